@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pixcal.engine.run import Runtime
-from pixcal.storage.artefact import read_json, write_json
+from pixcal.storage.manifest import read_json, write_json
 from reproduction import (
     figure_05,
     figure_09,

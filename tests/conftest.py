@@ -224,7 +224,7 @@ def make_bench() -> Callable[..., Bench]:
 @pytest.fixture(scope="session")
 def reseal() -> Callable[..., None]:
     """Make artefacts that a test has altered look as if they had been written so."""
-    from pixcal.storage.artefact import read_manifest, write_manifest
+    from pixcal.storage.manifest import read_manifest, write_manifest
 
     def change(*folders: Path) -> None:
         for folder in folders:
@@ -242,8 +242,9 @@ def write_reduced() -> Callable[[Bench, Path], Path]:
 
 
 def _reduced_run(bench: Bench, run: Path) -> Path:
-    from pixcal.storage.artefact import build, write_json
+    from pixcal.storage.artefact import build
     from pixcal.storage.cube import create_array, create_group, write_array
+    from pixcal.storage.manifest import write_json
 
     bench.bias = np.full(bench.shape, 300.0)
     acquisition = {

@@ -28,8 +28,8 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import Camera
 from pixcal.stages.simulate import acquire
-from pixcal.storage.artefact import digest
 from pixcal.storage.lock import lock
+from pixcal.storage.manifest import digest
 
 MOMENT = datetime(2026, 1, 1, tzinfo=UTC).timestamp()  # time of every file
 MAX_SEED = 10**17

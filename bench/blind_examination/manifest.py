@@ -6,7 +6,7 @@ from pathlib import Path
 from blind_examination.draw import Examination
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
-from pixcal.storage.artefact import read_json, write_json
+from pixcal.storage.manifest import read_json, write_json
 
 SCHEMA = "pixcal/blind/1"
 FILE = "blind.json"

@@ -20,7 +20,7 @@ from blind_examination.summary import PLACE, median, summary
 from blind_examination.table import as_markdown, write_between
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.errors import DamagedError, InputError, PixcalError, PlanError
-from pixcal.storage.artefact import read_json, write_json
+from pixcal.storage.manifest import read_json, write_json
 
 SCHEMA = "pixcal/blind-score/3"
 PRODUCT = "score.json"

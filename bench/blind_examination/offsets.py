@@ -22,7 +22,7 @@ from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import Camera
 from pixcal.stages.compare.sides import PART_OF
 from pixcal.stages.fitted_shape import fitted_shape
-from pixcal.storage.artefact import read_json
+from pixcal.storage.manifest import read_json
 from pixcal.storage.products import read_map
 
 F64 = NDArray[np.float64]

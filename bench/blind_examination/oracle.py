@@ -26,7 +26,7 @@ from pixcal.stages.diagnose.inquiry import REFERENCES
 from pixcal.stages.diagnose.look import look_at
 from pixcal.stages.diagnose.search import CONFIRM
 from pixcal.stages.diagnose.trial import Trials
-from pixcal.storage.artefact import read_json
+from pixcal.storage.manifest import read_json
 
 EXPLAINS = 0.5  # share of a statistic's gap that the true effects leave at most where they cause it
 

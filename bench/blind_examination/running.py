@@ -22,7 +22,7 @@ from pixcal.model.code import code_digest
 from pixcal.model.errors import ClusterError, DamagedError, PlanError
 from pixcal.stages import correct, diagnose, ingest, reduce
 from pixcal.stages.diagnose.look import ESTIMATE_BYTES, EVIDENCE_BYTES
-from pixcal.storage.artefact import read_json, write_json
+from pixcal.storage.manifest import read_json, write_json
 
 PRODUCTS = "products"
 DIAGNOSIS = Path(PRODUCTS) / "diagnosis.json"

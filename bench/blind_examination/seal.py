@@ -15,7 +15,7 @@ from blind_examination.draw import Examination
 from pixcal.model.bench import Bench
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
-from pixcal.storage.artefact import read_json, write_json
+from pixcal.storage.manifest import read_json, write_json
 
 SCHEMA = "pixcal/blind-truth/2"
 

@@ -8,7 +8,7 @@ import numpy as np
 from pixcal.kernels.optics import Geometry
 from pixcal.kernels.scene import geometry
 from pixcal.report.text import number
-from pixcal.storage.artefact import read_json
+from pixcal.storage.manifest import read_json
 from reproduction.lab import Lab, Scene
 from reproduction.outcome import Outcome, Row
 

@@ -16,8 +16,8 @@ from pixcal.model.yaml_file import to_yaml
 from pixcal.stages import allan, crests, fit, ingest, reduce, simulate
 from pixcal.stages.fit.sweep import load_run
 from pixcal.stages.fitted_shape import nominal_vector as declared_vector
-from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
+from pixcal.storage.manifest import read_json
 from truth import Truth
 
 F64 = NDArray[np.float64]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pixcal.model.options import Astrometry
-from pixcal.storage.artefact import read_json
+from pixcal.storage.manifest import read_json
 from pixcal_cli import printing
 from pixcal_cli.click_options import command
 from pixcal_cli.results import perform

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pixcal.model.options import Compare
-from pixcal.storage.artefact import read_json
+from pixcal.storage.manifest import read_json
 from pixcal_cli.click_options import PATH, Command, command
 from pixcal_cli.printing import Columns, show_notes, show_records, show_table, with_error
 from pixcal_cli.results import perform

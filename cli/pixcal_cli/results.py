@@ -12,8 +12,8 @@ from typing import Any
 import click
 
 from pixcal.report.text import chance, share_by_law
-from pixcal.storage.artefact import MANIFEST, read_json
 from pixcal.storage.cube_place import cubes_of
+from pixcal.storage.manifest import MANIFEST, read_json
 from pixcal_cli.printing import Columns, number, show_notes, show_records, show_table, with_error
 
 

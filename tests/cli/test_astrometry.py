@@ -8,7 +8,7 @@ import pytest
 
 from pixcal.stages import astrometry
 from pixcal.stages.astrometry.summary import axis_facts
-from pixcal.storage.artefact import write_json
+from pixcal.storage.manifest import write_json
 from pixcal_cli.main import invoke
 
 

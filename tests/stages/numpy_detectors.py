@@ -20,7 +20,7 @@ from pixcal.stages.diagnose.measuring import nominal_bench
 from pixcal.stages.diagnose.nominal import NominalBench
 from pixcal.stages.diagnose.parts import Raw, evidence_of, select
 from pixcal.stages.diagnose.windows import Split, split, whole_of
-from pixcal.storage.artefact import read_json
+from pixcal.storage.manifest import read_json
 
 F64 = NDArray[np.float64]
 Frames = dict[str, NDArray[Any]]

@@ -9,7 +9,8 @@ from pixcal.stages import fit, reduce
 from pixcal.stages.diagnose.parts import Raw
 from pixcal.stages.evidence import load_evidence
 from pixcal.stages.ingest.arrays import create, finish
-from pixcal.storage.artefact import build, write_json
+from pixcal.storage.artefact import build
+from pixcal.storage.manifest import write_json
 
 
 def evidence_on_disk(raw: Raw, folder: Path) -> Evidence:

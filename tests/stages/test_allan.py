@@ -17,8 +17,9 @@ from pixcal.kernels.allan import allan_deviation, averaging_lengths
 from pixcal.model.errors import DamagedError, InputError, PlanError
 from pixcal.stages.allan import Config
 from pixcal.stages.allan import stage as allan
-from pixcal.storage.artefact import build, read_json, write_json
+from pixcal.storage.artefact import build
 from pixcal.storage.cube import ArrayReader, create_array, create_group, write_array
+from pixcal.storage.manifest import read_json, write_json
 
 F64 = NDArray[np.float64]
 SYNC = Runtime(cluster="sync")

@@ -37,8 +37,9 @@ from pixcal.stages.astrometry.stars import (
 )
 from pixcal.stages.astrometry.summary import scientific, table, with_error
 from pixcal.stages.fitted_shape import fitted_shape
-from pixcal.storage.artefact import build, read_json, write_json
+from pixcal.storage.artefact import build
 from pixcal.storage.cube import ArrayReader
+from pixcal.storage.manifest import read_json, write_json
 from pixcal.storage.products import write_map
 
 F64 = NDArray[np.float64]

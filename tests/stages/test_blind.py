@@ -49,8 +49,9 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError, PlanError
 from pixcal.stages import correct, diagnose, ingest, reduce
 from pixcal.stages.diagnose import look
-from pixcal.storage.artefact import build, write_json
+from pixcal.storage.artefact import build
 from pixcal.storage.formats import STAGES
+from pixcal.storage.manifest import write_json
 from pixcal.storage.stage import require
 
 DIAGNOSIS_FORMAT = STAGES["diagnose"].format

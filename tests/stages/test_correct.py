@@ -26,9 +26,10 @@ from pixcal.stages.correct.sweep_to_correct import corrected
 from pixcal.stages.correct.uncertainty import moved
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.treatment import treatments
-from pixcal.storage.artefact import build, write_json
+from pixcal.storage.artefact import build
 from pixcal.storage.cube import create_group, write_array
 from pixcal.storage.formats import STAGES
+from pixcal.storage.manifest import write_json
 from pixcal.storage.products import read_map
 from pixcal.storage.stage import require
 from pixcal_cli.main import invoke

@@ -14,8 +14,8 @@ from pixcal.kernels.optics import PARAMETERS
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.stages import crests, fit
 from pixcal.stages.crests import Config, stage
-from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader
+from pixcal.storage.manifest import read_json, write_json
 
 SYNC = Runtime("sync")
 SETS = {"vertical": (6.0, 0.0), "diagonal": (-3.0, 4.5)}

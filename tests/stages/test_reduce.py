@@ -23,6 +23,7 @@ from pixcal.model.flags import PixelFlag
 from pixcal.stages import ingest, reduce
 from pixcal.storage import artefact
 from pixcal.storage.cube import ArrayReader, create_array, create_group
+from pixcal.storage.manifest import digest, write_json
 
 SYNC = Runtime(cluster="sync")
 SHAPE = (131, 141)
@@ -81,14 +82,14 @@ def make_ingest(
         "optics": {"wavelength_nm": 632.8, "distance_mm": 400.0},
         "frames": frames,
     }
-    inputs = {name: artefact.digest(data.tobytes().hex()) for name, data in arrays.items()}
+    inputs = {name: digest(data.tobytes().hex()) for name, data in arrays.items()}
     with artefact.build(run, "ingest", 1, described, inputs) as made:
         create_group(made.folder / "raw.zarr")
         for name, data in arrays.items():
             writer = create_array(made.folder / "raw.zarr" / name, data.shape, data.dtype)
             writer.write((0, 0, 0), data)
             writer.finish()
-        artefact.write_json(made.folder / "acquisition.json", described)
+        write_json(made.folder / "acquisition.json", described)
         tables = {
             name: {
                 "file": [f"{name}/{n}.fits" for n in range(len(data))],
@@ -101,7 +102,7 @@ def make_ingest(
             }
             for name, data in arrays.items()
         }
-        artefact.write_json(made.folder / "frames.json", tables)
+        write_json(made.folder / "frames.json", tables)
 
 
 def read(run: Path, name: str) -> NDArray[Any]:

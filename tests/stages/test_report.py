@@ -16,9 +16,10 @@ from pixcal.engine.run import Runtime
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.report import page as page_module
 from pixcal.stages import report
-from pixcal.storage.artefact import build, read_manifest, write_json
+from pixcal.storage.artefact import build
 from pixcal.storage.cube import create_group, write_array
 from pixcal.storage.formats import STAGES
+from pixcal.storage.manifest import read_manifest, write_json
 
 DIAGNOSIS_FORMAT = STAGES["diagnose"].format
 

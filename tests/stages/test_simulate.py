@@ -24,7 +24,8 @@ from pixcal.simulation.recording import recordings
 from pixcal.stages.simulate import Config, run
 from pixcal.stages.simulate import stage as simulate
 from pixcal.stages.simulate import truth as simulated_truth
-from pixcal.storage.artefact import artefact_key, read_manifest
+from pixcal.storage.artefact import artefact_key
+from pixcal.storage.manifest import read_manifest
 
 ROOT = Path(__file__).parents[2]
 SYNC = Runtime(cluster="sync")

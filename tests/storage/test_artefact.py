@@ -16,18 +16,9 @@ import pytest
 from pixcal import __version__
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.storage import artefact
-from pixcal.storage.artefact import (
-    MANIFEST,
-    Manifest,
-    artefact_key,
-    build,
-    digest,
-    read_json,
-    read_manifest,
-    up_to_date,
-    write_json,
-)
+from pixcal.storage.artefact import artefact_key, build, up_to_date
 from pixcal.storage.lock import lock
+from pixcal.storage.manifest import MANIFEST, Manifest, digest, read_json, read_manifest, write_json
 from pixcal.storage.stage import require
 
 CONFIG = {"model": "paraxial", "limit": 1.5}

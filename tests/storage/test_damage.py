@@ -16,20 +16,21 @@ import pytest
 from numpy.typing import NDArray
 
 from pixcal.model.errors import DamagedError
-from pixcal.storage import artefact, writeback
-from pixcal.storage.artefact import (
-    MANIFEST,
-    UNFLUSHED,
-    build,
-    read_json,
-    read_manifest,
-    unflushed,
-    up_to_date,
-    write_json,
-)
+from pixcal.storage import writeback
+from pixcal.storage.artefact import build, unflushed, up_to_date
 from pixcal.storage.cube import ArrayReader, create_array, create_group, write_array
 from pixcal.storage.formats import STAGES
 from pixcal.storage.lock import damage_noted, flushed_last, lock
+from pixcal.storage.manifest import (
+    DAMAGE,
+    JOURNAL,
+    MANIFEST,
+    SCRATCH,
+    UNFLUSHED,
+    read_json,
+    read_manifest,
+    write_json,
+)
 from pixcal.storage.products import is_whole, read_map, write_map
 from pixcal.storage.stage import require
 
@@ -141,9 +142,9 @@ def test_a_damaged_chunk_is_noted_and_its_command_told(
 
 def test_a_note_that_is_damaged_itself_still_counts(tmp_path: Path) -> None:
     key = complete(tmp_path)
-    (tmp_path / "fit" / artefact.DAMAGE).write_text("{")
+    (tmp_path / "fit" / DAMAGE).write_text("{")
     assert up_to_date(tmp_path, "fit", key) is None
-    with pytest.raises(DamagedError, match=artefact.DAMAGE):
+    with pytest.raises(DamagedError, match=DAMAGE):
         require(tmp_path, "fit")
 
 
@@ -170,8 +171,8 @@ def test_a_kill_before_the_last_steps_leaves_nothing_behind(tmp_path: Path) -> N
     final, old = tmp_path / "fit", tmp_path / ".partial" / "fit-replaced"
     assert sorted(f.name for f in final.iterdir()) == ["facts.json", MANIFEST, "maps.zarr"]
     shutil.copytree(final, old)
-    (final / artefact.JOURNAL).touch()
-    (final / artefact.SCRATCH).mkdir()
+    (final / JOURNAL).touch()
+    (final / SCRATCH).mkdir()
     with lock(tmp_path):
         assert sorted(f.name for f in final.iterdir()) == ["facts.json", MANIFEST, "maps.zarr"]
         assert not old.exists()

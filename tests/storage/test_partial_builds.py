@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from pixcal.storage import artefact
-from pixcal.storage.artefact import build, read_manifest
+from pixcal.storage.artefact import build
 from pixcal.storage.cube import create_array, create_group
 from pixcal.storage.lock import lock
+from pixcal.storage.manifest import read_manifest
 
 
 def complete(run: Path, stage: str, number: int) -> None:

@@ -14,7 +14,7 @@ from pixcal.api.opened import Run, open_run
 from pixcal.engine.run import Runtime
 from pixcal.model import options as of
 from pixcal.model.config import StrPath
-from pixcal.storage.artefact import read_json
+from pixcal.storage.manifest import read_json
 
 Json = dict[str, Any]
 

@@ -15,9 +15,9 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F32, F64, U8
 from pixcal.model.config import StrPath
 from pixcal.model.errors import InputError
-from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.lock import damage_noted
+from pixcal.storage.manifest import read_json
 from pixcal.storage.products import read_map
 from pixcal.storage.stage import read_acquisition, require
 

@@ -16,10 +16,8 @@ def runs(numbers: Indices) -> list[tuple[int, int]]:
 def follows(numbers: Indices, steps: int = 1) -> Mask:
     """Whether the frame so many steps before in an array was taken so many frames before (t,).
 
-    Parameters
-    ----------
-    numbers : (t,) of the frames, ascending
-    steps : negative: whether the frame so many steps after was taken so many frames after
+    ``numbers``: (t,) of the frames, ascending. ``steps``: negative: whether the frame so many steps
+    after was taken so many frames after.
     """
     return np.asarray(numbers - np.roll(numbers, steps) == steps)
 

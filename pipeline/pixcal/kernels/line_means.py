@@ -13,12 +13,8 @@ def without_line_means(noise: F32, used: Mask) -> F32:
 
     A plain mean of n pixels would leave each two anticorrelated by 1 / n. Here pixels within
     `REACH` of a pixel count half in the mean that is taken off it: white noise keeps its variance,
-    and near pixels stay uncorrelated, to second order in 1 / n.
-
-    Parameters
-    ----------
-    noise : (t, y, x)
-    used : (y, x) pixels of which means are taken
+    and near pixels stay uncorrelated, to second order in 1 / n. ``noise``: (t, y, x). ``used``: (y,
+    x) pixels of which means are taken.
     """
     weight = used.astype(np.float32)
     found = noise * weight

@@ -55,12 +55,9 @@ def noise_before_rounding(
     """Noise that has some variance, on average over pixels, once it is rounded; and its error.
 
     None where the samples do not tell: noise far below a step, in pixels whose levels all lie at
-    about the same distance from the next change of code.
-
-    Parameters
-    ----------
-    variance, error : of a sample, on average over the pixels, and its standard error
-    means : (n,) mean samples of pixels like these, over so many ``frames``
+    about the same distance from the next change of code. ``variance, error``: of a sample, on
+    average over the pixels, and its standard error. ``means``: (n,) mean samples of pixels like
+    these, over so many ``frames``.
     """
     if variance > SMOOTH**2 + SHEPPARD:
         sigma = float(np.sqrt(variance - SHEPPARD))

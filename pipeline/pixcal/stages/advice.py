@@ -10,7 +10,7 @@ from typing import Any
 from pixcal.effects import known_effects
 from pixcal.report.text import NO_OFFSETS, number, with_error
 from pixcal.stages.treatment import CORRECTED, SUFFIX, fitted_shapes, treatment_of_kind
-from pixcal.storage.artefact import MANIFEST, read_json
+from pixcal.storage.manifest import MANIFEST, read_json
 from pixcal.storage.stage import require
 
 Json = Mapping[str, Any]

@@ -16,7 +16,7 @@ from pixcal.model.arrays import F32, F64
 from pixcal.model.errors import InputError
 from pixcal.model.options import FWHMS, Centroids, Wcs
 from pixcal.stages.advice import maps_to_use
-from pixcal.storage.artefact import read_json
+from pixcal.storage.manifest import read_json
 from pixcal.storage.products import read_map
 from pixcal.storage.stage import read_acquisition
 from pixcal.storage.star_files import column, distortion, read_table, write_distortion, write_table

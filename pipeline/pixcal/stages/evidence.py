@@ -13,8 +13,8 @@ from pixcal.model.errors import InputError
 from pixcal.stages.fit.scouting import read_frames
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
+from pixcal.storage.manifest import read_json
 from pixcal.storage.place import Local
 from pixcal.storage.stage import read_acquisition, require
 

@@ -15,8 +15,8 @@ from pixcal.stages.fit.maps import write_offsets
 from pixcal.stages.fit.sweep import sweep_sets
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduce.stage import reduce_frames
-from pixcal.storage.artefact import write_json
 from pixcal.storage.cube import CHUNK
+from pixcal.storage.manifest import write_json
 from pixcal.storage.memory import MemoryArray, MemoryBuild, MemoryPath
 
 HERE = Runtime(cluster="sync", quiet=True)

@@ -40,10 +40,11 @@ from pixcal.report.summary import (
     summarise_flags,
 )
 from pixcal.stages.advice import advice, maps_to_use
-from pixcal.storage.artefact import MANIFEST, Build, Manifest, read_json
+from pixcal.storage.artefact import Build
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.folder import INDEX
 from pixcal.storage.formats import STAGES
+from pixcal.storage.manifest import MANIFEST, Manifest, read_json
 from pixcal.storage.stage import make, require, working
 
 FIGURE_BYTES = 192 << 20  # Matplotlib, one figure and the page

@@ -10,7 +10,7 @@ from pixcal.model.arrays import F64
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
-from pixcal.storage.artefact import MANIFEST, read_json
+from pixcal.storage.manifest import MANIFEST, read_json
 
 # the shape of fringes (`pixcal.estimators.fringe_fit.models`) beside straight ones
 HYPERBOLIC = "hyperbolic"

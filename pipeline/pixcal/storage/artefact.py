@@ -28,49 +28,21 @@ from pixcal.model.errors import DamagedError
 from pixcal.storage.cube_place import cubes_of, remove_cubes, settle, settled
 from pixcal.storage.folder import flush
 from pixcal.storage.manifest import (
-    DAMAGE,
     JOURNAL,
-    MANIFEST,
     SCRATCH,
     UNFLUSHED,
     Manifest,
     boot,
     check_intact,
-    damaged_files,
     digest,
-    file_digest,
     list_files,
-    read_json,
     read_manifest,
-    write_json,
     write_manifest,
     write_whole,
 )
 from pixcal.storage.memory import MemoryBuild
 from pixcal.storage.place import Place
 from pixcal.storage.writeback import flush_file
-
-__all__ = [
-    "DAMAGE",
-    "JOURNAL",
-    "MANIFEST",
-    "SCRATCH",
-    "UNFLUSHED",
-    "Build",
-    "Manifest",
-    "Workspace",
-    "artefact_key",
-    "build",
-    "damaged_files",
-    "digest",
-    "file_digest",
-    "read_json",
-    "read_manifest",
-    "up_to_date",
-    "write_json",
-    "write_manifest",
-    "write_whole",
-]
 
 _KEY_IN_NAME = 16
 

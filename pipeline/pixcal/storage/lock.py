@@ -9,11 +9,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pixcal.model.errors import DamagedError, InputError
-from pixcal.storage.artefact import UNFLUSHED, discard, settle_flush, tidy, unflushed
+from pixcal.storage.artefact import discard, settle_flush, tidy, unflushed
 from pixcal.storage.cube_place import POINTER, cubes_of
 from pixcal.storage.folder import DISK_FULL
 from pixcal.storage.formats import STAGES
-from pixcal.storage.manifest import DAMAGE, MANIFEST, damaged_files, write_json
+from pixcal.storage.manifest import DAMAGE, MANIFEST, UNFLUSHED, damaged_files, write_json
 
 
 def _settle_killed(run: Path) -> None:

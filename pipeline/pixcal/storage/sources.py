@@ -18,7 +18,7 @@ from typing import ClassVar
 
 from pixcal.model.acquisition import Frames
 from pixcal.model.errors import InputError
-from pixcal.storage.artefact import digest
+from pixcal.storage.manifest import digest
 
 HEADERS = "headers.csv"
 KEYWORDS = ("EXPTIME", "MJD-OBS", "DATE-OBS", "CCD-TEMP")

@@ -115,10 +115,8 @@ def _backed(value: F64, normal: F64, right: F64) -> Mask:
 def _shares(right: F64, normal: F64, read: float) -> tuple[F64, F64]:
     """Sums of the shares alone (link, u, u), the constant and brighter-fatter having been freed.
 
-    Parameters
-    ----------
-    right, normal : (link, term, class) float64 as in `Products`
-    read : variance without light, which the constant may well reach
+    ``right, normal``: (link, term, class) float64 as in `Products`. ``read``: variance without
+    light, which the constant may well reach.
     """
     links, _, count = right.shape
     free = range(2, TERMS)

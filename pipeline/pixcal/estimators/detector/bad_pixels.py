@@ -151,13 +151,9 @@ def nonlinear(rungs: Sequence[Rung], levels: F64, limit: float) -> Mask:
     The pixel's share of the median level of the rungs (of the same tile, so that the lamp's own
     drift drops out) is constant for a good pixel on a linear detector. Where the response of all
     pixels is curved, brighter pixels are further along the curve: what pixels of one brightness
-    have in common is the detector's response, and no defect.
-
-    Parameters
-    ----------
-    rungs : any number; with fewer than three for a pixel it is not flagged
-    levels : (rung,) of the tile, as `step_levels` gives them
-    limit : largest relative change of the share
+    have in common is the detector's response, and no defect. ``rungs``: any number; with fewer than
+    three for a pixel it is not flagged. ``levels``: (rung,) of the tile, as `step_levels` gives
+    them. ``limit``: largest relative change of the share.
     """
     shape = rungs[0].signal.shape
     if len(rungs) < MIN_RUNGS:
@@ -203,11 +199,8 @@ def _common(off: F64, brightness: F64, used: Mask) -> F64:
 def _curve(powers: F64, products: F64, values: F64, usable: Mask) -> F64:
     """Polynomial through values (n,) without outliers; all zero through too few.
 
-    Parameters
-    ----------
-    powers, products : (n, power), (n, power * power) of the places, and products of each two
-    values : (n,)
-    usable : (n,)
+    ``powers, products``: (n, power), (n, power * power) of the places, and products of each two.
+    ``values``: (n,). ``usable``: (n,).
     """
     terms = np.zeros(powers.shape[1])
     kept = usable

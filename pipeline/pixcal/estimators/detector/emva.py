@@ -38,10 +38,8 @@ class Nonuniformity:
 def nonuniformity(a: F64, b: F64, lost: int) -> Nonuniformity:
     """Nonuniformity that two averages of independent frames have in common.
 
-    Parameters
-    ----------
-    a, b : (y, x) averages of as many frames, in any unit, as `without_gaps` gives them
-    lost : pixels that are bad
+    ``a, b``: (y, x) averages of as many frames, in any unit, as `without_gaps` gives them.
+    ``lost``: pixels that are bad.
     """
     ny, nx = a.shape
     dofs = np.array([ny - 1, nx - 1, max((ny - 1) * (nx - 1) - lost, 1)], float)
@@ -125,10 +123,8 @@ class Spectrogram:
 def spectrogram(a: F64, b: F64, *, axis: int) -> Spectrogram:
     """Spectrum of the mean of two averages along an axis (1: along the rows), and its noise.
 
-    Parameters
-    ----------
-    a, b : (y, x) as for `nonuniformity`
-    axis : {0, 1} along which the Fourier transform is taken
+    ``a, b``: (y, x) as for `nonuniformity`. ``axis``: {0, 1} along which the Fourier transform is
+    taken.
     """
     n = a.shape[axis]
     scale = 1 / math.sqrt(n)

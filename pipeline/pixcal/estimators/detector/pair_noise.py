@@ -64,11 +64,9 @@ def dark_pair_sums(
 ) -> F64:
     """Sums (N_BINS, COLUMNS) over frames 0 and 1, 2 and 3, … without light.
 
-    Parameters
-    ----------
-    frames : (t, y, x) less their common level (ADU); NaN where a sample is not to be used
-    read_noise, quantum : as of `pair_statistics`
-    without : lines whose common noise is taken off
+    ``frames``: (t, y, x) less their common level (ADU); NaN where a sample is not to be used.
+    ``read_noise, quantum``: as of `pair_statistics`. ``without``: lines whose common noise is taken
+    off.
     """
     pairs = zip(frames[::2], frames[1::2], strict=False)
     blocks = [_blocks(*pair, np.inf, read_noise, quantum, without) for pair in pairs]

@@ -203,13 +203,9 @@ def boundaries_beside(
     """Boundaries of a given falloff, with a response that is free.
 
     One fringe period tells little of them but how boundaries along x and y differ, which no
-    response brings about.
-
-    Parameters
-    ----------
-    evidence, level_e, powers : as of `boundaries_alone`
-    falloff_px : one of `FALLOFFS_PX`
-    known : mean shift by an electron (px) and its variance, as the noise of neighbours has it
+    response brings about. ``evidence, level_e, powers``: as of `boundaries_alone`. ``falloff_px``:
+    one of `FALLOFFS_PX`. ``known``: mean shift by an electron (px) and its variance, as the noise
+    of neighbours has it.
     """
     sums = _sums_by_axis(evidence, level_e, powers)
     normal, right = _joint(sums, powers, powers + FALLOFFS_PX.index(falloff_px))

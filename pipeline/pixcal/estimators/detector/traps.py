@@ -60,9 +60,7 @@ class FittedLoss:
 class LossFit:
     """Fringe frames of an acquisition, ready to be held against losses of charge.
 
-    Parameters
-    ----------
-    level_e : full scale of the bands of the response, e-
+    ``level_e``: full scale of the bands of the response, e-.
     """
 
     def __init__(self, evidence: Evidence, level_e: float) -> None:
@@ -108,12 +106,8 @@ class LossFit:
         """Shares of bands of the level, and traps that fill up, if they explain more.
 
         Returns None where the share is the same in all bands; where traps explain no more.
-
-        Parameters
-        ----------
-        banded, trapped : as of `fit`: from a share of each band; from these, what traps keep and
-            what they hold
-        share, full : that stays on the mean, and of full scale, e-
+        ``banded, trapped``: as of `fit`: from a share of each band; from these, what traps keep and
+        what they hold. ``share, full``: that stays on the mean, and of full scale, e-.
         """
         even = np.full(len(BANDS), share)
         self.weigh(banded, even)

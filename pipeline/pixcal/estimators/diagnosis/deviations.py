@@ -174,11 +174,8 @@ class SetDeviations(_Deviations):
     ) -> Change:
         """What a change of the samples does to the linear deviations.
 
-        Parameters
-        ----------
-        samples : (t, y, x) e-, as reduced
-        constant, relative : (y, x) what bias and darks that changed with them take off every frame,
-            e-; and by how much the flats did, relative
+        ``samples``: (t, y, x) e-, as reduced. ``constant, relative``: (y, x) what bias and darks
+        that changed with them take off every frame, e-; and by how much the flats did, relative.
         """
         found, good = self.found, self.good
         changed = np.take(samples.reshape(len(samples), -1), np.flatnonzero(good), axis=1)

@@ -87,13 +87,9 @@ class RowSums:
         """Normal matrix (y, y) and right-hand side (y,) of the share of a light in each row.
 
         What the pixels take up of it, which is linear in the frames' own light, and what the
-        frames' own parameters do, is taken off.
-
-        Parameters
-        ----------
-        other : (t, 3) float64 parameters of the light in the frames inside, as in
-            `FringeEvidence.g`
-        factors : (y, 3) float64 of these parameters in each row
+        frames' own parameters do, is taken off. ``other``: (t, 3) float64 parameters of the light
+        in the frames inside, as in `FringeEvidence.g`. ``factors``: (y, 3) float64 of these
+        parameters in each row.
         """
         g = self.found.g[self.inside]
         own = (other - g @ (np.linalg.pinv(g) @ other))[:, None]

@@ -42,10 +42,8 @@ def find_line(
 ) -> Line | None:
     """The strongest line; None where the runs are too short for one.
 
-    Parameters
-    ----------
-    level : of a series, the variance (t - 1, 2) of its modes without a line
-    channels : that may hold the line
+    ``level``: of a series, the variance (t - 1, 2) of its modes without a line. ``channels``: that
+    may hold the line.
     """
     lengths = [(np.ptp(s.frame) + 1) * s.step_s for s in every]
     top = min(0.5 / s.step_s for s in every)

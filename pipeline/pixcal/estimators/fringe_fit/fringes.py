@@ -79,13 +79,9 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
     The highest peak of the summed power spectra, refined on the continuous spectrum; its sign is
     that of the nominal vector. Raises InputError if no peak stands out: the frames hold no fringes,
     or fewer than `MIN_FRINGES`; if fringes are nominally narrower than `SHORTEST_PX`, or lie across
-    the nominal ones.
-
-    Parameters
-    ----------
-    maps : (n, y, x) float64 maps without their mean light (ratios to the mean map)
-    good : (y, x) bool pixels to use
-    nominal : fringe vector of the bench's nominal geometry, rad/px
+    the nominal ones. ``maps``: (n, y, x) float64 maps without their mean light (ratios to the mean
+    map). ``good``: (y, x) bool pixels to use. ``nominal``: fringe vector of the bench's nominal
+    geometry, rad/px.
     """
     if max(map(abs, nominal)) * SHORTEST_PX > 2 * np.pi:
         raise InputError(

@@ -183,13 +183,9 @@ def start_model(
 
     The phase and the visibility are smooth over the tile; the level is the pixel's own, known to a
     part in a thousand, and only scales all the weights of that pixel together. With it the smooth
-    alpha exp(i psi) / iota.
-
-    Parameters
-    ----------
-    tile, blocks, coding, frames : as in `accumulate`
-    k : fringe vector near the tile, rad/px
-    start : (3, y, x) float64 the pixels as they are known; else from an unweighted fit
+    alpha exp(i psi) / iota. ``tile, blocks, coding, frames``: as in `accumulate`. ``k``: fringe
+    vector near the tile, rad/px. ``start``: (3, y, x) float64 the pixels as they are known; else
+    from an unweighted fit.
     """
     theta = _unweighted_pixels(tile, blocks, coding, frames) if start is None else start
     iota = theta[0]

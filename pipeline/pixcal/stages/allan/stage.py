@@ -37,9 +37,10 @@ from pixcal.stages.allan.batches import (
     region_name,
     sums_of_region,
 )
-from pixcal.storage.artefact import Build, Manifest, read_json, write_json
+from pixcal.storage.artefact import Build
 from pixcal.storage.cube import ArrayWriter, create_array, create_group, create_map, write_array
 from pixcal.storage.formats import STAGES
+from pixcal.storage.manifest import Manifest, read_json, write_json
 from pixcal.storage.stage import make, working
 
 STAGE = STAGES["allan"]

@@ -53,9 +53,9 @@ from pixcal.stages.astrometry.stars import (
 )
 from pixcal.stages.astrometry.summary import TARGET_PX, axis_facts, table
 from pixcal.stages.fitted_shape import fitted_shape
-from pixcal.storage.artefact import Build, Manifest, read_json, write_json
+from pixcal.storage.artefact import Build
 from pixcal.storage.formats import STAGES
-from pixcal.storage.manifest import file_digest
+from pixcal.storage.manifest import Manifest, file_digest, read_json, write_json
 from pixcal.storage.stage import make, read_acquisition, working
 
 SCHEMA = "pixcal/astrometry/1"

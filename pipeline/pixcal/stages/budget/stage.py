@@ -42,7 +42,7 @@ from pixcal.stages.budget.expected import (
     sample_variance,
 )
 from pixcal.stages.budget.levers import levers
-from pixcal.storage.artefact import digest, write_json, write_whole
+from pixcal.storage.manifest import digest, write_json, write_whole
 
 SCHEMA = "pixcal/budget/1"
 MARGIN = 4.0  # standard deviations that the brightest fringe should keep below the end of the range

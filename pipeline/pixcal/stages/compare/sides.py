@@ -22,8 +22,8 @@ from pixcal.estimators.fringe_fit.models import FringeShape
 from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
 from pixcal.stages.fitted_shape import fitted_shape
-from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
+from pixcal.storage.manifest import read_json
 from pixcal.storage.stage import read_acquisition, require
 
 Range = tuple[int, int]

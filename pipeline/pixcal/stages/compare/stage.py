@@ -27,17 +27,17 @@ from pixcal.stages.compare.agreement import VarianceEstimate, three_cornered_hat
 from pixcal.stages.compare.facts import describe
 from pixcal.stages.compare.pair import DISAGREE, Pair, read_pixels, read_sums
 from pixcal.stages.compare.sides import Side, Vector, parts_of, whole_run
-from pixcal.storage.artefact import (
+from pixcal.storage.artefact import artefact_key
+from pixcal.storage.formats import STAGES
+from pixcal.storage.lock import damage_noted, lock
+from pixcal.storage.manifest import (
     MANIFEST,
     Manifest,
-    artefact_key,
     read_manifest,
     write_json,
     write_manifest,
     write_whole,
 )
-from pixcal.storage.formats import STAGES
-from pixcal.storage.lock import damage_noted, lock
 
 STAGE = STAGES["compare"]
 SCHEMA = "pixcal/compare/1"

@@ -35,7 +35,6 @@ from pixcal.stages.correct.sweep_to_correct import (
 from pixcal.stages.correct.uncertainty import parameter_variance, task_bytes
 from pixcal.stages.evidence import Part
 from pixcal.stages.fit.sweep import BATCH_MAPS
-from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import (
     ArrayReader,
     ArrayWriter,
@@ -45,6 +44,7 @@ from pixcal.storage.cube import (
     write_array,
 )
 from pixcal.storage.folder import link_files
+from pixcal.storage.manifest import read_json, write_json
 
 SAME = ("chi2", "mask", "g", "dk", "time")  # arrays of a sweep that stay
 

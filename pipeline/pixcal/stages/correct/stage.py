@@ -38,10 +38,11 @@ from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.treatment import HYPERBOLIC, SUFFIX, Treatments, treatments
-from pixcal.storage.artefact import Build, Manifest, read_json, write_json
+from pixcal.storage.artefact import Build
 from pixcal.storage.cube import create_group
 from pixcal.storage.formats import STAGES
 from pixcal.storage.lock import lock
+from pixcal.storage.manifest import Manifest, read_json, write_json
 from pixcal.storage.products import Card
 from pixcal.storage.stage import make, require
 

@@ -20,8 +20,8 @@ from pixcal.stages.diagnose.undone import undone_on_samples
 from pixcal.stages.evidence import Part, fitted_theta
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.treatment import Treatment
-from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
+from pixcal.storage.manifest import read_json
 
 HALVES = 2  # parts of the frames that are corrected each for itself
 BEYOND = 8  # pixels beyond an open side that are taken to be there

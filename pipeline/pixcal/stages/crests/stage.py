@@ -43,9 +43,10 @@ from pixcal.stages.crests.windows import N_SUMS, CrestCarrier, Vector, Windows, 
 from pixcal.stages.fit.sweep import load_run
 from pixcal.stages.fitted_shape import nominal_geometry
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.storage.artefact import MANIFEST, Build, Manifest, read_json, write_json
+from pixcal.storage.artefact import Build
 from pixcal.storage.cube import ArrayReader, create_group, write_array
 from pixcal.storage.formats import STAGES
+from pixcal.storage.manifest import MANIFEST, Manifest, read_json, write_json
 from pixcal.storage.stage import make, require, working
 
 STAGE = STAGES["crests"]

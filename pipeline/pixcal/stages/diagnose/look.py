@@ -19,7 +19,7 @@ from pixcal.stages.diagnose.trial import Curves, Signature, Window, averaged, me
 from pixcal.stages.diagnose.windows import chosen_windows, frames_of_half, split
 from pixcal.stages.evidence import Part
 from pixcal.stages.reduce.ingested import Ingested
-from pixcal.storage.artefact import read_json
+from pixcal.storage.manifest import read_json
 from pixcal.storage.stage import read_acquisition, require
 
 # evidence in memory and the run that it is made of, for each sample of all fringe sets (measured,

@@ -62,12 +62,8 @@ def doubtful(
 
     For an unknown cause, if much more of the gap remains than it closes. For another law of the
     other causes, if their laws produce a good part of its significance, or if it is not significant
-    in the fitted frames.
-
-    Parameters
-    ----------
-    comparison, current, without : as for `redundant`
-    candidates : by name
+    in the fitted frames. ``comparison, current, without``: as for `redundant`. ``candidates``: by
+    name.
     """
     where = comparison.gap_of(current)
     open_still = comparison.residual(current, where)

@@ -2,14 +2,15 @@
 
 import inspect
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy.special import log_ndtr, ndtr
 
 from pixcal import __version__
-from pixcal.estimators.diagnosis.expectation import Expectation, Reference
+from pixcal.estimators.diagnosis.expectation import Reference
 from pixcal.estimators.diagnosis.gap import Difference, flagged, likelier, sigmas_among, sigmas_of
 from pixcal.estimators.diagnosis.test_statistics import DETECTOR, Curve, Key
 from pixcal.estimators.diagnosis.test_statistics.signature import statistic_named
@@ -28,6 +29,8 @@ from pixcal.stages.diagnose.comparison import (
 from pixcal.stages.diagnose.frames_used import FramesUsed
 from pixcal.stages.diagnose.recommended_frames import recommend_frames
 
+Json = dict[str, Any]
+
 SCHEMA = "pixcal/diagnosis/1"
 EXPLAINED = 0.15  # share of the gap that may be left where it is called explained,
 LEFT = 0.25  # and share of any one statistic's that is off by more than
@@ -36,6 +39,8 @@ STILL = 6.0  # standard deviations: less can be the simulation of the effects th
 ALWAYS = ("allan_of_batches", "offset_by_place", "residual_noise")
 MIN_P_VALUE = 1e-12  # smallest that is told: of tails further out nobody knows the shape
 SHOWN = 3  # statistics named that gave a cause away
+# facts of a statistic that its curve has
+FACTS = ("title", "domain", "quantity", "unit", "x_label", "kind")
 
 
 def describe(
@@ -45,44 +50,14 @@ def describe(
     reference: Reference,
     facts: FramesUsed,
     places: Sequence[Mapping[str, Any]] = (),
-) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+) -> tuple[Json, list[Json]]:
     """The product, and every curve as measured, nominal and with the effects found.
 
     ``data`` are the curves of the held-out frames on the reference's scales, ``measured`` in their
     own units; ``places`` says how far windows are off by themselves, `by_domain`.
     """
-    where = differing(found.nominal, found.final, data)
-    final = shrinkage(data, found.nominal, found.final, where)
-    verdict = _verdict(found, final)
-    curves = _curves(found, final, data, measured, reference)
-    by_key = {(c["statistic"], c["set"]): c for c in curves}
-    causes = [_cause(name, found, data, where, final, facts) for name in found.accepted]
-    diagnosis = {
-        "schema": SCHEMA,
-        "pixcal": __version__,
-        "verdict": verdict,
-        "causes": sorted(causes, key=lambda c: -float(c["gap_closed"])),
-        "gap": {
-            "total": 1.0 if where else 0.0,
-            "after": _rounded(final.gap.total),
-            "interval": [_rounded(v) for v in gap_interval(data, final, found.final)],
-            "domains": {
-                domain: [_rounded(v) for v in final.gap.of_domain(domain)] for domain in DOMAINS
-            },
-            "where": _where(final, by_key),
-            "absolute": _absolute(found, final, by_key, reference),
-            "places": list(places),
-        },
-        "candidates": [_candidate(c, found, data, where) for c in found.candidates.values()],
-        "more_would_tell": (
-            recommend_frames(facts.missing_frames)
-            if verdict in ("unexplained", "partly explained")
-            else []
-        ),
-        "statistics": len(final.before),
-        "looked_at": to_plain(facts),
-    }
-    return diagnosis, curves
+    described = _Description(found, data, measured, reference, facts)
+    return described.diagnosis(places), list(described.curves.values())
 
 
 def by_domain(
@@ -102,140 +77,223 @@ def by_domain(
     return found
 
 
-def _verdict(found: SearchResult, final: Shrinkage) -> str:
-    if not final.where:
-        return "no gap"
-    if not found.accepted:
-        return "unexplained"
-    still = [
-        key
-        for key in flagged(final.after)
-        if final.gap.left.get(key, 1.0) > LEFT and sigmas_of(final.after[key].log_chance) > STILL
-    ]
-    return "explained" if final.gap.total <= EXPLAINED and not still else "partly explained"
+@dataclass(frozen=True)
+class _Description:
+    """Arguments of `describe`, and what follows from them."""
 
+    found: SearchResult
+    data: Mapping[Key, F64]
+    measured: Mapping[Key, Curve]
+    reference: Reference
+    facts: FramesUsed
 
-def _cause(
-    name: str,
-    found: SearchResult,
-    data: Mapping[Key, F64],
-    where: set[Key],
-    final: Shrinkage,
-    facts: FramesUsed,
-) -> dict[str, Any]:
-    candidate = found.candidates[name]
-    estimate = candidate.estimate
-    assert estimate is not None
-    effect = next(e for e in found.final.effects if e.name == name)
-    by_itself = candidate.alone or found.final
-    alone = shrinkage(data, found.nominal, by_itself, where)
-    without = shrinkage(data, found.nominal, found.without[name], where)
-    gain = found.final.log_likelihood - found.without[name].log_likelihood
-    by_law = alone
-    if name in found.by_law:
-        by_law = shrinkage(data, found.nominal, found.by_law[name], where)
-    alike = found.alike.get(name, ())
-    kinds = [type(e.effect) for n in (name, *alike) if (e := found.candidates[n].estimate)]
-    # Two independent parts of the frames, joined by Fisher's rule. A likelihood ratio of e^gain has
-    # a chance of at most e^-gain (Markov's inequality).
-    own = estimate.significance * candidate.share
-    log_both = max(float(log_ndtr(-own)) - max(gain, 0.0), -600.0)
-    chance = np.exp(log_both) * (1 - log_both)
-    same_samples = facts.shared and not facts.sets and facts.on_the_same_pixels
-    if same_samples or candidate.in_maps_alone:
-        # Both parts hold the same samples, or the same offsets: the second says nothing new.
-        chance = float(ndtr(-own))
-    chance *= len(found.candidates) * candidate.ways
-    return {
-        "effect": name,
-        "title": effect.title,
-        "about": (inspect.getdoc(effect) or "").partition("\n")[0].replace("`", ""),
-        "parameters": to_plain(effect),
-        "uncertainty": {k: float(v) for k, v in estimate.errors.items()},
-        "units": {f.name: f.metadata.get("unit", "") for f in fields(effect)},
-        "meanings": {f.name: f.metadata.get("doc", "") for f in fields(effect)},
-        "strengths": list(effect.strengths),
-        "law": estimate.law,
-        "gap_closed": _closed(alone.gap.total),
-        "gap_closed_interval": [_closed(v) for v in reversed(gap_interval(data, alone, by_itself))],
-        "gap_closed_by_law": _closed(by_law.gap.total),
-        "gain_over_rest": _rounded(without.gap.total - final.gap.total),
-        "p_value": float(np.clip(chance, MIN_P_VALUE, 1.0)),
-        "sigmas": _rounded(estimate.significance),
-        "why": estimate.why,
-        "given_away_by": _telling(found.without[name], found.final, data),
-        "not_told_apart_from": list(alike),
-        "would_decide": recommend_frames(facts.missing_frames, kinds) if alike else [],
-    }
+    @cached_property
+    def where(self) -> set[Key]:
+        """Curves that make up the gap."""
+        return differing(self.found.nominal, self.found.final, self.data)
 
+    @cached_property
+    def final(self) -> Shrinkage:
+        """The gap with all causes."""
+        return self._with(self.found.final)
 
-def _telling(before: Trial, after: Trial, data: Mapping[Key, F64]) -> list[dict[str, str]]:
-    """Statistics that an effect makes most likely, best first."""
-    gains = likelier(data, before.expected, after.expected)
-    best = sorted(gains, key=lambda k: -gains[k])[:SHOWN]
-    return [{"statistic": k[0], "set": k[1]} for k in best if gains[k] > 1]
+    def _with(self, trial: Trial) -> Shrinkage:
+        return shrinkage(self.data, self.found.nominal, trial, self.where)
 
-
-def _candidate(
-    candidate: Candidate, found: SearchResult, data: Mapping[Key, F64], where: set[Key]
-) -> dict[str, Any]:
-    closed = 0.0
-    if candidate.alone is not None and where:
-        closed = _closed(shrinkage(data, found.nominal, candidate.alone, where).gap.total)
-    about: dict[str, Any] = {
-        "effect": candidate.name,
-        "gap_closed": _rounded(closed),
-        "rejected_because": candidate.reason,
-        "tried_on_unseen_frames": candidate.alone is not None,
-    }
-    if candidate.estimate is not None:
-        about |= {
-            "sigmas": _rounded(candidate.estimate.significance),
-            "parameters": to_plain(candidate.estimate.effect),
+    def diagnosis(self, places: Sequence[Mapping[str, Any]]) -> Json:
+        """Contents of ``diagnosis.json``."""
+        found, final, verdict = self.found, self.final, self._verdict()
+        causes = [self._cause(name) for name in found.accepted]
+        return {
+            "schema": SCHEMA,
+            "pixcal": __version__,
+            "verdict": verdict,
+            "causes": sorted(causes, key=lambda c: -float(c["gap_closed"])),
+            "gap": {
+                "total": 1.0 if self.where else 0.0,
+                "after": _rounded(final.gap.total),
+                "interval": [_rounded(v) for v in gap_interval(self.data, final, found.final)],
+                "domains": {d: [_rounded(v) for v in final.gap.of_domain(d)] for d in DOMAINS},
+                "where": self._where(),
+                "absolute": self._absolute(),
+                "places": list(places),
+            },
+            "candidates": [self._candidate(c) for c in found.candidates.values()],
+            "more_would_tell": (
+                recommend_frames(self.facts.missing_frames)
+                if verdict in ("unexplained", "partly explained")
+                else []
+            ),
+            "statistics": len(final.before),
+            "looked_at": to_plain(self.facts),
         }
-    return about
 
+    def _verdict(self) -> str:
+        if not self.where:
+            return "no gap"
+        if not self.found.accepted:
+            return "unexplained"
+        gap, after = self.final.gap, self.final.after
+        still = [
+            key
+            for key in flagged(after)
+            if gap.left.get(key, 1.0) > LEFT and sigmas_of(after[key].log_chance) > STILL
+        ]
+        return "explained" if gap.total <= EXPLAINED and not still else "partly explained"
 
-def _curves(
-    found: SearchResult,
-    final: Shrinkage,
-    data: Mapping[Key, F64],
-    measured: Mapping[Key, Curve],
-    reference: Reference,
-) -> list[dict[str, Any]]:
-    """Every statistic: measured, nominal and with effects, with limits of one sigma."""
-    curves = []
-    for key, before in final.before.items():
-        one = statistic_named(key[0])
-        usual = reference.usual[key]
-        after = final.after[key]
-        curve = measured[key]
-        nominal = _band(found.nominal.expected, key, usual)
-        with_effects = _band(found.final.expected, key, usual)
-        curves.append(
-            {
+    def _cause(self, name: str) -> Json:
+        found, candidate = self.found, self.found.candidates[name]
+        estimate = candidate.estimate
+        assert estimate is not None
+        effect = next(e for e in found.final.effects if e.name == name)
+        by_itself = candidate.alone or found.final
+        alone, without = self._with(by_itself), self._with(found.without[name])
+        gain = found.final.log_likelihood - found.without[name].log_likelihood
+        by_law = self._with(found.by_law[name]) if name in found.by_law else alone
+        alike = found.alike.get(name, ())
+        kinds = [type(e.effect) for n in (name, *alike) if (e := found.candidates[n].estimate)]
+        # Two independent parts of the frames, joined by Fisher's rule. A likelihood ratio of e^gain
+        # has a chance of at most e^-gain (Markov's inequality).
+        own = estimate.significance * candidate.share
+        log_both = max(float(log_ndtr(-own)) - max(gain, 0.0), -600.0)
+        chance = np.exp(log_both) * (1 - log_both)
+        same_samples = self.facts.shared and not self.facts.sets and self.facts.on_the_same_pixels
+        if same_samples or candidate.in_maps_alone:
+            # Both parts hold the same samples, or the same offsets: the second says nothing new.
+            chance = float(ndtr(-own))
+        chance *= len(found.candidates) * candidate.ways
+        return {
+            "effect": name,
+            "title": effect.title,
+            "about": (inspect.getdoc(effect) or "").partition("\n")[0].replace("`", ""),
+            "parameters": to_plain(effect),
+            "uncertainty": {k: float(v) for k, v in estimate.errors.items()},
+            "units": {f.name: f.metadata.get("unit", "") for f in fields(effect)},
+            "meanings": {f.name: f.metadata.get("doc", "") for f in fields(effect)},
+            "strengths": list(effect.strengths),
+            "law": estimate.law,
+            "gap_closed": _closed(alone.gap.total),
+            "gap_closed_interval": [
+                _closed(v) for v in reversed(gap_interval(self.data, alone, by_itself))
+            ],
+            "gap_closed_by_law": _closed(by_law.gap.total),
+            "gain_over_rest": _rounded(without.gap.total - self.final.gap.total),
+            "p_value": float(np.clip(chance, MIN_P_VALUE, 1.0)),
+            "sigmas": _rounded(estimate.significance),
+            "why": estimate.why,
+            "given_away_by": self._telling(found.without[name]),
+            "not_told_apart_from": list(alike),
+            "would_decide": recommend_frames(self.facts.missing_frames, kinds) if alike else [],
+        }
+
+    def _telling(self, without: Trial) -> list[dict[str, str]]:
+        """Statistics that an effect makes most likely, best first."""
+        gains = likelier(self.data, without.expected, self.found.final.expected)
+        best = sorted(gains, key=lambda k: -gains[k])[:SHOWN]
+        return [{"statistic": k[0], "set": k[1]} for k in best if gains[k] > 1]
+
+    def _candidate(self, candidate: Candidate) -> Json:
+        alone, estimate = candidate.alone, candidate.estimate
+        closed = _closed(self._with(alone).gap.total) if alone is not None and self.where else 0.0
+        about: Json = {
+            "effect": candidate.name,
+            "gap_closed": _rounded(closed),
+            "rejected_because": candidate.reason,
+            "tried_on_unseen_frames": alone is not None,
+        }
+        if estimate is not None:
+            about["sigmas"] = _rounded(estimate.significance)
+            about["parameters"] = to_plain(estimate.effect)
+        return about
+
+    @cached_property
+    def curves(self) -> dict[Key, Json]:
+        """Every statistic: measured, nominal and with effects, with limits of one sigma."""
+        curves, gap = {}, self.final.gap
+        for key, before in self.final.before.items():
+            one, after = statistic_named(key[0]), self.final.after[key]
+            curves[key] = {
                 "statistic": key[0],
                 "set": key[1],
-                "title": one.title,
-                "domain": one.domain,
-                "quantity": one.quantity,
-                "unit": one.unit,
-                "x_label": one.x_label,
-                "kind": one.kind,
-                "x": curve.x.tolist(),
-                "measured": _natural(data[key], usual).tolist(),
-                "nominal": nominal,
-                "with_effects": with_effects,
+                **{name: getattr(one, name) for name in FACTS},
+                "x": self.measured[key].x.tolist(),
+                "measured": _natural(self.data[key], self.reference.usual[key]).tolist(),
+                "nominal": self._band(self.found.nominal, key),
+                "with_effects": self._band(self.found.final, key),
                 "z": before.sigmas.tolist(),
                 "z_after": after.sigmas.tolist(),
-                "in_gap": key in final.where,
-                "weight": final.gap.weights.get(key, 0.0),
-                "left": final.gap.left.get(key, 0.0),
+                "in_gap": key in self.where,
+                "weight": gap.weights.get(key, 0.0),
+                "left": gap.left.get(key, 0.0),
                 "significance": sigmas_of(before.log_chance),
                 "significance_after": sigmas_of(after.log_chance),
             }
-        )
-    return curves
+        return curves
+
+    def _band(self, trial: Trial, key: Key) -> dict[str, list[float]]:
+        expected, usual = trial.expected, self.reference.usual[key]
+        mean, error = expected.mean[key], np.sqrt(expected.variance[key])
+        low = mean - error if usual is None else np.maximum(mean - error, -3)
+        ends = (("value", mean), ("low", low), ("high", mean + error))
+        return {name: _natural(values, usual).tolist() for name, values in ends}
+
+    def _where(self) -> list[Json]:
+        """Statistics that differ, most significant first; then those that only do with effects."""
+        before, after = self.final.before, self.final.after
+        keys = sorted(self.where, key=lambda k: before[k].log_chance)
+        keys += sorted(flagged(after) - self.where, key=lambda k: after[k].log_chance)
+        return [self._entry(key, before[key], after[key]) for key in keys]
+
+    def _entry(self, key: Key, before: Difference, after: Difference) -> Json:
+        at, curve = before.worst if key in self.where else after.worst, self.curves[key]
+        set_name = "" if key[1] == DETECTOR else f"set {key[1]}, "
+        return {
+            "domain": curve["domain"],
+            "statistic": key[0],
+            "set": key[1],
+            "title": curve["title"],
+            "unit": curve["unit"],
+            "measured": curve["measured"][at],
+            "simulated": curve["nominal"]["value"][at],
+            "after": curve["with_effects"]["value"][at],
+            "z": _rounded(float(before.sigmas[at])),
+            "z_after": _rounded(float(after.sigmas[at])),
+            "significance": _rounded(sigmas_among(before.log_chance, len(self.final.before))),
+            "left": _rounded(self.final.gap.left.get(key, 0.0)),
+            "place": set_name + place(curve, at),
+        }
+
+    def _absolute(self) -> list[Json]:
+        """What differs in units of the bench, with all causes and with each alone; some always.
+
+        Intervals are of one sigma: where a measurement may lie if the simulation is right.
+        """
+        candidates = self.found.candidates
+        only = {n: t for n in self.found.accepted if (t := candidates[n].alone) is not None}
+        rows = []
+        for key, curve in self.curves.items():
+            listed = key in self.where or key[0] in ALWAYS
+            if curve["unit"] not in ("px", "e-", "rad") or not listed:
+                continue
+            at, nominal, after = (
+                self.final.before[key].worst,
+                curve["nominal"],
+                curve["with_effects"],
+            )
+            alone = {name: self._band(trial, key)["value"][at] for name, trial in only.items()}
+            rows.append(
+                {
+                    "quantity": curve["title"] + ("" if key[1] == DETECTOR else f" ({key[1]})"),
+                    "unit": curve["unit"],
+                    "measured": curve["measured"][at],
+                    "simulated": nominal["value"][at],
+                    "simulated_interval": [nominal["low"][at], nominal["high"][at]],
+                    "after": after["value"][at],
+                    "after_interval": [after["low"][at], after["high"][at]],
+                    "with_only": alone,
+                }
+            )
+        return rows
 
 
 def _natural(values: F64, usual: F64 | None) -> F64:
@@ -244,82 +302,6 @@ def _natural(values: F64, usual: F64 | None) -> F64:
         return values
     ratio = np.where(values > 0, np.exp(np.minimum(values, 600)), (1 + values / 3) ** 3)
     return np.asarray(np.sqrt(np.maximum(ratio, 0) * usual))
-
-
-def _band(expected: Expectation, key: Key, usual: F64 | None) -> dict[str, list[float]]:
-    mean, error = expected.mean[key], np.sqrt(expected.variance[key])
-    return {
-        "value": _natural(mean, usual).tolist(),
-        "low": _natural(
-            np.maximum(mean - error, -3) if usual is not None else mean - error, usual
-        ).tolist(),
-        "high": _natural(mean + error, usual).tolist(),
-    }
-
-
-def _where(final: Shrinkage, curves: Mapping[Key, dict[str, Any]]) -> list[dict[str, Any]]:
-    """Statistics that differ, most significant first; then those that only differ with effects."""
-    keys = sorted(final.where, key=lambda k: final.before[k].log_chance)
-    keys += sorted(flagged(final.after) - final.where, key=lambda k: final.after[k].log_chance)
-    return [_entry(key, final, curves[key]) for key in keys]
-
-
-def _entry(key: Key, final: Shrinkage, curve: Mapping[str, Any]) -> dict[str, Any]:
-    at = final.before[key].worst if key in final.where else final.after[key].worst
-    set_name = "" if key[1] == DETECTOR else f"set {key[1]}, "
-    return {
-        "domain": curve["domain"],
-        "statistic": key[0],
-        "set": key[1],
-        "title": curve["title"],
-        "unit": curve["unit"],
-        "measured": curve["measured"][at],
-        "simulated": curve["nominal"]["value"][at],
-        "after": curve["with_effects"]["value"][at],
-        "z": _rounded(float(final.before[key].sigmas[at])),
-        "z_after": _rounded(float(final.after[key].sigmas[at])),
-        "significance": _rounded(sigmas_among(final.before[key].log_chance, len(final.before))),
-        "left": _rounded(final.gap.left.get(key, 0.0)),
-        "place": set_name + place(curve, at),
-    }
-
-
-def _absolute(
-    found: SearchResult,
-    final: Shrinkage,
-    curves: Mapping[Key, dict[str, Any]],
-    reference: Reference,
-) -> list[dict[str, Any]]:
-    """What differs in units of the bench, with all causes and with each alone; some in any case.
-
-    Intervals are of one sigma: where a measurement may lie if the simulation is right.
-    """
-    keys: Sequence[Key] = [k for k in curves if curves[k]["unit"] in ("px", "e-", "rad")]
-    only = {n: trial for n in found.accepted if (trial := found.candidates[n].alone) is not None}
-    rows = []
-    for key in keys:
-        curve = curves[key]
-        if key not in final.where and key[0] not in ALWAYS:
-            continue
-        at = final.before[key].worst
-        quantity = curve["title"] + ("" if key[1] == DETECTOR else f" ({key[1]})")
-        nominal, after = curve["nominal"], curve["with_effects"]
-        rows.append(
-            {
-                "quantity": quantity,
-                "unit": curve["unit"],
-                "measured": curve["measured"][at],
-                "simulated": nominal["value"][at],
-                "simulated_interval": [nominal["low"][at], nominal["high"][at]],
-                "after": after["value"][at],
-                "after_interval": [after["low"][at], after["high"][at]],
-                "with_only": {
-                    name: _band(trial.expected, key, reference.usual[key])["value"][at]
-                    for name, trial in only.items()
-                },
-            }
-        )
-    return rows
 
 
 def _closed(left: float) -> float:

@@ -21,8 +21,9 @@ from pixcal.stages.diagnose.inquiry import inquire, places
 from pixcal.stages.diagnose.on_map import on_map
 from pixcal.stages.diagnose.result import describe
 from pixcal.stages.diagnose.trial import Effects
-from pixcal.storage.artefact import Build, Manifest, write_json
+from pixcal.storage.artefact import Build
 from pixcal.storage.formats import STAGES
+from pixcal.storage.manifest import Manifest, write_json
 from pixcal.storage.stage import make, require, working
 
 STAGE = STAGES["diagnose"]

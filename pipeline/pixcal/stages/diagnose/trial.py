@@ -19,8 +19,7 @@ from pixcal.simulation.effect import Again, Effect, Estimate
 from pixcal.stages.diagnose.nominal import NominalBench
 from pixcal.stages.diagnose.parts import Half, evidence_of
 from pixcal.stages.evidence import Part
-from pixcal.storage.artefact import read_json, write_json
-from pixcal.storage.manifest import digest
+from pixcal.storage.manifest import digest, read_json, write_json
 
 # of which the slowest takes 6 s for as many samples as there are at most (`windows.SAMPLES`)
 OF_ESTIMATE = Bound(seconds=45.0)
@@ -84,13 +83,8 @@ class Trials:
         """Statistics of several benches.
 
         Returns for each bench its simulations (means over the windows), or why it cannot be
-        simulated.
-
-        Parameters
-        ----------
-        benches : effects of each
-        seeds : number of simulations of each
-        beside : done along with them in this process, if any is to be made
+        simulated. ``benches``: effects of each. ``seeds``: number of simulations of each.
+        ``beside``: done along with them in this process, if any is to be made.
         """
         wanted = [(frozenset(bench), seed) for bench in benches for seed in range(seeds)]
         missing = [one for one in dict.fromkeys(wanted) if one not in self._made]

@@ -6,9 +6,9 @@ from typing import Any
 
 from pixcal.model.errors import DamagedError
 from pixcal.stages.fit.sweep import load_run
-from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.fits_facts import date_of
+from pixcal.storage.manifest import read_json, write_json
 from pixcal.storage.products import Card, is_whole, write_map
 
 

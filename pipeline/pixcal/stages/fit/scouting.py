@@ -13,8 +13,8 @@ from pixcal.estimators.fringe_fit.fringes import FrameParameters
 from pixcal.estimators.fringe_fit.scout import Scout, in_turn
 from pixcal.model.arrays import U16, Indices
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader, write_array
+from pixcal.storage.manifest import read_json, write_json
 from pixcal.storage.place import Local
 
 SCOUT_SHARE = 0.01  # share of the tiles that the scout reads (of large windows)

@@ -12,8 +12,9 @@ from pixcal.stages.fit.fringe_set import describe, fit_sets
 from pixcal.stages.fit.maps import write_maps
 from pixcal.stages.fit.products import publish, published
 from pixcal.stages.fit.sweep import load_run
-from pixcal.storage.artefact import Build, Manifest, write_json
+from pixcal.storage.artefact import Build
 from pixcal.storage.formats import STAGES
+from pixcal.storage.manifest import Manifest, write_json
 from pixcal.storage.stage import make, require, working
 
 

@@ -30,14 +30,7 @@ from pixcal.model.options import Sweep as Config
 from pixcal.stages.fit.scouting import CACHE_BYTES, read_frames, scout_set
 from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.stages.reduced_set import STRIP, ReducedSet
-from pixcal.storage.artefact import (
-    Build,
-    Manifest,
-    Workspace,
-    file_digest,
-    read_json,
-    write_json,
-)
+from pixcal.storage.artefact import Build, Workspace
 from pixcal.storage.cube import (
     ArrayReader,
     ArrayWriter,
@@ -47,6 +40,7 @@ from pixcal.storage.cube import (
     write_array,
 )
 from pixcal.storage.formats import STAGES
+from pixcal.storage.manifest import Manifest, file_digest, read_json, write_json
 from pixcal.storage.place import Local
 from pixcal.storage.stage import make, read_acquisition, require
 

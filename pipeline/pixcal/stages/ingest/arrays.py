@@ -15,7 +15,7 @@ from typing import Any
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.errors import DamagedError
-from pixcal.storage.artefact import Build, Manifest, damaged_files, digest, file_digest, read_json
+from pixcal.storage.artefact import Build
 from pixcal.storage.cube import ArrayWriter, create_array, create_group
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.fits_in import FrameFile, SampleFormat
@@ -23,6 +23,7 @@ from pixcal.storage.fits_rows import BAND, FACTS
 from pixcal.storage.folder import DISK_FULL
 from pixcal.storage.frame_reader import Columns, described
 from pixcal.storage.frames import tabulate
+from pixcal.storage.manifest import Manifest, damaged_files, digest, file_digest, read_json
 from pixcal.storage.place import Place
 from pixcal.storage.sources import SourceFile
 

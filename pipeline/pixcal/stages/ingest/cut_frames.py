@@ -16,13 +16,8 @@ def cut_from(array: str, facts: Mapping[str, F64], rows: int) -> list[int | None
 
     Noise makes an exactly constant last row unlikely. Where most frames have one, or nearly, it is
     no mark: rows without light on a camera whose noise is cut off at zero or below a code. Nor are
-    rows that saturate.
-
-    Parameters
-    ----------
-    array : ``bias``, ``dark``, ``flat``, ``fringes/<set>``
-    facts : `pixcal.storage.fits_rows.FACTS` by name, (time, band)
-    rows : of a frame
+    rows that saturate. ``array``: ``bias``, ``dark``, ``flat``, ``fringes/<set>``. ``facts``:
+    `pixcal.storage.fits_rows.FACTS` by name, (time, band). ``rows``: of a frame.
     """
     share = facts["share"][:, -1]
     if np.quantile(share, 0.5, method="lower") >= 0.5:

@@ -29,7 +29,7 @@ from pixcal.model.errors import DamagedError, InputError, RemoteError
 from pixcal.model.options import Ingest as Config
 from pixcal.stages.ingest.arrays import FRAMES_A_PIECE, Writers, find_kept, take_over
 from pixcal.stages.ingest.cut_frames import cut_from, cut_warning
-from pixcal.storage.artefact import Build, Manifest, read_manifest, write_json, write_manifest
+from pixcal.storage.artefact import Build
 from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.cube_place import base_of, chosen_base, cubes_of
 from pixcal.storage.fits_in import FrameFile
@@ -39,6 +39,7 @@ from pixcal.storage.formats import STAGES
 from pixcal.storage.frame_reader import describe
 from pixcal.storage.frames import Frame, columns, inspect, tabulate
 from pixcal.storage.lock import lock
+from pixcal.storage.manifest import Manifest, read_manifest, write_json, write_manifest
 from pixcal.storage.place import Place
 from pixcal.storage.sources import SourceFile, find_sources, fingerprint
 from pixcal.storage.stage import make

@@ -72,10 +72,8 @@ def strips(todo: Sequence[Index], width: int) -> list[Strip]:
 def strip_width(readers: Iterable[Reader], need: Callable[[int], int], runtime: Runtime) -> int:
     """Columns of a strip: all, or as many as leave memory for all workers.
 
-    Parameters
-    ----------
-    readers : of the frames. Cubes at URLs are read column by column, ahead of time.
-    need : bytes of a task, given the number of columns
+    ``readers``: of the frames. Cubes at URLs are read column by column, ahead of time. ``need``:
+    bytes of a task, given the number of columns.
     """
     width = 1
     for reader in readers:

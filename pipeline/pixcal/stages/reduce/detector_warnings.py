@@ -12,10 +12,8 @@ _OF_STEP = 0.1  # relative distance of a gain declared for a step of the convert
 def detector_warnings(summary: Summary, gain: float, saturation: float | None) -> list[str]:
     """What to say of the detector as a whole.
 
-    Parameters
-    ----------
-    gain : that is used (e-/ADU)
-    saturation : where flats were found to saturate (ADU), if it was not declared
+    ``gain``: that is used (e-/ADU). ``saturation``: where flats were found to saturate (ADU), if it
+    was not declared.
     """
     found = []
     if saturation is not None:

@@ -28,8 +28,9 @@ from pixcal.stages.reduce.detector_summary import Summary, pair_sums
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.halves import Window, frames_of, middle_of, read_halves
 from pixcal.stages.reduce.ingested import Ingested
-from pixcal.storage.artefact import Build, write_json
+from pixcal.storage.artefact import Build
 from pixcal.storage.cube import CHUNK, ArrayReader
+from pixcal.storage.manifest import write_json
 
 Json = dict[str, Any]
 

@@ -13,10 +13,10 @@ from pixcal.model.acquisition import Detector
 from pixcal.model.errors import InputError
 from pixcal.stages.reduce.exposures import Exposures, group_exposures
 from pixcal.stages.reduce.flat_survey import FlatSurvey, code_step, of_several_levels
-from pixcal.storage.artefact import read_json, read_manifest
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.frame_reader import ChosenFrames, FrameReader, Reader
+from pixcal.storage.manifest import read_json, read_manifest
 from pixcal.storage.place import Local, Place
 from pixcal.storage.stage import read_acquisition
 

@@ -37,11 +37,12 @@ from pixcal.stages.reduce.frame_statistics import (
 from pixcal.stages.reduce.fringe_sets import Bounds, set_warnings, share_at_mean, write_set
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import STRIP
-from pixcal.storage.artefact import Build, Manifest, Workspace, write_json
+from pixcal.storage.artefact import Build, Workspace
 from pixcal.storage.cube import ArrayReader, create_group
 from pixcal.storage.cube_place import base_of, chosen_base
 from pixcal.storage.folder import transit_bytes
 from pixcal.storage.formats import STAGES
+from pixcal.storage.manifest import Manifest, write_json
 from pixcal.storage.place import Place
 from pixcal.storage.stage import make, working
 

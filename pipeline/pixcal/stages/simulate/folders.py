@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from pixcal.model.errors import InputError
-from pixcal.storage.artefact import MANIFEST, Manifest, read_manifest, write_manifest
 from pixcal.storage.formats import ArtefactKind
+from pixcal.storage.manifest import MANIFEST, Manifest, read_manifest, write_manifest
 
 
 @dataclass(frozen=True)

@@ -34,11 +34,11 @@ from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import Recording, recordings
 from pixcal.stages.simulate.folders import Target
 from pixcal.stages.simulate.truth import Effects, row_blocks, write_truth
-from pixcal.storage.artefact import Manifest, artefact_key
+from pixcal.storage.artefact import artefact_key
 from pixcal.storage.fits_out import COMPRESSED, FrameWriter
 from pixcal.storage.formats import STAGES
 from pixcal.storage.lock import lock
-from pixcal.storage.manifest import file_digest
+from pixcal.storage.manifest import Manifest, file_digest
 
 STAGE, TRUTH = STAGES["simulate"], STAGES["simulate-truth"]
 FRAMES_PER_TASK = 128  # the maps of some rows are made once for so many frames

@@ -14,8 +14,8 @@ from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import Camera, states_of
 from pixcal.simulation.recording import Recording
-from pixcal.storage.artefact import write_json
 from pixcal.storage.fits_out import FrameWriter
+from pixcal.storage.manifest import write_json
 
 Effects = tuple[Effect, ...]
 
