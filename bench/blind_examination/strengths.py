@@ -98,7 +98,7 @@ def _bent(s: float, rng: np.random.Generator) -> Plain:
 
 _BIAS = ("jitter_rms", "ramp_e_h", "walk_e_h", "settle_e")
 _DRIFT = ("ramp", "settle", "walk")
-_ROWS = ("row_rms", "flicker_rms", "interlace_rms", "column_rms")
+_ROWS = ("row_rms", "flicker_rms", "interlace_rms", "column_rms", "alternate_rms")
 _CODES = ("coarse_adu", "dnl_rms", "ripple")
 _WAVE = ("ramp", "walk", "hop")
 

@@ -29,7 +29,8 @@ class RowNoise(Effect):
     """Noise of the reference or of the readout that all pixels of a row or a column share.
 
     White and flicker noise from row to row; rows that two amplifiers read in turn, whose levels
-    part and meet from frame to frame; and columns, white from column to column and frame to frame.
+    part and meet from frame to frame, or whose references hold on to the row before, the second
+    last of the frame; and columns, white from column to column and frame to frame.
     What the whole frame has in common is `bias_drift`: flicker noise is given without its mean.
     Nothing of it is constant in time, so maps do not tell of it; and frames of fringes do not hold
     the rows' offsets well enough to take them off (shot noise is larger), only bars of dark pixels
@@ -41,7 +42,7 @@ class RowNoise(Effect):
     acts_at = Stage.READOUT
     order = 2
     domains = ("noise", "time")
-    strengths = ("row_rms", "flicker_rms", "interlace_rms", "column_rms")
+    strengths = ("row_rms", "flicker_rms", "interlace_rms", "column_rms", "alternate_rms")
     left_because = "noise that is independent in each frame averages out"
     frames_needed = ("dark",)
     sources = (
@@ -75,6 +76,13 @@ class RowNoise(Effect):
         high=1e5,
         doc="white noise from column to column, new in each frame, rms",
     )
+    alternate_rms: float = quantity(
+        0.0,
+        unit="e-",
+        low=0,
+        high=1e5,
+        doc="noise from row to row, rms, of which a row shares half with the second next",
+    )
 
     def readout(self, adu: F32, shot: Shot) -> F32:
         rng = shot.recording.pixel_rng(self.name, shot.frame)
@@ -92,6 +100,9 @@ class RowNoise(Effect):
         # Last, so that without it the others are what they are with it.
         if self.flicker_rms:
             rows += self.flicker_rms * flicker(rng, ny)
+        if self.alternate_rms:
+            white = rng.standard_normal(ny + 2)
+            rows += self.alternate_rms * np.sqrt(0.5) * (white[2:] + white[:-2])
         return rows, columns
 
     @classmethod
@@ -111,8 +122,8 @@ class RowNoise(Effect):
         columns = [line_spectrum(_turned(r), good.T, n) for r, good, n in dark]
         rows += [_of_fringes(f, across=False) for f in fringes]
         columns += [_of_fringes(f, across=True) for f in fringes]
-        found, size, error, sigmas = [], np.zeros(4), np.full(4, np.nan), []
-        for part, spectra, own in ((slice(3), rows, _row_shapes), (slice(3, 4), columns, _flat)):
+        found, size, error, sigmas = [], np.zeros(5), np.full(5, np.nan), []
+        for part, spectra, own in (([0, 1, 2, 4], rows, _row_shapes), ([3], columns, _flat)):
             there = [s for s in spectra if s is not None]
             if there:
                 noise = fit_lines(there, [own(s) for s in there])
@@ -136,10 +147,12 @@ def _turned(residual: F32) -> F32:
 
 
 def _row_shapes(spectrum: LineSpectrum) -> F64:
-    """White noise, flicker, and alternate rows (m, n)."""
+    """White noise, flicker, alternate rows, and what every second row shares (m, n)."""
     alternate = np.where(spectrum.modes == spectrum.lines // 2, spectrum.lines, 0.0)
     power = flicker_power(spectrum.lines)[spectrum.modes]
-    return np.stack([np.ones(len(power)), power, alternate])
+    turn = np.cos(4 * np.pi * spectrum.modes / spectrum.lines)
+    shared = 1 + (1 - 2 / spectrum.lines) * turn
+    return np.stack([np.ones(len(power)), power, alternate, shared])
 
 
 def _flat(spectrum: LineSpectrum) -> F64:
