@@ -28,10 +28,7 @@ def with_neighbours(numbers: Indices) -> Indices:
 
 
 def since_gap(numbers: Indices, steps: int) -> Mask:
-    """Frames (t,) with fewer than so many frames of an array between them and the last gap.
-
-    The beginning counts as a gap.
-    """
+    """Frames (t,) with fewer than so many between them and the last gap, or the beginning."""
     begins = np.flatnonzero(~follows(numbers))
     place = np.arange(len(numbers))
     return np.asarray(place - begins[np.searchsorted(begins, place, "right") - 1] < steps)

@@ -134,10 +134,7 @@ class _Paths:
 
 
 def gaussian_beam(x: ArrayLike, y: ArrayLike, centre: tuple[float, float], radius: float) -> F64:
-    """Intensity of a Gaussian beam at x, y relative to its peak, all in px.
-
-    At the radius it has fallen to 1/e².
-    """
+    """Intensity of a Gaussian beam (1/e² at its radius) at x, y over its peak's, all in px."""
     # A product of two exponentials: with x a row and y a column only their sides are computed.
     across = np.exp(-2 * ((np.asarray(x, float) - centre[0]) / radius) ** 2)
     along = np.exp(-2 * ((np.asarray(y, float) - centre[1]) / radius) ** 2)

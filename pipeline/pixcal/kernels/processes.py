@@ -70,10 +70,7 @@ def _walk(normals: F64, keep: float, step: float, walk: F64) -> None:
 
 
 def swing(time_s: F64, hz: float, phase: float, exptime_s: float = 0.0) -> F64:
-    """Sine of unit amplitude, as its mean over an exposure that starts at each time (t,), s.
-
-    ``phase`` is that at time zero, rad.
-    """
+    """Sine of some ``phase`` (rad) at time 0: its mean over exposures from each time (t,), s."""
     middle = 2 * np.pi * hz * (time_s + exptime_s / 2) + phase
     return np.asarray(np.sinc(hz * exptime_s) * np.sin(middle))
 

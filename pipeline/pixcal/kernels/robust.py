@@ -139,10 +139,7 @@ def _medians_around(wide: F32, side: int, out: F32) -> None:
 
 
 def median_around(values: NDArray[Any], side: int) -> F32:
-    """Median (y, x) of a square about each pixel, its side odd; beyond the edges a map is mirrored.
-
-    NaN are not counted.
-    """
+    """Median (y, x) of an odd square about each pixel, NaN left out; edges mirror the map."""
     out = np.empty(values.shape, np.float32)
     _medians_around(np.pad(values.astype(np.float32), side // 2, "symmetric"), side, out)
     return out

@@ -144,10 +144,7 @@ def geometry(bench: Bench, number: int) -> optics.Geometry:
 
 
 def fibre_light(bench: Bench, number: int, rows: Rows) -> tuple[F64, F64]:
-    """Light of fibres A and B alone on rows of the window, in units of the peak of A, (y, x).
-
-    Gaussian beams, taken at the centres of the pixels of the perfect grid.
-    """
+    """Gaussian beams A and B alone (y, x), at centres of a perfect grid, over the peak of A."""
     g, o = geometry(bench, number), bench.optics
     x = np.arange(bench.detector.shape[1])
     y = np.arange(*rows)[:, None]

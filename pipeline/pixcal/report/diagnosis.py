@@ -158,10 +158,7 @@ def still_differing(result: DiagnosisContents) -> list[Facts]:
 
 
 def worst_of_each_domain(curves: Sequence[Facts]) -> tuple[list[Facts], list[Facts]]:
-    """The first `SHOWN` curves, shared evenly among the domains, and the others.
-
-    Both are sorted by domain, that of the most significant curve first.
-    """
+    """The first `SHOWN` curves, shared among domains, and the rest; the worst domain first."""
     order = list(dict.fromkeys(c["domain"] for c in curves))
     domains = [[c for c in curves if c["domain"] == domain] for domain in order]
     ranked = sorted((rank, n) for n, d in enumerate(domains) for rank in range(len(d)))

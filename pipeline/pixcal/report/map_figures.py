@@ -34,10 +34,7 @@ MEANS_DRAWN = 800  # most means of a profile that are drawn one by one
 def offsets(
     name: str, delta: MapSummary, sigma: MapSummary, start: tuple[int, int] = (0, 0)
 ) -> Figure:
-    """A map of offsets (px) with the means of its columns below and of its rows beside it.
-
-    Of a part of a map, ``start`` is its first row and column.
-    """
+    """A map of offsets (px), or a part from ``start``, with means of columns and rows beside it."""
     width, height = fit_box(delta.shape, 5.7, 5.4)
     total = height + 3.45
     figure = Figure(figsize=(WIDE, total), dpi=DPI)

@@ -138,10 +138,7 @@ def bands(source: Source, side: int = 1) -> Iterator[tuple[int, NDArray[Any]]]:
 
 
 def summarise(source: Source, most: int = SHOWN_PIXELS) -> MapSummary:
-    """Reduce a map, whose values that are not finite count as masked, to what is shown of it.
-
-    The image has at most ``most`` blocks along its longer side.
-    """
+    """What is shown of a map in ``most`` blocks a side; values that are not finite are masked."""
     ny, nx = source.shape
     side = block_side((ny, nx), most)
     step = _sample_step(ny * nx, nx)

@@ -30,10 +30,7 @@ def nominal_vector(acquisition: Acquisition, name: str) -> tuple[float, float]:
 def fitted_shape(
     run: Path, facts: Mapping[str, Any], acquisition: Acquisition, window: tuple[int, int]
 ) -> FringeShape:
-    """The fringes of a set as fitted, from pixel (0, 0) of a window (y, x) px.
-
-    ``facts`` is what ``fit.json`` says of the set; ``run`` is for messages.
-    """
+    """The fringes of a set as fitted (``fit.json``), from pixel (0, 0) of a window (y, x) px."""
     phase, origin = facts["phase_at_origin_rad"], (0.0, 0.0)
     if facts["model"] == "paraxial":
         return Paraxial(phase, facts["kx"], facts["ky"], origin, max(window) / 2)

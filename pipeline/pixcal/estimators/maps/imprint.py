@@ -14,10 +14,7 @@ MIN_SIGNAL = 1.0  # of a sample (e-), below which its shot noise is not taken
 
 
 def usual_fringe(theta: F64, count: int) -> tuple[F64, F64]:
-    """Phases (count,) spread over a fringe, and the maps (3, count) of pixels of the usual light.
-
-    Of maps (3, ...), as those of `imprint`.
-    """
+    """Phases (count,) over a fringe, and maps (3, count) of pixels of the usual light."""
     psi = np.linspace(0, 2 * np.pi, count, endpoint=False)
     mean, amplitude = np.median(theta[0]), np.median(np.hypot(theta[1], theta[2]))
     return psi, np.stack([np.full(count, mean), amplitude * np.sin(psi), amplitude * np.cos(psi)])
@@ -41,10 +38,7 @@ def imprint(theta: F64, g: F64, change: F64, read_noise_e: float) -> F64:
 
 
 def left_in_samples(theta: F64, g: F64, change: F64, read_noise_e: float) -> float:
-    """Mean square of what the maps do not take up, in units of the noise of the samples.
-
-    Parameters as of `imprint`.
-    """
+    """Mean square, over the samples' noise, of what maps do not take up; as of `imprint`."""
     _, usual = usual_fringe(theta, PHASES)
     weight = _weight(g @ usual, read_noise_e)
     taken = _taken(g, change, weight)

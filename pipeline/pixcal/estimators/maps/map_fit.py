@@ -32,10 +32,7 @@ class MapPart:
 
     @classmethod
     def of(cls, signals: F64, data: F64, free: F64, good: Mask) -> "MapPart":
-        """Data (y, x) and signals (n, y, x) whose free terms (m, y, x) are taken off.
-
-        Outliers are left out.
-        """
+        """Data (y, x), signals (n, y, x), without outliers or free terms (m, y, x)."""
         use = good
         for _ in range(2):
             left = without(data[use][:, None], free[:, use].T)[:, 0]

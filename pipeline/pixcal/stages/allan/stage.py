@@ -49,10 +49,7 @@ COUNT_BYTES = 64 << 20  # of the digits of all values of a map (`quantiles_of_pa
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
-    """Measure how the error of the offset maps falls with the number of frames.
-
-    Reads ``RUN/fit``; makes ``RUN/allan`` and the product ``allan.json``.
-    """
+    """Make ``RUN/allan`` and ``allan.json`` from ``RUN/fit``: how the error falls with frames."""
     with working(run_dir, "fit") as inputs:
         facts = read_json(run_dir / "fit" / "fit.json")["sets"]
         sets = {

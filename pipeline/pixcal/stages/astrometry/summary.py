@@ -79,10 +79,7 @@ def _roots(sums: F64) -> F64:
 
 
 def running_means(errors: F64, lengths: list[int]) -> list[F64]:
-    """Mean (star, 1) of the errors (star, position) of each star over its first positions.
-
-    NaN are left out, and stand where a star has none.
-    """
+    """Mean (star, 1) of errors (star, position) over each star's first positions, NaN left out."""
     good = np.isfinite(errors)
     sums, counts = np.cumsum(np.where(good, errors, 0.0), axis=1), np.cumsum(good, axis=1)
     means = sums / np.where(counts > 0, counts, np.nan)

@@ -105,10 +105,7 @@ class Side:
         return [s for s, share in zip(self.sets, shares, strict=True) if abs(share) > PART_OF]
 
     def read(self, tile: Tile, direction: Vector) -> tuple[F64, F64, F64]:
-        """Offset along a unit vector (x, y), px, its variance, px², and its modes, on a tile.
-
-        (y, x), NaN where there is none, and (mode, y, x).
-        """
+        """Offset along a vector (x, y), px, NaN where none; variance, px²; modes (mode, y, x)."""
         offsets = [s.delta(tile) for s in self.sets]
         delta, sigma = (np.stack(maps) for maps in zip(*offsets, strict=True))
         shares = self._shares([s.axis(tile) for s in self.sets], sigma, direction)

@@ -43,7 +43,7 @@ def _create_groups(store: Place, array: str) -> None:
 
 
 def finish(writer: ArrayWriter) -> dict[str, Any]:
-    """Close an array: its shape, type, and digest; DamagedError if a chunk is missing or cut."""
+    """Close an array: shape, type and digest; DamagedError if a chunk is missing or cut."""
     index = writer.finish()
     content = hashlib.sha256(repr((writer.shape, writer.dtype.str)).encode())
     content.update(index.tobytes())
