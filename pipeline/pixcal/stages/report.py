@@ -49,8 +49,6 @@ from pixcal.storage.stage import make, require, working
 
 FIGURE_BYTES = 192 << 20  # Matplotlib, one figure and the page
 
-STAGE = STAGES["report"]
-
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Write ``RUN/report/report.html`` and ``RUN/products/report.html``.
@@ -71,7 +69,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             (made.folder / "report.html").write_text(page, encoding="utf-8")
             made.summary = {"bytes": len(page.encode()), "sections": page.count("<section")}
 
-        return make(run_dir, STAGE, result_options(config), inputs, body)
+        return make(run_dir, STAGES["report"], result_options(config), inputs, body)
 
 
 def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime) -> Contents:

@@ -1,6 +1,6 @@
 """Body of the command ``pixcal allan``."""
 
 from pixcal.model.options import Allan as Config
-from pixcal.stages.allan.stage import STAGE, run
+from pixcal.stages.allan.stage import run
 
-__all__ = ["STAGE", "Config", "run"]
+__all__ = ["Config", "run"]

@@ -43,7 +43,6 @@ from pixcal.storage.formats import STAGES
 from pixcal.storage.manifest import Manifest, read_json, write_json
 from pixcal.storage.stage import make, working
 
-STAGE = STAGES["allan"]
 SCHEMA = "pixcal/allan/1"
 COUNT_BYTES = 64 << 20  # of the digits of all values of a map (`quantiles_of_parts`)
 
@@ -69,7 +68,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             whole = {"schema": SCHEMA, "pixcal": __version__, "sets": result}
             write_json(made.folder / "allan.json", whole)
 
-        return make(run_dir, STAGE, result_options(config), inputs, body)
+        return make(run_dir, STAGES["allan"], result_options(config), inputs, body)
 
 
 def _check_region(region: Region | None, window: tuple[int, int]) -> None:

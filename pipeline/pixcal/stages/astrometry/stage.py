@@ -70,8 +70,6 @@ _BYTES_PER_FITTED_MODE = 28
 # peak of a task of the stars, for each pixel of a star's windows (measured)
 _BYTES_PER_WINDOW_PIXEL = 200
 
-STAGE = STAGES["astrometry"]
-
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Compare centroids on a perfect grid with centroids on the measured maps.
@@ -104,7 +102,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             _measure(made, components, modes, acquisition, telescope, config, runtime)
 
         options = result_options(config) | {"truth": None}
-        return make(run_dir, STAGE, options, inputs, body)
+        return make(run_dir, STAGES["astrometry"], options, inputs, body)
 
 
 def _measure(

@@ -49,7 +49,6 @@ from pixcal.storage.formats import STAGES
 from pixcal.storage.manifest import MANIFEST, Manifest, read_json, write_json
 from pixcal.storage.stage import make, require, working
 
-STAGE = STAGES["crests"]
 SCHEMA = "pixcal/crests/1"
 MAP_SIDE = 21  # places along each side of a cost map; odd, so that the minimum is one of them
 MAP_REACH = 0.04  # how far the maps go from the minimum, as a share of distance and baseline
@@ -99,7 +98,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             whole = {"schema": SCHEMA, "pixcal": __version__, "sets": sets}
             write_json(made.folder / "crests.json", whole)
 
-        return make(run_dir, STAGE, result_options(config), inputs, body)
+        return make(run_dir, STAGES["crests"], result_options(config), inputs, body)
 
 
 def _facts(paths: CrestPaths, fit: CrestFit, maps: Mapping[str, NDArray[Any]]) -> dict[str, Any]:

@@ -26,8 +26,6 @@ from pixcal.storage.formats import STAGES
 from pixcal.storage.manifest import Manifest, write_json
 from pixcal.storage.stage import make, require, working
 
-STAGE = STAGES["diagnose"]
-
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Diagnose a reduced run: make ``RUN/diagnose`` and the product ``diagnosis.json``."""
@@ -42,7 +40,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     }
     with working(run_dir, "reduce") as inputs:
         body = partial(_diagnose, run_dir, kinds, base, runtime)
-        return make(run_dir, STAGE, plain, inputs, body)
+        return make(run_dir, STAGES["diagnose"], plain, inputs, body)
 
 
 def _diagnose(
