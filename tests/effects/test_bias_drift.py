@@ -298,6 +298,7 @@ def test_a_ramp_that_begins_anew_with_each_run_is_found(
     assert abs(found.effect.run_ramp_e_h + 4000) < 4 * error
 
 
+@pytest.mark.long
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("other", ["intensity_noise", "contrast_noise"])
 def test_light_that_changes_is_no_drift_of_the_runs(
@@ -319,6 +320,7 @@ def test_tracks_are_replayed(make_effect_bench: Callable[..., Bench]) -> None:
         np.testing.assert_allclose(on - plain, wanted, atol=0.1)
 
 
+@pytest.mark.long
 def test_a_track_takes_the_place_of_the_laws_in_its_run_alone(
     make_effect_bench: Callable[..., Bench],
 ) -> None:
@@ -358,6 +360,7 @@ def test_offsets_of_bias_and_dark_frames_are_replayed_as_they_were(
         np.testing.assert_allclose(on - plain, wanted, atol=1.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("jitter", [0.0, 20.0])
 def test_the_jitter_of_a_replay_is_that_of_the_fringes(
     acquired: Callable[..., Evidence], jitter: float

@@ -28,6 +28,11 @@ GLOW = ROOT / "docs" / "examples" / "glow.py"
 KNOWN = known_effects([GLOW, *sorted((Path(__file__).parent / "own").glob("*.py"))])
 EVERY = pytest.mark.parametrize("cls", KNOWN.values(), ids=KNOWN)
 EVERY_OF_PIXCAL = pytest.mark.parametrize("cls", effects().values(), ids=effects())
+EVERY_BUT_EXAMPLES = pytest.mark.parametrize(
+    "cls",
+    [c if n in effects() else pytest.param(c, marks=pytest.mark.long) for n, c in KNOWN.items()],
+    ids=KNOWN,
+)
 PAGES = sorted((ROOT / "docs" / "reference" / "effects").glob("*.md"))
 """What effects are, their sources, and pictures of what they do to the offsets; optional."""
 DOMAINS = {"space", "time", "intensity", "noise"}
@@ -145,7 +150,7 @@ def test_windows_share_what_happens_to_frames_and_not_the_noise_of_pixels(
         assert np.abs(difference.mean(axis=(1, 2))).max() < 6 * noise / np.sqrt(here[0].size)
 
 
-@EVERY
+@EVERY_BUT_EXAMPLES
 def test_it_is_not_claimed_where_it_is_not(
     cls: type[Effect], acquired: Callable[..., Evidence]
 ) -> None:

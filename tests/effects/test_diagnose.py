@@ -225,6 +225,7 @@ def test_a_bent_ladder_of_flats_is_a_gap_and_its_response_closes_it(
     assert "flat_ladder" in {entry["statistic"] for entry in found["gap"]["where"]}
 
 
+@pytest.mark.long
 def test_a_saturated_rung_of_the_ladder_is_left_out(reduced: Callable[..., Path]) -> None:
     """Whether or not its level is declared; the rest is looked at as before."""
     rungs = [{"exptime_s": t, "count": 20} for t in (0.01, 0.02, 0.03, 0.08)]

@@ -173,6 +173,7 @@ def test_pixels_that_differ_tell_where_the_contrast_is_noisy(
     assert nothing.significance < 4
 
 
+@pytest.mark.long
 def test_flats_tell_where_there_are_no_fringes(acquired: Callable[..., Evidence]) -> None:
     found = Lag.estimate(replace(acquired(None, {"lag": {}}), fringes={}))
     assert found is not None

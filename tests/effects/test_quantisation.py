@@ -217,6 +217,7 @@ def test_uneven_codes_are_as_uneven_where_float32_is_coarse() -> None:
     assert np.mean(found) == pytest.approx(0.007, abs=4 / 2e3)
 
 
+@pytest.mark.long
 def test_bits_that_leave_codes_out_are_no_coarse_step(acquired: Callable[..., Evidence]) -> None:
     """A code in 256 that never comes is a wrong bit, though a step of 1 + 1/256 makes such too."""
     bits = (0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.4, -1.4, -1.5, 0.1, 3.9)

@@ -119,6 +119,7 @@ def test_without_noise_the_fibres_are_found_to_numerical_precision() -> None:
     assert fit.cost < 1e-15
 
 
+@pytest.mark.long
 def test_a_beam_that_is_not_even_moves_no_crest() -> None:
     shape = (420, 510)
     truth = fibres(shape, 11.0, 1.1, offset=(2.0, 1.0))
@@ -160,6 +161,7 @@ def test_crests_are_bright_and_valleys_dark() -> None:
     assert np.corrcoef(paths.k, across)[0, 1] > 0.999
 
 
+@pytest.mark.long
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("pitch", [WIDE_PITCH, 4.4e-3])
 def test_errors_are_honest(pitch: float) -> None:
@@ -252,6 +254,7 @@ def test_every_start_ends_at_the_same_minimum(
     assert found.evaluations < 40
 
 
+@pytest.mark.long
 def test_the_cost_has_one_minimum(seen: tuple[CrestPaths, Geometry]) -> None:
     paths, truth = seen
     fit = fit_crests(paths, truth)

@@ -160,6 +160,7 @@ def test_figure_13_is_flat_without_crosstalk(laboratory: Lab) -> None:
     assert not found.expected.any()
 
 
+@pytest.mark.long
 def test_figure_15_shows_the_crest_and_loses_it(laboratory: Lab) -> None:
     bench = resized(laboratory.bench("figure-15"), side=160, frames=20)
     found = figure_14.measure(without_noise(bench, laboratory))

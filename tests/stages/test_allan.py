@@ -198,6 +198,7 @@ def test_results_do_not_depend_on_the_runtime(tmp_path: Path, cluster: Runtime) 
     assert len(texts) == 1
 
 
+@pytest.mark.long
 def test_gaps(tmp_path: Path) -> None:
     maps = noise(40)
     maps[11:15] = np.nan

@@ -259,6 +259,7 @@ HYPERBOLIC = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("exact", [False, True])
 def test_modes_of_the_bench_are_no_errors_of_the_maps(
@@ -409,6 +410,7 @@ def test_it_is_made_once_and_again_when_maps_change(
     assert astrometry.run(run, config, SYNC).key != first.key
 
 
+@pytest.mark.long
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("truth", [False, True])
 def test_one_fringe_axis(tmp_path: Path, truth: bool) -> None:

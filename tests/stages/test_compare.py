@@ -363,6 +363,7 @@ def test_a_drift_shows_between_halves_and_not_between_odd_and_even(
     assert other["beyond_noise"]["variance_px2"] < 0.1 * halves["beyond_noise"]["variance_px2"]
 
 
+@pytest.mark.long
 def test_three_runs_tell_which_is_odd(make: Any, tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     steps = np.kron(rng.normal(0, 1e-3, (18, 24)), np.ones((8, 8)))[: SHAPE[0], : SHAPE[1]]

@@ -430,6 +430,7 @@ def test_all_pixels_masked_is_no_error(tmp_path: Path) -> None:
     assert "no pixel with an offset" in words(page_of(run))
 
 
+@pytest.mark.long
 def test_large_maps_are_shown_in_means_of_blocks(tmp_path: Path) -> None:
     page = page_of(make_run(tmp_path / "run", (131, 907), ("one",)))
     text = words(page)

@@ -194,6 +194,7 @@ def test_a_damaged_pointer_is_refused(tmp_path: Path, text: str) -> None:
         cubes_of(tmp_path / "run/reduce")
 
 
+@pytest.mark.long
 def test_a_place_that_cannot_be_written_leaves_nothing_behind(
     tmp_path: Path, s3_endpoint: str
 ) -> None:
