@@ -31,4 +31,8 @@ def inverse_normal(normal: NDArray[Any], rcond: float = 1e-9) -> F64:
     """
     scale = root_diagonal(normal)
     both = scale[..., :, None] * scale[..., None, :]
-    return np.asarray(np.linalg.pinv(normal / both, rcond=rcond, hermitian=True) / both)
+    values, vectors = np.linalg.eigh(normal / both)
+    size = np.abs(values)
+    known = size > rcond * size.max(axis=-1, keepdims=True, initial=0.0)
+    inverse = np.divide(1.0, values, out=np.zeros_like(values), where=known)
+    return np.asarray((vectors * inverse[..., None, :]) @ np.swapaxes(vectors, -1, -2) / both)

@@ -7,7 +7,6 @@ from typing import TypeVar
 
 import numpy as np
 from scipy.ndimage import maximum_filter
-from scipy.optimize import minimize
 
 from pixcal.kernels.robust import median
 from pixcal.model.arrays import C128, F32, F64, Mask
@@ -23,6 +22,8 @@ HONEST_FRINGES = 1.95
 SHORTEST_PX = 2.2
 # least cosine between the fringes' axis and the nominal one: the nominal vector gives the sign
 MOST_TURNED = 0.5
+RESOLVED = 1e-7  # last step to the peak of the spectrum, rad/px
+MOST_STEPS = 20  # a few are enough from the highest bin
 # pixels that a smooth phasor is fitted to, about: ten terms are then known to 4 % of the noise of
 # one pixel
 MOST_PIXELS = 6000
@@ -140,21 +141,27 @@ def _peak(light: F64, nominal: tuple[float, float]) -> F64 | None:
 
 
 def _refined(light: F64, start: F64) -> F64:
-    """Peak (kx, ky), rad/px, of the continuous power spectrum of maps (n, y, x) near a start."""
-    shape = (light.shape[1], light.shape[2])
-    y, x = grid(shape)
+    """Peak (kx, ky), rad/px, of the continuous power spectrum of maps (n, y, x) near a start.
 
-    def minus_power(k: F64) -> float:
-        phasor = np.exp(-1j * k[0] * x) * np.exp(-1j * k[1] * y)
-        return -float((np.abs((light * phasor).sum(axis=(1, 2))) ** 2).sum())
-
-    scale = -minus_power(start)
-    simplex = start + np.array([[0, 0], [0.3, 0], [0, 0.3]]) / min(shape)
-    options = {"initial_simplex": simplex, "xatol": 1e-7, "fatol": 1e-12}
-    solved = minimize(
-        lambda k: minus_power(k) / scale, start, method="Nelder-Mead", options=options
-    )
-    return np.asarray(solved.x)
+    By Newton's method: derivatives of the spectrum are those of the maps times powers of y and x.
+    """
+    y, x = grid((light.shape[1], light.shape[2]))
+    orders, k = np.arange(3)[:, None], start
+    for _ in range(MOST_STEPS):
+        across = (-1j * x) ** orders * np.exp(-1j * k[0] * x)
+        along = (-1j * y.T) ** orders * np.exp(-1j * k[1] * y.T)
+        # (n, order along y, order along x)
+        f = along @ (light @ across.T.real + 1j * (light @ across.T.imag))
+        first = np.stack([f[:, 0, 1], f[:, 1, 0]])
+        second = np.array([[f[:, 0, 2], f[:, 1, 1]], [f[:, 1, 1], f[:, 2, 0]]])
+        bend = (first @ first.conj().T + second @ f[:, 0, 0].conj()).real
+        if np.linalg.eigvalsh(bend)[-1] >= 0:
+            break
+        step = -np.linalg.solve(bend, (first @ f[:, 0, 0].conj()).real)
+        k = k + step
+        if np.abs(step).max() < RESOLVED:
+            break
+    return np.asarray(k)
 
 
 @lru_cache(maxsize=8)
