@@ -59,4 +59,5 @@ def _gap(axes: Axes, diagnosis: dict[str, Any]) -> None:
     bars = axes.barh(["nominal", f"with\n{found}"], sizes, color=[GREY, BLUE], height=0.55)
     axes.bar_label(bars, [f"{size:.0f} %" for size in sizes], padding=4)
     axes.invert_yaxis()
-    axes.set(title="Gap between data and simulation", xlabel="gap (%)", xlim=(0, 120))
+    axes.set(title="Gap to the simulation", xlabel="gap (%)", xlim=(0, 135))
+    axes.set_xticks(range(0, 101, 20))

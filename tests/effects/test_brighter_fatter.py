@@ -231,7 +231,7 @@ def test_boundaries_that_move_otherwise_between_rows_are_found(
     acquired: Callable[..., Evidence],
 ) -> None:
     given = {"shift_px_per_e": 3e-7, "falloff_px": 0.7, "along_y": 0.8}
-    found = BrighterFatter.estimate(acquired(None, {"brighter_fatter": given}))
+    found = BrighterFatter.estimate(acquired({"seed": 101}, {"brighter_fatter": given}))
     assert found is not None
     assert isinstance(found.effect, BrighterFatter)
     assert abs(found.effect.along_y - 0.8) < 4 * found.errors["along_y"] < 0.1

@@ -129,7 +129,7 @@ def test_a_modulator_that_settles_is_found(
     apart = profile(found.effect.settling, at) - (np.array(share) - np.mean(share))
     # But for the mean, which is the frames' own phase. One row tells of the spline's first end.
     assert np.std(apart[1:]) < 0.025 * np.ptp(share)
-    assert np.ptp(apart) < 0.15 * np.ptp(share)
+    assert abs(apart[0]) < 4 * found.errors["settling[0]"] < 0.4 * np.ptp(share)
 
 
 def test_phases_that_stand_still_settle_nothing(acquired: Callable[..., Evidence]) -> None:

@@ -185,7 +185,8 @@ class GhostFringes(Effect):
         law, tied, left = _law(found.waves, middle)
         # Beams interfere with each other: fringes alone, or a static pattern that is not theirs,
         # is no reflection. What multiplies both alike, in all sets, is the flat's.
-        a_beam = left < UNTIED and not (law == BOTH and _of_the_flat(found.waves, evidence))
+        moving = law == BOTH or any(SINGLE[law][1:])
+        a_beam = left < UNTIED and not (moving and _of_the_flat(found.waves, evidence))
         return Estimate(
             cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=tuple(waves)),
             errors,

@@ -29,8 +29,8 @@ class RowNoise(Effect):
     """Noise of the reference or of the readout that all pixels of a row or a column share.
 
     White and flicker noise from row to row; rows that two amplifiers read in turn, whose levels
-    part and meet from frame to frame, or whose references hold on to the row before, the second
-    last of the frame; and columns, white from column to column and frame to frame.
+    part and meet from frame to frame, or each of which keeps half of the noise of the row that it
+    read before; and columns, white from column to column and frame to frame.
     What the whole frame has in common is `bias_drift`: flicker noise is given without its mean.
     Nothing of it is constant in time, so maps do not tell of it; and frames of fringes do not hold
     the rows' offsets well enough to take them off (shot noise is larger), only bars of dark pixels
@@ -81,7 +81,7 @@ class RowNoise(Effect):
         unit="e-",
         low=0,
         high=1e5,
-        doc="noise from row to row, rms, of which a row shares half with the second next",
+        doc="noise from row to row, rms; half of its variance is shared with the second next row",
     )
 
     def readout(self, adu: F32, shot: Shot) -> F32:

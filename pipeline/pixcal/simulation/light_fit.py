@@ -44,6 +44,7 @@ STRAIGHT = 0.02  # part of a step's change by which derivatives may fail to tell
 # have much the same noise, so that as little says nothing
 LEAST = 0.01
 UNTOLD = 1e-8  # share of a signal's square that is left where smooth surfaces take all of it
+LOWEST = -3.0  # significance
 # of what an effect must do to a map, as much has to be there; where it shows by so many errors
 AGREED, SHOWN = 0.5, 2.0
 
@@ -73,7 +74,8 @@ class LightFit:
         """In standard deviations; zero where a map that must show the effect does not."""
         if min(self.agreed.values(), default=1.0) < AGREED:
             return 0.0
-        return sigmas_of_chi2(self.gain, max(self.dof, 1))
+        # A gain of nothing would be far below what chance does, and rule the scatter of many.
+        return max(sigmas_of_chi2(self.gain, max(self.dof, 1)), LOWEST)
 
     @property
     def why(self) -> str:
