@@ -40,11 +40,11 @@ SEEN, STEP, LONGER, MOST = 1e-4, 1e-3, 3, 1e3
 # chi-square, and share of all of it, by which a start of more numbers must explain more
 APART, MODEL = 25.0, 0.02
 STRAIGHT = 0.02  # part of a step's change by which derivatives may fail to tell it
-# of its largest signal in any kind of map, below which an effect is not in one: logarithms and rad
-# have much the same noise, so that as little says nothing
+# share of an effect's largest signal in any kind of map, below which a kind is left out: all have
+# much the same noise, so a signal this small carries no information
 LEAST = 0.01
 UNTOLD = 1e-8  # share of a signal's square that is left where smooth surfaces take all of it
-LOWEST = -3.0  # significance
+LOWEST = -3.0  # lowest significance, standard deviations
 # of what an effect must do to a map, as much has to be there; where it shows by so many errors
 AGREED, SHOWN = 0.5, 2.0
 
@@ -74,7 +74,7 @@ class LightFit:
         """In standard deviations; zero where a map that must show the effect does not."""
         if min(self.agreed.values(), default=1.0) < AGREED:
             return 0.0
-        # A gain of nothing would be far below what chance does, and rule the scatter of many.
+        # A gain of zero would be -37, and one such simulation would dominate the scatter of all.
         return max(sigmas_of_chi2(self.gain, max(self.dof, 1)), LOWEST)
 
     @property

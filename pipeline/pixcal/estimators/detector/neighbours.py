@@ -136,6 +136,7 @@ def _of_flats(stack: Stack, evidence: Evidence) -> Iterator[_Noise]:
     light = np.where(good, np.maximum(charge - dark, 0), 0)
     if not light.any():
         return
+    # Copies, not views: for views the kernels would be compiled a second time.
     variance = np.repeat((charge + np.float32(evidence.read_noise**2))[None], len(frames), 0)
     weight = np.where(good, 1 / variance, np.float32(0)).reshape(len(frames), -1)
     level = np.ones((1, len(frames)), np.float32)
