@@ -16,6 +16,10 @@ from astropy.io import fits
 from hypothesis import settings
 from numpy.typing import NDArray
 
+# Before Dask is imported, here and in workers that tests start: with Python 3.11 its profiler can
+# stop a process for good (https://github.com/python/cpython/issues/106883).
+os.environ["DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED"] = "False"
+
 # Property tests try the same examples everywhere, however slow the machine.
 settings.register_profile("pixcal", deadline=None, derandomize=True, database=None)
 settings.load_profile("pixcal")
