@@ -7,8 +7,10 @@ TOOLS := $(VENV)/.installed-tools
 DOCS := $(VENV)/.installed-docs
 # Of the whole blind examination; each is used once (docs/appendix/blind.md).
 SEED ?= 2004
+# uv installs in seconds what takes pip most of a minute; where it does not succeed, pip does it.
 # Compiled on first use: most of what is installed is never imported.
 PIP := $(BIN)/python -m pip --quiet install --no-compile
+install = PATH="$$PATH:$(BIN)" uv pip install --quiet --python $(BIN)/python $(1) 2>/dev/null || $(PIP) $(1)
 # Where it is set, every process would compile all that it imports: seconds each.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -25,17 +27,18 @@ $(INSTALLED): pyproject.toml
 	  echo "pixcal needs Python 3.11 or newer, $(PYTHON) is not; try: make PYTHON=python3.12" >&2; \
 	  exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) --editable .
+	-@command -v uv >/dev/null || $(PIP) uv
+	@$(call install,--editable .)
 	@touch $@
 
 $(TOOLS): $(INSTALLED)
-	$(PIP) --upgrade 'pip>=25.1'
-	$(PIP) --group dev
+	@$(call install,--upgrade 'pip>=25.1')
+	@$(call install,--group dev)
 	@touch $@
 
 $(DOCS): $(INSTALLED)
-	$(PIP) --upgrade 'pip>=25.1'
-	$(PIP) --group docs
+	@$(call install,--upgrade 'pip>=25.1')
+	@$(call install,--group docs)
 	@touch $@
 
 demo: $(INSTALLED) ## calibrate the sample acquisition into demo/
@@ -110,7 +113,7 @@ blind: $(TOOLS) ## ten small cases whose effects are withheld, diagnosed and sco
 	$(BIN)/pixcal blind score work/blind --sealed work/blind-truth.json
 
 blind-second: $(TOOLS) ## 100 cases of the second bench alone (hours, 7 GB of disk); goes on where it was
-	$(PIP) --editable '.[second-bench]'
+	@$(call install,--editable '.[second-bench]')
 	[ -e work/blind-second ] || \
 	  $(BIN)/pixcal blind make --cases 100 --seed $(SEED) --size standard --bench second \
 	  --out work/blind-second --sealed work/blind-second-truth.json
