@@ -165,12 +165,13 @@ def _alone(evidence: Evidence, falloff: float) -> Boundaries | None:
 
 
 def _errors(found: Boundaries) -> tuple[dict[str, float], tuple[dict[str, float], ...]]:
-    """Of both parameters, and how they hang together."""
+    """Of all parameters, and how they hang together."""
     own = {"shift_px_per_e": found.shift_error}
     ratio = {"along_y": found.along_y_error} if found.along_y_error else {}
-    together = (own, ratio) if ratio else (own,)
-    if not np.isfinite(found.falloff_error):
-        return own | ratio, together
-    both = {"shift_px_per_e": found.with_falloff, "falloff_px": found.falloff_error}
-    whole = float(np.hypot(found.shift_error, found.with_falloff))
-    return both | {"shift_px_per_e": whole} | ratio, (*together, both)
+    together = [d for d in (own, ratio) if d]
+    if np.isfinite(found.falloff_error):
+        by_falloff = {"shift_px_per_e": found.with_falloff, "falloff_px": found.falloff_error}
+        together.append(by_falloff | dict.fromkeys(ratio, found.along_y_with_falloff))
+    names = dict.fromkeys(name for part in together for name in part)
+    errors = {n: float(np.linalg.norm([part.get(n, 0.0) for part in together])) for n in names}
+    return errors, tuple(together)

@@ -9,7 +9,6 @@ from pixcal.estimators.detector.transfer_curve import (
     CLIP,
     MIN_PIXELS,
     STEPS,
-    shared_steps,
     shot_share,
     sums_of_stacks,
     transfer_curve,
@@ -114,8 +113,8 @@ def shot_share_of_flats(evidence: Evidence) -> tuple[float, float] | None:
     changes it by one factor: the former is taken out as the levels show it or, where the lamp was
     changed between them, by the noise at level zero.
     """
-    pooled = shot_share(sums_of_stacks(evidence), shared_steps(evidence))
-    curve = transfer_curve(evidence)
+    pooled = shot_share(sums_of_stacks(evidence))
+    curve = transfer_curve(evidence, whole=True)
     if pooled is None or curve is None:
         return pooled
     response = ladder_response(evidence, curve.top)

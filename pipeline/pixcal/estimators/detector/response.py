@@ -6,10 +6,11 @@ on the fringes' spacing.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.linalg import block_diag
 
 from pixcal.estimators.diagnosis.distortions import (
     Agreement,
@@ -23,9 +24,10 @@ from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F32, F64
 
 UNIT = 1e-7  # shift of boundaries (px per electron) that is fitted as one
-# in equal steps of the logarithm, nearly; what the boundaries' shift may fall by is looked for
-# among these
+# Shifts within `REACH` are of six distances: those of any falloff are a sum of these.
 FALLOFFS_PX = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
+_FINE_PX = np.geomspace(FALLOFFS_PX[0], FALLOFFS_PX[-1], 61)
+_BESIDE = 5  # of the fine steps: the parabola about the best one goes so far
 LOOSE = 0.02  # departure from a response, of full scale, that is unlikely without data
 TOLD = 0.5  # error of the falloff's logarithm with which it is told from others
 
@@ -138,10 +140,11 @@ class Boundaries:
     shift_error: float
     with_falloff: float  # by how much the shift changes with the falloff's error, px
     against: float  # chi-square by which a bent response beside them would fit better
-    # along_y, along_y_error: shift of boundaries between rows over that between columns; the
-    # error is zero where it was held
-    along_y: float = 1.0
-    along_y_error: float = 0.0
+    # shift of boundaries between rows over that between columns, and by how much it changes with
+    # the falloff's error; its own error is zero where it was held
+    along_y: float
+    along_y_error: float
+    along_y_with_falloff: float
 
 
 def boundaries_alone(
@@ -159,12 +162,20 @@ def boundaries_alone(
     sums = _sums_by_axis(evidence, level_e, powers)
     if len(sums) < 2 or not by_axis:
         sums = [(sum(n for n, _ in sums), sum(r for _, r in sums))]  # type: ignore[list-item]
-    found = [_alone(sums, powers, powers + n) for n in range(len(FALLOFFS_PX))]
-    one = _best_falloff([f[:4] for f in found], FALLOFFS_PX.index(otherwise_px))
-    if len(sums) < 2:
-        return one
-    near = int(np.argmin(np.abs(np.log(np.array(FALLOFFS_PX) / one.falloff_px))))
-    return replace(one, along_y=found[near][4], along_y_error=found[near][5])
+    fine = _of_fine_falloffs(powers)
+    sums = [(fine @ normal @ fine.T, fine @ right) for normal, right in sums]
+    found = [_alone(sums, powers, powers + n) for n in range(len(_FINE_PX))]
+    return _best_falloff(np.array(found), otherwise_px)
+
+
+def _of_fine_falloffs(powers: int) -> F64:
+    """Powers and shifts of `_FINE_PX` as sums (to, from) of powers and those of `FALLOFFS_PX`."""
+    coarse, fine = (
+        np.stack([boundary_shifts(falloff).ravel() for falloff in falloffs], axis=1)
+        for falloffs in (FALLOFFS_PX, _FINE_PX.tolist())
+    )
+    shares: F64 = block_diag(np.eye(powers), np.linalg.lstsq(coarse, fine, rcond=None)[0].T)
+    return shares
 
 
 def _boundary_sums(evidence: Evidence, level_e: float, powers: int) -> list[tuple[F64, F64]]:
@@ -176,8 +187,18 @@ def _boundary_sums(evidence: Evidence, level_e: float, powers: int) -> list[tupl
         tuple(f for f in sets if (abs(f.k[0]) >= abs(f.k[1])) == of_columns)
         for of_columns in (True, False)
     ]
+
+    def by_itself(normal: F64, right: F64) -> F64:
+        explained = right**2 / np.diag(normal)
+        best = powers + int(np.argmax(explained[powers:]))
+        sizes = np.zeros(len(right))
+        sizes[best] = right[best] / normal[best, best]
+        return sizes
+
     return [
-        distortion_sums(own, signal, powers + len(every), margin=REACH) for own in across if own
+        distortion_sums(own, signal, powers + len(every), by_itself, margin=REACH)
+        for own in across
+        if own
     ]
 
 
@@ -257,23 +278,28 @@ def _alone(
     return UNIT * float(sizes[0]), UNIT**2 / float(information[0]), gain, beside, ratio, error
 
 
-def _best_falloff(found: Sequence[tuple[float, float, float, float]], otherwise: int) -> Boundaries:
-    """By a parabola through the best of all and those beside it."""
-    sizes, variances, gains, beside = np.array(found).T
-    best = int(np.clip(np.argmax(gains), 1, len(gains) - 2))
-    at = np.log(FALLOFFS_PX[best - 1 : best + 2])
-    bend, slope, _ = np.polyfit(at - at[1], gains[best - 1 : best + 2], 2)
-    error = 1 / np.sqrt(-bend) if bend < 0 else np.inf
+def _best_falloff(found: F64, otherwise_px: float) -> Boundaries:
+    """By a parabola about the best; ``found`` is what `_alone` tells of each of `_FINE_PX`."""
+    best = int(np.clip(np.argmax(found[:, 2]), _BESIDE, len(found) - 1 - _BESIDE))
+    near = np.array([best - _BESIDE, best, best + _BESIDE])
+    at = np.log(_FINE_PX[near] / _FINE_PX[best])
+    bends = np.polyfit(at, found[near] - found[best], 2).T
+    curved, slope, _ = bends[2]
+    error = 1 / np.sqrt(-curved) if curved < 0 else np.inf
     if error > TOLD:
-        size, variance, _, against = found[otherwise]
-        return Boundaries(FALLOFFS_PX[otherwise], np.inf, size, variance**0.5, 0.0, against)
-    top = float(at[1] - slope / (2 * bend))
+        given = int(np.argmin(np.abs(_FINE_PX - otherwise_px)))
+        size, variance, _, against, ratio, own = found[given].tolist()
+        return Boundaries(otherwise_px, np.inf, size, variance**0.5, 0.0, against, ratio, own, 0.0)
+    top = float(-slope / (2 * curved))
     # Not beyond what was tried; how far that is from the best is not known then.
-    there = float(np.clip(top, *np.log([FALLOFFS_PX[0], FALLOFFS_PX[-1]])))
+    there = float(np.clip(top, *np.log(_FINE_PX[[0, -1]] / _FINE_PX[best])))
     error = float(np.hypot(error, top - there))
-    near = slice(best - 1, best + 2)
-    bends = [np.polyfit(at - at[1], values[near], 2) for values in (sizes, variances, beside)]
-    own = [float(np.polyval(coefficients, there - at[1])) for coefficients in bends]
-    rise = float(np.polyval(np.polyder(bends[0]), there - at[1]))
-    falloff = float(np.exp(there))
-    return Boundaries(falloff, falloff * error, own[0], own[1] ** 0.5, rise * error, own[2])
+    size, variance, _, against, ratio, own = (
+        value + float(np.polyval(bend, there))
+        for value, bend in zip(found[best].tolist(), bends, strict=True)
+    )
+    rises = [error * float(np.polyval(np.polyder(bend), there)) for bend in bends]
+    falloff = float(_FINE_PX[best] * np.exp(there))
+    return Boundaries(
+        falloff, falloff * error, size, variance**0.5, rises[0], against, ratio, own, rises[4]
+    )

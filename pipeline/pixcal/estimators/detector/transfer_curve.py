@@ -40,18 +40,24 @@ class TransferCurve:
     errors: F64
 
 
-def transfer_curve(evidence: Evidence) -> TransferCurve | None:
-    """Photon transfer of each level of flats; None with fewer than three levels."""
-    return evidence.once("transfer curve", make=lambda: _transfer_curve(evidence))
+def transfer_curve(evidence: Evidence, *, whole: bool = False) -> TransferCurve | None:
+    """Photon transfer of each level of flats; None with fewer than three levels.
+
+    Where flats told the gain, of `STEPS` only those count that were found to share noise, unless
+    the ``whole`` noise is asked for. The slope is better known so; but what several share together
+    may be more than the error when that of none is significant.
+    """
+    return evidence.once("transfer curve", whole, make=lambda: _transfer_curve(evidence, whole))
 
 
-def _transfer_curve(evidence: Evidence) -> TransferCurve | None:
+def _transfer_curve(evidence: Evidence, whole: bool) -> TransferCurve | None:
+    counted = None if whole else _shared_steps(evidence)
     without = (s for s in evidence.stacks if s.kind != "flat" and _is_enough(s))
     darks = [sums for s in without if (sums := _of_stack(s, evidence)) is not None]
     points = []
     for stack in filter(_is_enough, evidence.ladder):
         sums = _of_stack(stack, evidence)
-        share = None if sums is None else shot_share([sums, *darks], shared_steps(evidence))
+        share = None if sums is None else shot_share([sums, *darks], counted)
         level = float((stack.adu.mean(axis=0) - evidence.bias)[evidence.good].mean())
         if share is not None and level > 0:
             points.append((level * evidence.gain, *share))
@@ -68,15 +74,6 @@ def _transfer_curve(evidence: Evidence) -> TransferCurve | None:
     errors = np.sqrt(np.diag(covariance))
     at_zero, rise = zip(found.tolist(), errors.tolist(), strict=True)
     return TransferCurve(*at_zero, *rise, top, level, share, error)
-
-
-def shared_steps(evidence: Evidence) -> Mask:
-    """Which of `STEPS` count: where flats told the gain, only those found to share noise."""
-    # The others would add nothing but their own noise.
-    if np.isnan(evidence.photon_transfer[0]):
-        return np.ones(len(STEPS), np.bool_)
-    counted = {(0, 0), *evidence.neighbours, *((-y, -x) for y, x in evidence.neighbours)}
-    return np.array([(int(y), int(x)) in counted for y, x in STEPS])
 
 
 def shot_share(sums: Iterable[F64], counted: Mask | None = None) -> tuple[float, float] | None:
@@ -141,3 +138,11 @@ def _of_stack(stack: Stack, evidence: Evidence) -> F64 | None:
         np.ones((len(frames), 1)), (noise / len(frames))[None], np.full(len(STEPS), 1 / pixels),
         STEPS, CLIP,
     )  # fmt: skip
+
+
+def _shared_steps(evidence: Evidence) -> Mask:
+    """Which of `STEPS` share noise as far as the flats told it: all where they told no gain."""
+    if np.isnan(evidence.photon_transfer[0]):
+        return np.ones(len(STEPS), np.bool_)
+    counted = {(0, 0), *evidence.neighbours, *((-y, -x) for y, x in evidence.neighbours)}
+    return np.array([(int(y), int(x)) in counted for y, x in STEPS])

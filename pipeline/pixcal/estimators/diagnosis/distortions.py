@@ -195,16 +195,25 @@ def fit_distortions(
 
 
 def distortion_sums(
-    sets: Sequence[FringeEvidence], distortion: Distortion, count: int, *, margin: int = 0
+    sets: Sequence[FringeEvidence],
+    distortion: Distortion,
+    count: int,
+    near: Callable[[F64, F64], F64],
+    *,
+    margin: int = 0,
 ) -> tuple[F64, F64]:
-    """Normal matrix (count, count) and right-hand side (count,) about no distortion.
+    """Normal matrix (count, count) and right-hand side (count,) of sizes that all sets share.
 
     Parameters as of `fit_distortions`. What holds for all sizes together holds for any of them.
+    ``near`` makes sizes (count,) near the right ones of a set's own sums: a distortion is a
+    straight line in its sizes about these.
     """
     normal, right = np.zeros((count, count)), np.zeros(count)
     for fringes in sets:
         fit = _SetFit(fringes, distortion, count, margin)
-        normal, right = normal + fit.normal, right + fit.right(np.zeros(count))
+        about = near(fit.normal, fit.right(np.zeros(count)))
+        fit.right(about)  # from here on the signal is that without these
+        normal, right = normal + fit.normal, right + fit.right(about) + fit.normal @ about
     return normal, right
 
 
