@@ -27,6 +27,27 @@ def shifted(values: np.ndarray, dy: int, dx: int) -> np.ndarray:
     return wide[:, dy : dy + ny, 2 + dx : 2 + dx + nx]
 
 
+def steady(frames: int, seed: int) -> Residuals:
+    """Frames of one charge; samples are clipped in pixels of which no two are partners."""
+    part = some(frames, seed)
+    one = np.broadcast_to(part.one.max(axis=0), part.one.shape).copy()
+    clipped = np.random.default_rng(seed).random(one.shape) < 0.3
+    clipped[:, np.arange(7) % 4 != 0] = clipped[:, :, np.arange(21) % 4 != 0] = False
+    one[clipped] = 0
+    level = np.random.default_rng(seed).uniform(0.5, 2, one.shape[1:]).astype(np.float32)
+    e, charge = part.e * (one > 0), level * one
+    return Residuals(e, charge, charge, one, part.modes * (one[::16] > 0), steady=True)
+
+
+def test_frames_of_one_charge_give_the_sums_of_any_frames() -> None:
+    parts, links = [steady(20, 1), steady(2, 2), steady(35, 3)], np.array(LINKS)
+    usual, quick = ([np.zeros((3, n, 7, 21), np.float32) for n in (5, 14)] for _ in range(2))
+    covariance._add_changing(parts, links, *usual)
+    covariance.add_steady(parts, links, *quick)
+    for one, other in zip(usual, quick, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-5 * np.abs(one).max())
+
+
 @pytest.mark.parametrize("step", range(len(LINKS)))
 def test_the_sums_are_those_of_the_terms(step: int) -> None:
     parts = [some(20, 1), some(35, 2)]

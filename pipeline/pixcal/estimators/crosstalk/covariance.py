@@ -23,9 +23,10 @@ from numba import njit
 
 from pixcal.estimators.crosstalk.links import Place
 from pixcal.estimators.crosstalk.residuals import STRIDE, UNIT, Residuals, all_residuals
+from pixcal.estimators.crosstalk.steady import add_products as add_steady
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling
-from pixcal.model.arrays import F32, F64
+from pixcal.model.arrays import F32, F64, Indices
 
 Frames = tuple[F32, F32, F32]  # factor, charge over sigma, and one over sigma, all (t, y, x)
 
@@ -75,19 +76,23 @@ def products(
             brightest = max(brightest, part.brightness)
             own, own_right = _variance(part)
             line, line_right = line + own, line_right + own_right
-        noise = [frames for p in parts for frames in ((p.e, p.charge, p.one), p.taken)]
-        for piece in _pieces(noise):
-            _add_right_sums(*_powers(piece, 2), steps, right)
-        terms = [(p.one, p.charge, p.one) for p in parts]
-        for piece in _pieces(terms):
-            _add_normal_sums(*_powers(piece, 4), steps, normal)
+        add = add_steady if parts[0].steady else _add_changing
+        add(parts, steps, right, normal)
         # Not beside the next ones: they are large.
-        del parts, part, noise, terms, piece
+        del parts, part
     if brightest < min(MIN_CHARGE, ABOVE_READ * evidence.read_noise**2 / UNIT):
         return None
     covariance = np.linalg.pinv(line, rcond=1e-12, hermitian=True)
     shot, error = float((covariance @ line_right)[0]), float(np.sqrt(2 * covariance[0, 0]))
     return Products(right, normal, shot, error, evidence.read_noise**2 / UNIT)
+
+
+def _add_changing(parts: Sequence[Residuals], steps: Indices, right: F32, normal: F32) -> None:
+    noise = [frames for p in parts for frames in ((p.e, p.charge, p.one), p.taken)]
+    for piece in _pieces(noise):
+        _add_right_sums(*_powers(piece, 2), steps, right)
+    for piece in _pieces([(p.one, p.charge, p.one) for p in parts]):
+        _add_normal_sums(*_powers(piece, 4), steps, normal)
 
 
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
@@ -99,7 +104,8 @@ def _gathered(parts: Iterable[Residuals]) -> Iterator[list[Residuals]]:
     """Short sequences together, for sums over few frames cost as much; long ones one by one."""
     some: list[Residuals] = []
     for part in parts:
-        if sum(len(p.e) for p in (*some, part)) > _LONG and some:
+        joined = [*some, part]
+        if some and (sum(len(p.e) for p in joined) > _LONG or part.steady != some[0].steady):
             yield some
             some = []
         some.append(part)

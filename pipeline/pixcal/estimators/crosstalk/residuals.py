@@ -8,7 +8,7 @@ The second makes it smaller, which is made good here.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,6 +40,7 @@ class Residuals:
     # (m, s, y, x) what was taken off every `STRIDE`-th frame, orthonormal, and grown to stand
     # for all
     modes: F32
+    steady: bool = False  # whether the charge of a pixel is the same in all frames
 
     @property
     def brightness(self) -> float:
@@ -85,7 +86,8 @@ def _of_stack(stack: Stack, evidence: Evidence, known: Sequence[Coupling], kept:
     level = np.ones((1, len(at)), np.float32)
     common = [np.ones(used.size), charge[0].ravel()][: 1 + (stack.kind == "flat")]
     read = np.full(used.shape, evidence.read_noise**2 / UNIT, np.float32)
-    return _noise(rest, charge, read, kept, level, np.array(common, np.float32))
+    found = _noise(rest, charge, read, kept, level, np.array(common, np.float32))
+    return replace(found, steady=True)
 
 
 def _of_fringes(found: FringeEvidence, known: Sequence[Coupling], kept: F32) -> Residuals:
