@@ -1,5 +1,6 @@
 """An estimate that does not come to an end costs its own answer, and no more."""
 
+from functools import partial
 from typing import Any, cast
 
 import pytest
@@ -48,7 +49,7 @@ def test_the_others_go_on(cluster: str, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(inquiry, "OF_ESTIMATE", Bound(0.2))
     kinds = cast(Any, {kind.name: kind for kind in (Endless, Missing)})
     runtime = Runtime(cluster=cluster, workers=2, memory=1 << 50)
-    found = inquiry._estimates(EVIDENCE, kinds, runtime, "estimate effects")
+    found = inquiry._each_of(kinds, partial(estimate, EVIDENCE), runtime, "estimate effects")
     assert found["missing"] is None
     assert str(found["endless"]).startswith("not decided")
     assert trial.OF_ESTIMATE.seconds > 1

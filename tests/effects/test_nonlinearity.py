@@ -114,6 +114,11 @@ def test_its_coefficients_are_found(bent: tuple[Evidence, Estimate]) -> None:
     assert_found_well(bent[1], Nonlinearity())
 
 
+def test_its_significance_needs_no_estimate(bent: tuple[Evidence, Estimate]) -> None:
+    evidence, found = bent
+    assert Nonlinearity.detect(replace(evidence)) == found.significance
+
+
 @pytest.mark.long
 def test_coefficients_of_a_small_one_are_found(acquired: Callable[..., Evidence]) -> None:
     effects = {"nonlinearity": {"quadratic": 0.003, "cubic": 0.0}}

@@ -90,10 +90,9 @@ def test_its_parameters_follow_from_its_forward_model(
     assert found.significance > 5
     assert within(to_plain(found.effect), dict(found.errors), truth), found
     # What just this has in the same frames, nothing being chosen any more.
-    signature = found.again or kind
-    again = signature.estimate(load_evidence(run_with(case)))
+    again = (found.again or kind).detect(load_evidence(run_with(case)))
     assert again is not None
-    assert again.significance > found.significance - 1
+    assert again > found.significance - 1
 
 
 def test_without_effects_the_frames_are_the_fits_model(acquired: Callable[..., Evidence]) -> None:

@@ -1,6 +1,6 @@
 """Response of the pixel and its amplifier that is not a straight line."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -148,49 +148,82 @@ class Nonlinearity(Effect):
         second harmonic too: they are fitted beside, and the noise that they make neighbours share
         says how much of them there is, where all fringes have the same spacing.
         """
-        level = _full_scale(evidence, cls().level_e)
-        ladder, curve = ladder_response(evidence, level), _of_noise(evidence, level)
-        # Information on the bend alone: the ladder has a cubic term beside it.
-        told = [0.0 if one is None else np.linalg.inv(one[1])[0, 0] for one in (ladder, curve)]
-        by_levels = told[0] > told[1]
-        if evidence.fringes:
-            shifts = boundary_shifts(FALLOFF_PX)
-            part = central_crop(evidence)
-            noise = shared_charge(part, shifts)
-            known = None if noise is None else (noise.size, noise.variance)
-            sizes, covariance = fit_response(part, level, 2, shifts, known)
-            why = "second and third harmonic of the fringes in the residuals"
-        elif ladder is not None and by_levels:
-            sizes, covariance = ladder
-            why = "flat levels that are not proportional to the exposure time"
-        elif curve is not None:
-            sizes, covariance = curve
-            why = "flat noise that is not proportional to the level"
-        else:
+        found = _polynomial(evidence)
+        if found is None:
             return None
-        details: dict[str, object] = {}
-        if curve is not None:
-            details["of_noise"], details["of_noise_error"] = curve[0][0], curve[1][0, 0] ** 0.5
-        if ladder is not None:
-            errors = np.sqrt(np.diag(ladder[1]))
-            details["of_flats"] = [float(v) for v in ladder[0]]
-            details["of_flats_errors"] = [float(v) for v in errors]
-        found = sizes[:2] @ np.linalg.solve(covariance[:2, :2], sizes[:2])
-        quadratic, cubic = (float(np.clip(v, -0.3, 0.3)) for v in sizes[:2])
-        errors = np.sqrt(np.diag(covariance))
-        effect, significance = cls(quadratic, cubic, level), sigmas_of_chi2(float(found), 2)
+        quadratic, cubic = (float(np.clip(v, -0.3, 0.3)) for v in found.sizes)
+        effect = cls(quadratic, cubic, found.level_e)
         more, refused = None, ""
-        if evidence.fringes and significance > SIGNIFICANT:
-            more, agreement = _bends(part, effect.response, float(found))
+        if evidence.fringes and found.significance > SIGNIFICANT:
+            part = central_crop(evidence)
+            more, agreement = _bends(part, effect.response, found.chi2)
             refused = SETS_DISAGREE if agreement.refused else ""
+        errors = np.sqrt(np.diag(found.covariance))
         named = {"quadratic": float(errors[0]), "cubic": float(errors[1])}
+        told = found.significance, found.why, found.details
         if more is None:
-            return Estimate(effect, named, significance, why, details, refused=refused)
+            return Estimate(effect, named, *told, refused=refused)
         named |= {f"bends[{n}].change_e": error for n, error in enumerate(more[1])}
         return Estimate(
-            replace(effect, bends=more[0]), named, significance, why, details,
+            replace(effect, bends=more[0]), named, *told,
             law="response curve of second and third order", by_law=effect, refused=refused,
         )  # fmt: skip
+
+    @classmethod
+    def detect(cls, evidence: Evidence) -> float | None:
+        found = _polynomial(evidence)
+        return None if found is None else found.significance
+
+
+@dataclass(frozen=True)
+class _Polynomial:
+    """Quadratic and cubic term of the response."""
+
+    level_e: float  # at which the deviations are given
+    sizes: F64  # (2,)
+    covariance: F64  # (2, 2)
+    why: str
+    details: Mapping[str, object]
+
+    @property
+    def chi2(self) -> float:
+        return float(self.sizes @ np.linalg.solve(self.covariance, self.sizes))
+
+    @property
+    def significance(self) -> float:
+        return sigmas_of_chi2(self.chi2, 2)
+
+
+def _polynomial(evidence: Evidence) -> _Polynomial | None:
+    """From fringes or, without them, from what flats tell best."""
+    level = _full_scale(evidence, Nonlinearity().level_e)
+    ladder, curve = ladder_response(evidence, level), _of_noise(evidence, level)
+    # Information on the bend alone: the ladder has a cubic term beside it.
+    told = [0.0 if one is None else np.linalg.inv(one[1])[0, 0] for one in (ladder, curve)]
+    by_levels = told[0] > told[1]
+    if evidence.fringes:
+        shifts = boundary_shifts(FALLOFF_PX)
+        part = central_crop(evidence)
+        noise = shared_charge(part, shifts)
+        known = None if noise is None else (noise.size, noise.variance)
+        sizes, covariance = fit_response(part, level, 2, shifts, known)
+        why = "second and third harmonic of the fringes in the residuals"
+    elif ladder is not None and by_levels:
+        sizes, covariance = ladder
+        why = "flat levels that are not proportional to the exposure time"
+    elif curve is not None:
+        sizes, covariance = curve
+        why = "flat noise that is not proportional to the level"
+    else:
+        return None
+    details: dict[str, object] = {}
+    if curve is not None:
+        details["of_noise"], details["of_noise_error"] = curve[0][0], curve[1][0, 0] ** 0.5
+    if ladder is not None:
+        errors = np.sqrt(np.diag(ladder[1]))
+        details["of_flats"] = [float(v) for v in ladder[0]]
+        details["of_flats_errors"] = [float(v) for v in errors]
+    return _Polynomial(level, sizes[:2], covariance[:2, :2], why, details)
 
 
 def _bends(

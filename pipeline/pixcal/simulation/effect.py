@@ -207,6 +207,12 @@ class Effect(ForwardModel):
         return Estimate(found.model, found.errors, found.significance, found.why, again=again)
 
     @classmethod
+    def detect(cls, evidence: Evidence) -> float | None:
+        """Significance that `estimate` gives; of many simulations nothing else is wanted."""
+        found = cls.estimate(evidence)
+        return None if found is None else found.significance
+
+    @classmethod
     def starts(cls, evidence: Evidence) -> Sequence[LightStart]:
         """Where a fit to the maps begins, if it acts on the light of the fringes alone.
 
@@ -304,10 +310,9 @@ class Again:
         """Of the effect."""
         return self.effect.domains
 
-    def estimate(self, evidence: Evidence) -> Estimate:
+    def detect(self, evidence: Evidence) -> float:
         """Its significance; nothing is fitted."""
-        size = score_again(self.effect, self.way, evidence, self.template)
-        return Estimate(self.effect, {}, size, "")
+        return score_again(self.effect, self.way, evidence, self.template)
 
 
 def _of_light(found: LightFit) -> Estimate:

@@ -1,10 +1,10 @@
 """A reduced run is looked at, its nominal bench simulated, and causes of the gap are searched."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,8 +25,19 @@ from pixcal.stages.diagnose.look import DiagnosisInput, look_at
 from pixcal.stages.diagnose.recommended_frames import MORE
 from pixcal.stages.diagnose.result import by_domain
 from pixcal.stages.diagnose.search import CONFIRM, SCREEN, Search
-from pixcal.stages.diagnose.trial import OF_ESTIMATE, Curves, Effects, Signature, Trials, estimate
+from pixcal.stages.diagnose.trial import (
+    OF_ESTIMATE,
+    Curves,
+    Effects,
+    Signature,
+    Trials,
+    detect,
+    estimate,
+)
 from pixcal.stages.diagnose.windows import whole_of
+
+K = TypeVar("K")
+R = TypeVar("R")
 
 REFERENCES = 16  # simulations of the nominal bench
 LEARN_SEED = 900_000
@@ -131,8 +142,8 @@ class _Asking:
         except InputError:
             return {}  # These frames do not tell what the effects look like.
         asked = {n: _again(self.candidates[n]) or self.kinds[n] for n in names}
-        found = _estimates(evidence, asked, few, "estimate again")
-        return {n: e.significance for n, e in found.items() if isinstance(e, Estimate)}
+        found = _each_of(asked, partial(detect, evidence), few, "estimate again")
+        return {name: size for name, size in found.items() if size is not None}
 
 
 def places(made: Inquiry) -> list[dict[str, Any]]:
@@ -161,7 +172,7 @@ def _candidates(
 ) -> dict[str, Candidate]:
     there = {effect.name for effect in base}
     tried = {name: kind for name, kind in kinds.items() if name not in there}
-    found = _estimates(evidence, tried, runtime, "estimate effects")
+    found = _each_of(tried, partial(estimate, evidence), runtime, "estimate effects")
     candidates = {}
     for name, one in found.items():
         if isinstance(one, Estimate):
@@ -224,13 +235,11 @@ def _key_of(kind: Signature) -> Key:
     return signature_key(kind.name, kind.domains[0])
 
 
-def _estimates(
-    evidence: Evidence, kinds: Mapping[str, Signature], runtime: Runtime, label: str
-) -> dict[str, Estimate | str | None]:
-    results = run_tasks(
-        partial(estimate, evidence, bound=replace(OF_ESTIMATE, memory=runtime.memory)),
-        list(kinds.values()),
-        runtime.here,
-        label=label,
-    )
+def _each_of(
+    kinds: Mapping[str, K], ask: Callable[..., R], runtime: Runtime, label: str
+) -> dict[str, R]:
+    """What is asked of each effect, by its name."""
+    bound = replace(OF_ESTIMATE, memory=runtime.memory)
+    asked = partial(ask, bound=bound)
+    results = run_tasks(asked, list(kinds.values()), runtime.here, label=label)
     return dict(zip(kinds, results, strict=True))

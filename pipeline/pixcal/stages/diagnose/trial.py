@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from pixcal.storage.manifest import digest, read_json, write_json
 # of which the slowest takes 6 s for as many samples as there are at most (`windows.SAMPLES`)
 OF_ESTIMATE = Bound(seconds=45.0)
 
+T = TypeVar("T")
 Curves = dict[Key, Curve]
 # an effect whose estimate is a statistic; or, by its forward model, the score test of just it
 Signature = type[Effect] | Again
@@ -199,10 +200,9 @@ def measured_curves(evidence: Evidence, signatures: Sequence[Signature]) -> Curv
     """The test statistics, and the detection significance of some effects."""
     curves = measure(evidence)
     for kind in signatures:
-        found = estimate(evidence, kind)
-        if isinstance(found, Estimate):
-            key = signature_key(kind.name, kind.domains[0])
-            curves[key] = signature_curve(found.significance)
+        found = detect(evidence, kind)
+        if found is not None:
+            curves[signature_key(kind.name, kind.domains[0])] = signature_curve(found)
     return curves
 
 
@@ -220,12 +220,26 @@ def averaged(curves: Sequence[Curves]) -> Curves:
 
 
 def estimate(
-    evidence: Evidence, kind: Signature, bound: Bound = OF_ESTIMATE
+    evidence: Evidence, kind: type[Effect], bound: Bound = OF_ESTIMATE
 ) -> Estimate | str | None:
     """Parameters of an effect; None without evidence, a sentence where the estimate failed."""
+    found = _kept_within(bound, kind.estimate, evidence)
+    if isinstance(found, Estimate) and not np.isfinite(found.significance):
+        return "cannot be estimated here: no finite significance"
+    return found
+
+
+def detect(evidence: Evidence, kind: Signature, bound: Bound = OF_ESTIMATE) -> float | None:
+    """Significance of an effect; None where it cannot be told."""
+    found = _kept_within(bound, kind.detect, evidence)
+    return found if isinstance(found, float) and np.isfinite(found) else None
+
+
+def _kept_within(bound: Bound, ask: Callable[[Evidence], T], evidence: Evidence) -> T | str:
+    """An answer within a bound, or why there is none."""
     try:
         with bound.kept():
-            found = kind.estimate(evidence)
+            return ask(evidence)
     except Exceeded:
         return f"not decided: an estimate may use {bound.told()}, this one would need more"
     except NotImplementedError as error:
@@ -236,6 +250,3 @@ def estimate(
         told = str(error)
         reason = told if told.startswith("not decided") else f"cannot be estimated here: {told}"
         return " ".join(reason.split())[:300]
-    if found is not None and not np.isfinite(found.significance):
-        return "cannot be estimated here: no finite significance"
-    return found
