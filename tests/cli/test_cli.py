@@ -500,6 +500,7 @@ def bench_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_run_prints_where_and_what(bench_run: Path) -> None:
     lines = (bench_run / "run.out").read_text().splitlines()
     made = [*STAGES[:5], "corrected", STAGES[5]]
@@ -510,6 +511,7 @@ def test_run_prints_where_and_what(bench_run: Path) -> None:
         assert f"  RUN/products/{name}" in lines
 
 
+@pytest.mark.long
 def test_what_is_up_to_date_is_left_alone(bench_run: Path) -> None:
     def products() -> dict[str, bytes]:
         return {p.name: p.read_bytes() for p in (bench_run / "RUN/products").iterdir()}
@@ -521,7 +523,7 @@ def test_what_is_up_to_date_is_left_alone(bench_run: Path) -> None:
     assert products() == before
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("stages", "files"),
     [(STAGES[:4], ("fit.json", "allan.json")), (STAGES, ("fit.json", "diagnosis.json"))],

@@ -78,7 +78,8 @@ def start(folder: Path) -> Cluster:
     return made
 
 
-@pytest.fixture(scope="session")
+# It takes time even where it waits.
+@pytest.fixture(scope="package")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     """Two workers of two threads, with little memory."""
     made = start(tmp_path_factory.mktemp("cluster"))

@@ -22,6 +22,8 @@ from second_bench.ordinary import VARIATIONS, Layout
 
 SMALL = Layout(shape=(33, 40), frames=24, bias=6, dark=3, flat=30)
 CASES = [f"{one.effect}/{one.name}" for one in LAWS]
+# Pyxel compiles its traps in ten seconds, each time.
+SLOW = {"lag/traps": pytest.mark.long}
 PYXEL = {"lag/traps", "charge_transfer/traps"}
 
 
@@ -170,7 +172,13 @@ def test_a_seed_gives_the_same_samples_again_and_another_one_others() -> None:
 
 
 @pytest.mark.quick(12)
-@pytest.mark.parametrize("one", LAWS, ids=CASES)
+@pytest.mark.parametrize(
+    "one",
+    [
+        pytest.param(one, id=case, marks=SLOW.get(case, ()))
+        for case, one in zip(CASES, LAWS, strict=True)
+    ],
+)
 def test_every_law_shows_and_weakly_less_than_strongly(one: Law) -> None:
     case = f"{one.effect}/{one.name}"
     with warnings.catch_warnings():

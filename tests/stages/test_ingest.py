@@ -77,11 +77,19 @@ def tree(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+@pytest.fixture(scope="module")
+def frames_70(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Written once, copied for each test."""
+    folder = tmp_path_factory.mktemp("frames")
+    save_frames(folder, noise((70, 67, 131)))
+    return folder
+
+
 @pytest.fixture
-def acquisition(tmp_path: Path) -> Path:
+def acquisition(tmp_path: Path, frames_70: Path) -> Path:
     """70 frames of 67 × 131, in a folder with a space and a letter beyond ASCII."""
     folder = describe(tmp_path / "Aufnahme für März", bias=["bias 1/*.fits"])
-    save_frames(folder / "v", noise((70, 67, 131)))
+    shutil.copytree(frames_70, folder / "v")
     save_frames(folder / "bias 1", noise((3, 67, 131), 1), "é{}.fits")
     return folder
 
@@ -429,14 +437,14 @@ def test_full_disk_is_told(
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Path:
+def bench(tmp_path: Path, frames_70: Path) -> Path:
     """Numbered biases, flats in cubes with time stamps and temperatures, 70 fringe frames."""
     folder = describe(tmp_path / "acq", **GLOBS)
     save_frames(folder / "bias", noise((3, 67, 131), 1))
     for n, name in enumerate(["c.fits", "b.fits.gz", "a.fz"]):
         cards = {"MJD_OBS": 60000 + n / 7e3, "EXPTIME": 0.1 + n / 3, "CCD_TEMP": -10 - n / 7}
         save(folder / "flat" / name, noise((3 + n, 67, 131), 2 + n), **cards)
-    save_frames(folder / "v", noise((70, 67, 131)))
+    shutil.copytree(frames_70, folder / "v")
     return folder
 
 
