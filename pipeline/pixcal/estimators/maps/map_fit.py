@@ -15,6 +15,7 @@ from pixcal.estimators.fringe_fit.fringes import grid, polynomial_basis
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.estimators.maps.structure import CELLS
 from pixcal.kernels.normal_matrix import inverse_normal
+from pixcal.kernels.robust import median
 from pixcal.model.arrays import F64, Indices, Mask
 
 _CLIP = 5.0
@@ -33,21 +34,27 @@ class MapPart:
     @classmethod
     def of(cls, signals: F64, data: F64, free: F64, good: Mask) -> "MapPart":
         """Data (y, x), signals (n, y, x), without outliers or free terms (m, y, x)."""
-        use = good
+        at = np.flatnonzero(good)
+        terms, values = _taken(free, at), data.ravel()[at]
         for _ in range(2):
-            left = without(data[use][:, None], free[:, use].T)[:, 0]
-            centre = np.median(left)
-            scatter = 1.4826 * np.median(np.abs(left - centre))
-            kept = use.copy()
-            kept[use] = np.abs(left - centre) <= _CLIP * scatter
-            use = kept
-        rest = without(np.concatenate([signals[:, use], data[None, use]]).T, free[:, use].T)
-        y, x = np.nonzero(use)
-        sides = [*CELLS, max(min(use.shape) // 4, 1)]
-        blocks = np.stack([(y // n) * (use.shape[1] // n + 1) + x // n for n in sides])
+            left = without(values[:, None], terms.T)[:, 0]
+            centre = median(left)
+            kept = np.abs(left - centre) <= _CLIP * 1.4826 * median(np.abs(left - centre))
+            if kept.all():
+                break
+            at, terms, values = at[kept], terms[:, kept], values[kept]
+        rest = without(np.concatenate([_taken(signals, at), values[None]]).T, terms.T)
+        y, x = np.divmod(at, good.shape[1])
+        sides = [*CELLS, max(min(good.shape) // 4, 1)]
+        blocks = np.stack([(y // n) * (good.shape[1] // n + 1) + x // n for n in sides])
         return cls(
-            np.ascontiguousarray(rest[:, :-1]), rest[:, -1].copy(), blocks, len(y) - len(free)
+            np.ascontiguousarray(rest[:, :-1]), rest[:, -1].copy(), blocks, len(at) - len(free)
         )
+
+
+def _taken(maps: F64, at: Indices) -> F64:
+    """Some pixels (n, pixel) of maps (n, y, x)."""
+    return np.take(maps.reshape(len(maps), -1), at, axis=1)
 
 
 @dataclass(frozen=True)
@@ -61,21 +68,11 @@ class MapFit:
 
 def fit_maps(parts: Sequence[MapPart]) -> MapFit:
     """Weighted least squares of the same parameters in several maps."""
-    n = parts[0].signals.shape[1]
-    values = np.zeros(n)
-    variances = np.array([max(p.data @ p.data / max(p.dof, 1), _MIN_VARIANCE) for p in parts])
-    for _ in range(3):
-        normal, right = np.zeros((n, n)), np.zeros(n)
-        for part, variance in zip(parts, variances, strict=True):
-            normal += part.signals.T @ part.signals / variance
-            right += part.signals.T @ part.data / variance
-        values = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) @ right
-        left = [p.data - p.signals @ values for p in parts]
-        squares = np.array([r @ r / max(p.dof - n, 1) for p, r in zip(parts, left, strict=True)])
-        variances = np.maximum(squares, _MIN_VARIANCE)
+    values, normal, variances = fitted_values(parts)
     covariance = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
-    meat = np.zeros((len(parts[0].blocks), n, n))
-    for part, rest, variance in zip(parts, left, variances, strict=True):
+    meat = np.zeros((len(parts[0].blocks), *normal.shape))
+    for part, variance in zip(parts, variances, strict=True):
+        rest = part.data - part.signals @ values
         pulls = part.signals * (rest / variance)[:, None]
         for own, block in zip(meat, part.blocks, strict=True):
             scores = np.stack([np.bincount(block, pull) for pull in pulls.T])
@@ -83,6 +80,23 @@ def fit_maps(parts: Sequence[MapPart]) -> MapFit:
     inside = np.einsum("ij,sjk,ki->si", covariance, meat, covariance)
     more = max(1.0, *map(float, np.mean(inside / np.diag(covariance), axis=1)))
     return MapFit(values, np.asarray(covariance * more), float(values @ normal @ values) / more)
+
+
+def fitted_values(parts: Sequence[MapPart]) -> tuple[F64, F64, F64]:
+    """Parameters (n,), their normal matrix (n, n), and the variance of each map."""
+    n = parts[0].signals.shape[1]
+    values = np.zeros(n)
+    variances = np.array([max(p.data @ p.data / max(p.dof, 1), _MIN_VARIANCE) for p in parts])
+    squares = [p.signals.T @ p.signals for p in parts]
+    rights = [p.signals.T @ p.data for p in parts]
+    for _ in range(3):
+        normal = sum((s / v for s, v in zip(squares, variances, strict=True)), np.zeros((n, n)))
+        right = sum((r / v for r, v in zip(rights, variances, strict=True)), np.zeros(n))
+        values = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) @ right
+        left = (p.data - p.signals @ values for p in parts)
+        noise = [rest @ rest / max(p.dof - n, 1) for p, rest in zip(parts, left, strict=True)]
+        variances = np.maximum(noise, _MIN_VARIANCE)
+    return values, normal, variances
 
 
 def phase_map(fringes: FringeEvidence) -> F64:

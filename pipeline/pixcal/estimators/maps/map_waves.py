@@ -17,6 +17,7 @@ from pixcal.estimators.maps.map_fit import (
     MapPart,
     centred,
     fit_maps,
+    fitted_values,
     gauge_terms,
     phase_map,
     polynomial,
@@ -246,7 +247,6 @@ def _fitted(
     q, size = start.copy(), 6 * len(names)
     six = np.zeros(size)
     limit = 2 * np.pi / np.array(maps[0][1].good.shape[::-1])
-    errors = np.ones(size + 2)
     for turn in range(_ITERATIONS):
         parts = []
         for name, m in maps:
@@ -262,11 +262,11 @@ def _fitted(
             parts.append(
                 MapPart.of(signals if turn else signals[:size], m.data - model, m.free, m.good)
             )
-        fit = fit_maps(parts)
-        six = six + fit.values[:size]
+        step, _, _ = fitted_values(parts)
+        six = six + step[:size]
         if turn:
-            q = np.clip(q + fit.values[size:], start - limit, start + limit)
-        errors = np.sqrt(np.diag(fit.covariance))
+            q = np.clip(q + step[size:], start - limit, start + limit)
+    errors = np.sqrt(np.diag(fit_maps(parts).covariance))
     waves = []
     for n, name in enumerate(names):
         s, f, b = (complex(*six[6 * n : 6 * n + 6][part]) for part in (STATIC, FORWARD, BACKWARD))
