@@ -7,6 +7,8 @@ neither can be written: they are then kept as long as the process lives.
 import atexit
 import shutil
 import tempfile
+from collections.abc import Callable
+from typing import Any
 
 import numba
 
@@ -21,3 +23,14 @@ except RuntimeError:
     # Of this process alone: what others could write there would be run.
     numba.config.CACHE_DIR = tempfile.mkdtemp(prefix="pixcal-")
     atexit.register(shutil.rmtree, numba.config.CACHE_DIR, ignore_errors=True)
+
+
+def inner(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compile a function as a part of the kernels that call it; Python cannot.
+
+    It is not kept by itself, which saves a quarter of the time to compile.
+    """
+    decorate: Callable[[Callable[..., Any]], Any] = numba.njit(
+        nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options
+    )
+    return decorate

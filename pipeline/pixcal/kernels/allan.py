@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pixcal.kernels import inner
 from pixcal.model.arrays import F64
 
 # series whose running sums are held at the same time: they stay in the processor's cache
@@ -66,7 +67,7 @@ def _deviations(series, lengths, out):  # type: ignore[no-untyped-def]
                 out[number, start + p] = np.sqrt(mean) / m
 
 
-@njit(cache=True, nogil=True)
+@inner()
 def _add_difference(total, missing, k, m, squares, count):  # type: ignore[no-untyped-def]
     for p in range(PIXELS_AT_ONCE):
         whole = 1.0 if missing[k + 2 * m, p] == missing[k, p] else 0.0

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from pixcal.kernels import inner
 from pixcal.model.arrays import F32, F64, I64
 
 # sums kept for each pixel: 6 normal, 3 right-hand, weighted square of the residual, samples
@@ -28,7 +29,7 @@ SINGULAR = 1e-9
 FAST = {"reassoc", "contract", "nsz", "arcp", "afn"}
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@inner(fastmath=FAST, error_model="numpy")
 def _sweep_row(
     codes: Any, row: int, scale: float, offset: float, fill: float, g: Any,
     dk: Any, y: float, x0: float,
@@ -65,7 +66,7 @@ def _sweep_row(
             rr[i] += wr * r
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@inner(fastmath=FAST, error_model="numpy")
 def _sweep_still_row(
     codes: Any, row: int, scale: float, offset: float, fill: float, g: Any,
     t0: Any, t1: Any, t2: Any, read: Any, shot: Any,
@@ -95,14 +96,14 @@ def _sweep_still_row(
             rr[i] += wr * r
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _count_row(codes: Any, row: int, fill: int, count: Any) -> None:
     for t in range(codes.shape[0]):
         for i in range(codes.shape[2]):
             count[i] += np.float32(codes[t, row, i] != fill)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _sum_row(
     codes: Any, row: int, scale: float, offset: float, fill: int, g: Any, dk: Any, moving: bool,
     y: float, x0: float, t0: Any, t1: Any, t2: Any, read: Any, shot: Any, p: Any,
@@ -121,7 +122,7 @@ def _sum_row(
     _count_row(codes, row, fill, p[10])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _pour(part: Any, total: Any) -> None:
     """Add sums to others, and begin again."""
     for k in range(part.shape[0]):
@@ -234,7 +235,7 @@ def frame_sums(
 # long.
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@inner(fastmath=FAST, error_model="numpy")
 def _turn_pixels(t1: Any, t2: Any, kx: float, ky: float, y: Any, x: Any, h1: Any, h2: Any) -> None:
     one, two, half = np.float32(1), np.float32(2), np.float32(0.5)
     sixth, fourth = np.float32(1 / 6), np.float32(1 / 24)
@@ -254,7 +255,7 @@ def _turn_pixels(t1: Any, t2: Any, kx: float, ky: float, y: Any, x: Any, h1: Any
         h2[i] = t2[i] * co - t1[i] * si
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@inner(fastmath=FAST, error_model="numpy")
 def _weigh_pixels(
     codes: Any, s: float, o: float, f: float, g0: float, c1: float, c2: float,
     h0: Any, h1: Any, h2: Any, read: Any, shot: Any, turn: Any, w: Any, wr: Any,
@@ -269,7 +270,7 @@ def _weigh_pixels(
         wr[i] = weight * (s * code + o - model)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@inner(fastmath=FAST, error_model="numpy")
 def add_normal(h0: Any, h1: Any, h2: Any, turn: Any, w: Any, y: Any, x: Any, normal: Any) -> None:
     """Add pixels to the normal matrix (15 numbers) of g and dk; as in `frame_sums`, by pixel.
 
@@ -303,7 +304,7 @@ def add_normal(h0: Any, h1: Any, h2: Any, turn: Any, w: Any, y: Any, x: Any, nor
         normal[k] += q
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@inner(fastmath=FAST, error_model="numpy")
 def add_right(
     h0: Any, h1: Any, h2: Any, turn: Any, weighted: Any, y: Any, x: Any, right: Any
 ) -> None:
@@ -362,7 +363,7 @@ def _fringe(
     return s * m2 - c * m1, c * m2 + s * m1, variance
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@inner(fastmath=FAST, error_model="numpy")
 def _close_pixels(
     n00: Any, n01: Any, n02: Any, n11: Any, n12: Any, n22: Any, b0: Any, b1: Any, b2: Any,
     m1: Any, m2: Any, turn: Any, sigma: Any,

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from pixcal.kernels import inner
 from pixcal.model.arrays import F32, F64
 
 REACH = 2  # pixels on either side of a boundary whose charge acts on it
@@ -172,7 +173,7 @@ def _slopes(shifts: F64, dy: int, dx: int, axes: tuple[float, float]) -> F32:
     return np.array([by_shift, tuple(by_charge)], np.float32)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _gain(
     q: Any, push_x: Any, push_y: Any, y: int, left: int, right: int, slopes: Any, out: Any
 ) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pixcal.kernels import inner
 from pixcal.model.arrays import F32
 
 Key = tuple[int, int]  # two words of 32 bits
@@ -99,7 +100,7 @@ def _draw(row: np.uint32, frame: np.uint32, key: np.uint32, other: np.uint32, wo
         words[0, x], words[1, x], words[2, x], words[3, x] = a, b, c, d
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _box_muller(radius: U32, angle: U32, one: F32, other: F32) -> None:
     """Pairs of normals (x,) from pairs of words; none is beyond 6.8."""
     for x in range(len(radius)):
@@ -109,7 +110,7 @@ def _box_muller(radius: U32, angle: U32, one: F32, other: F32) -> None:
         one[x], other[x] = size * cosine, size * sine
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _log(value: np.float32) -> np.float32:
     """Natural logarithm of a positive number."""
     bits = np.int32(np.float32(value).view(np.int32) - _ROOT_HALF)
@@ -123,7 +124,7 @@ def _log(value: np.float32) -> np.float32:
     return x * square * series - np.float32(0.5) * square + x + np.float32(exponent) * _LOG_2
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _circle(word: np.uint32) -> Any:
     """Cosine and sine of a word as a fraction of a turn."""
     turn = np.int32(word)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from pixcal.kernels import inner
 from pixcal.model.arrays import F32
 
 FILL = 65535  # code of a sample without weight
@@ -49,7 +50,7 @@ def choose_scale(low: float, high: float, smallest_variance: float, share: float
 # Loops of their own: one loop that also counts takes twice as long.
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})  # type: ignore[untyped-decorator]
+@inner(fastmath={"contract"})
 def _encode_row(
     raw: Any, slope: Any, start: Any, dark: Any, exptime: float, saturation: float, codes: Any
 ) -> None:
@@ -62,7 +63,7 @@ def _encode_row(
         codes[i] = np.int32(value if inside else fill)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _sum_row(codes: Any) -> Any:
     total, fills = np.uint32(0), np.uint32(0)
     for i in range(codes.size):
@@ -71,7 +72,7 @@ def _sum_row(codes: Any) -> Any:
     return np.int64(total), np.int64(fills)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _count_row(raw: Any, saturation: float, codes: Any, saturated: Any, lost: Any) -> None:
     for i in range(raw.size):
         if codes[i] == FILL:
@@ -144,7 +145,7 @@ def coefficients(
     return slope.astype(np.float32), start.astype(np.float32), dark.astype(np.float32)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _extremes_of_row(raw: Any, saturation: float, lowest: Any, highest: Any) -> None:
     for i in range(raw.size):
         sample = np.float32(raw[i])

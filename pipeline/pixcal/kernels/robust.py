@@ -22,6 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pixcal.kernels import inner
 from pixcal.model.arrays import F32, F64, Mask
 
 BATCH = 64  # frames that are looked at together
@@ -37,7 +38,7 @@ def clipped_variance_factor(clip: float) -> float:
     return 1 - 2 * clip * density / math.erf(clip / math.sqrt(2))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _exchange(a: Any, b: Any) -> None:
     for i in range(a.size):
         low, high = a[i], b[i]
@@ -45,7 +46,7 @@ def _exchange(a: Any, b: Any) -> None:
         b[i] = high if low < high else low
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _sort_columns(rows: Any) -> None:
     # Batcher's merge exchange (Knuth, TAOCP 3, 5.2.2 M): the same exchanges whatever the data, so
     # that neighbouring columns are sorted in step, in vector registers.
@@ -109,7 +110,7 @@ def deviation_of_sorted(rows: Any, median: Any, out: Any) -> None:
             out[x] = 0.5 * (out[x] + least[x])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _deviation_of_some(column: Any, median: float) -> float:
     # Of the values before the first infinite one; NaN without any.
     count = 0
@@ -165,7 +166,7 @@ def median_and_deviation(frames: F32) -> tuple[F32, F32]:
     return median, deviation
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _add_row(
     samples: Any, offset: float, factor: float, reference: Any, limit: Any, widen: float,
     seen: Any, count: Any, s1: Any, s2: Any, s3: Any, s4: Any,

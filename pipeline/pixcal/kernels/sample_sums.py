@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from pixcal.kernels import inner
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
@@ -60,7 +61,7 @@ def _calm(
                         _count(one, noise, limits, beyond)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@inner(fastmath=_FAST, error_model="numpy")
 def _calm_row(
     samples: F32, model: F32, shot: F32, read: F32, good: Mask, square: float, least: float,
     calm: F32, kept: F32,
@@ -85,7 +86,7 @@ def _calm_row(
     return total, found
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _count(rest: float, variance: float, limits: F64, beyond: F64) -> None:
     for n in range(len(limits)):
         if rest * rest > limits[n] ** 2 * variance:
@@ -201,7 +202,7 @@ def products_by_level(
     return sums
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
+@inner(fastmath=_FAST)
 def _add_products(frame: F32, pairs: F32, steps: Indices, sums: F64) -> None:
     for n in range(len(steps)):
         dy, dx = steps[n]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from pixcal.kernels import inner
 from pixcal.model.arrays import F32
 
 _PIXELS = 2048  # of a frame that are worked on together: they stay in the cache
@@ -73,7 +74,7 @@ def _project(
             _subtract(rest[t], of_time[i, t], share[i])
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})  # type: ignore[untyped-decorator]
+@inner(fastmath={"reassoc", "contract"})
 def _dot(a: Any, weight: Any, b: Any) -> Any:
     total = np.float32(0)
     for x in range(len(a)):
@@ -81,13 +82,13 @@ def _dot(a: Any, weight: Any, b: Any) -> Any:
     return total
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})  # type: ignore[untyped-decorator]
+@inner(fastmath={"reassoc", "contract"})
 def _subtract(row: Any, times: Any, what: Any) -> None:
     for x in range(len(row)):
         row[x] -= times * what[x]
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})  # type: ignore[untyped-decorator]
+@inner(fastmath={"reassoc", "contract"})
 def _add_weighted(sums: Any, times: Any, weight: Any, row: Any) -> None:
     for x in range(len(sums)):
         sums[x] += times * weight[x] * row[x]

@@ -25,6 +25,7 @@ from pixcal.estimators.crosstalk.links import Place
 from pixcal.estimators.crosstalk.residuals import STRIDE, UNIT, Residuals, all_residuals
 from pixcal.estimators.crosstalk.steady import add_products as add_steady
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.kernels import inner
 from pixcal.kernels.crosstalk import Coupling
 from pixcal.model.arrays import F32, F64, Indices
 
@@ -158,7 +159,7 @@ def _multiply_up(factor: F32, charge: F32, one: F32, first: int, powers: F32) ->
                         value *= ratio
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inner()
 def _add_pixels(sums: F32, y: int, first: int, out: F32) -> None:
     """Add sums (pixel, link, n) of pixels of a row, from a column on, to all (link, n, y, x)."""
     count = min(len(sums), out.shape[3] - first)
