@@ -43,6 +43,7 @@ def test_frames_instead_of_a_precision(capsys: pytest.CaptureFixture[str]) -> No
     assert "with 960 frames" in both
 
 
+@pytest.mark.long
 def test_json_and_files_are_the_same(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     out = tmp_path / "out"
     text = printed(capsys, "--json", "--out", str(out))

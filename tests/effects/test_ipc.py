@@ -340,6 +340,7 @@ def test_maps_at_two_baselines_tell_it_best(acquired: Acquired) -> None:
     assert error(two) < 0.6 * error(one)
 
 
+@pytest.mark.long
 def test_detector_frames_alone_are_enough(acquired: Acquired) -> None:
     evidence = acquired(None, {"ipc": to_plain(Ipc())})
     found = Ipc.estimate(dataclasses.replace(evidence, fringes={}))

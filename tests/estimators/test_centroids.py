@@ -114,6 +114,7 @@ def test_the_bound_grows_with_the_pixels() -> None:
     assert bounds[-1] > 2
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("electrons", "read_variance"), [(1e7, 0.0), (1e6, 500.0), (3e4, 256.0)])
 def test_noise_scatters_the_fits_by_the_bound(electrons: float, read_variance: float) -> None:
     of = star(electrons=electrons, background=20.0, read_variance=read_variance)

@@ -278,6 +278,7 @@ def test_partial_blocks_are_blocks_if_they_are_large_enough() -> None:
     np.testing.assert_array_equal(blocks[:, 0], [255, 255, 47, 0, 0, 0])
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("above", [3e3, 1e4])
 @pytest.mark.parametrize("levels", [11, 16])
 def test_a_second_amplifier_for_bright_pixels_leaves_the_gain(above: float, levels: int) -> None:

@@ -35,6 +35,7 @@ def texts(figure: Figure) -> list[str]:
     return [text.get_text() for axes in figure.get_axes() for text in axes.texts]
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize(
     "budget",
     [

@@ -138,6 +138,7 @@ def test_the_same_bits_however_it_runs(fitted: Path, tmp_path: Path, runtime: Ru
     assert found(one) == found(other)
 
 
+@pytest.mark.long
 def test_it_runs_without_a_fit_and_again_with_one(fitted: Path, tmp_path: Path) -> None:
     run = bare(fitted, tmp_path / "run")
     first = crests.run(run, Config(frames=2), SYNC)

@@ -53,6 +53,7 @@ def cut_from_rows(run: Path) -> dict[str, list[int | None]]:
     return {name.partition("/")[0]: table["cut_from_row"] for name, table in tables.items()}
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize(
     ("shape", "value", "suffix"),
     [

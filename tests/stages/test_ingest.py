@@ -504,6 +504,7 @@ CHANGES: list[tuple[Callable[[Path], None], str]] = [
 ]
 
 
+@pytest.mark.quick(3)
 @pytest.mark.parametrize(("change", "folder_read"), CHANGES)
 def test_only_what_changed_is_read(
     bench: Path,
@@ -571,6 +572,7 @@ def test_copies_that_fill_the_disk_are_told(
         ingest.run(bench, tmp_path / "run", ingest.Config(), SYNC)
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize(
     "damage", ["missing", "cut", "altered", "facts", "tables", "planes", "files"]
 )
@@ -720,6 +722,7 @@ print(int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[
 """
 
 
+@pytest.mark.long
 def test_peak_memory_keeps_to_what_is_allowed(tmp_path: Path) -> None:
     """A set larger than the memory allowed goes through it, frame by frame and as a cube."""
     memory = 440 << 20

@@ -142,6 +142,7 @@ def ingested(far: Path, tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
+@pytest.mark.long
 def test_others_open_the_url(far: Path, local: Path) -> None:
     raw = zarr.open_array(store=f"{cubes_of(far / 'ingest')}/raw.zarr/fringes/vertical", mode="r")
     home = ArrayReader(local / "ingest/raw.zarr/fringes/vertical").read()

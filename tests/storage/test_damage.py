@@ -54,6 +54,7 @@ def flip(file: Path, bit: int) -> None:
     file.write_bytes(body)
 
 
+@pytest.mark.long
 def test_every_flipped_bit_of_a_manifest_is_seen(tmp_path: Path) -> None:
     complete(tmp_path)
     file = tmp_path / "fit" / MANIFEST
