@@ -1,13 +1,16 @@
 """Detector frames tell gain, response and converter, of a camera with little noise too."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.effects.quantisation import Quantisation
+from pixcal.estimators.detector.ladder_curve import ladder_curve
 from pixcal.estimators.detector.transfer_curve import transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.estimators.diagnosis.test_statistics.noise import read_noise
@@ -16,29 +19,47 @@ SHAPE = (93, 101)
 READ, GAIN, BIAS, DARK = 1.0, 1.5, 200.3, 0.4
 
 
-def evidence(seed: int = 1, quadratic: float = 0.0, read: float = READ) -> Evidence:
-    """Ten flats in pairs, and bias and dark frames whose signal is about the read noise."""
+Response = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+def knee(charge: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Signal that bends above 12 ke-: 6 % at 18 ke-."""
+    return charge * (1 - 0.06 * np.maximum(charge / 6e3 - 2, 0) ** 2)
+
+
+def evidence(
+    seed: int = 1,
+    quadratic: float = 0.0,
+    read: float = READ,
+    response: Response = lambda charge: charge,
+    lamp: float | None = None,
+    count: int = 8,
+) -> Evidence:
+    """Flats in pairs, and bias and dark frames whose signal is about the read noise."""
     rng = np.random.default_rng(seed)
-    response = 1 + 0.01 * rng.standard_normal(SHAPE)
+    pattern = 1 + 0.01 * rng.standard_normal(SHAPE)
 
     def stack(kind: str, frames: int, seconds: float, light: float) -> Stack:
-        charge = rng.poisson(light * response + DARK * seconds, (frames, *SHAPE)).astype(float)
+        charge = rng.poisson(light * pattern + DARK * seconds, (frames, *SHAPE)).astype(float)
         charge *= 1 + quadratic * charge / 2e4
+        charge = response(charge)
         charge += read * rng.standard_normal(charge.shape)
         adu = np.rint(BIAS + charge / GAIN).astype(np.float32)
         return Stack(
             kind, seconds, np.arange(frames), np.arange(float(frames)), adu, step=int(light)
         )
 
-    levels = np.linspace(1500, 18000, 8)
+    levels = np.linspace(1500, 18000, count)
+    times = np.zeros(count) if lamp is None else levels / 1e5
+    lights = levels * (1 + (lamp or 0.0) * rng.standard_normal(count))
     return Evidence(
         fringes={},
         stacks=(
             stack("bias", 40, 0.0, 0), stack("dark", 10, 1.0, 0),
-            *(stack("flat", 2, 0.0, float(level)) for level in levels),
+            *(stack("flat", 2, *one) for one in zip(times, lights, strict=True)),
         ),
         gain=GAIN, read_noise=float(np.hypot(read, GAIN / np.sqrt(12))), amplifier_noise=read,
-        bias=np.full(SHAPE, BIAS), dark_rate=np.full(SHAPE, DARK), flat=response,
+        bias=np.full(SHAPE, BIAS), dark_rate=np.full(SHAPE, DARK), flat=pattern,
         good=np.ones(SHAPE, np.bool_), saturation_adu=65535.0, pitch_um=5.0, wavelength_nm=600.0,
         distance_mm=1000.0, photon_transfer=(GAIN, 0.01, 1.0),
     )  # fmt: skip
@@ -49,6 +70,30 @@ def test_dark_signal_of_the_order_of_the_read_noise_leaves_the_photon_transfer_r
     assert curve is not None
     assert abs(curve.share - 1) < 4 * curve.error < 0.04
     assert abs(curve.slope) < 4 * curve.slope_error
+
+
+def test_a_knee_is_measured_from_level_to_level() -> None:
+    frames = evidence(5, response=knee, lamp=0.0, count=16)
+    found = Nonlinearity.estimate(frames)
+    assert found is not None
+    assert isinstance(found.effect, Nonlinearity)
+    at = np.array([bend.level_e for bend in found.effect.bends[1:]])
+    # Its errors hang together: all changes are off by the same factor if the gain is.
+    steps = np.array([[own[key] for key in found.errors] for own in found.together])
+    off = np.linalg.solve(steps.T, found.effect.response(at) - knee(at))
+    assert chdtrc(len(at), off @ off) > 1e-4
+    assert np.hypot.reduce(steps, axis=0)[-1] < 0.02 * at[-1]
+    assert found.significance > 10
+
+
+@pytest.mark.parametrize("lamp", [0.02, None])
+def test_levels_of_a_lamp_that_is_not_known_tell_no_curve(lamp: float | None) -> None:
+    assert ladder_curve(evidence(5, response=knee, lamp=lamp)) is None
+
+
+@pytest.mark.parametrize("seed", range(6, 9))
+def test_where_a_polynomial_suffices_no_curve_is_told(seed: int) -> None:
+    assert ladder_curve(evidence(seed, quadratic=-0.04, lamp=0.0)) is None
 
 
 def test_photon_transfer_tells_a_response_that_bends() -> None:

@@ -68,6 +68,9 @@ def test_the_size_of_an_effect_is_told_in_its_units():
     wave = {"beat_rad_px": [0.7, 0.1], "static": [0.003, -0.004], "forward": [0.0, 0.001]}
     ghost = {"parameters": {"share": 0.0, "waves": [wave]}, **size("share", "waves")}
     assert size_of(ghost) == "1 wave, largest 0.5 %"
+    points = [{"level_e": 0.0, "change_e": 0.0}, {"level_e": 5e3, "change_e": -100.0}]
+    bent = {"strengths": ["bends"], "units": {"bends": ""}, "parameters": {"bends": points}}
+    assert size_of(bent) == "2 bends, largest 2 %"
     glow = {"parameters": {"rate": 118.0, "reach_px": 15.0}, "uncertainty": {"rate": 2.0}}
     own = glow | {"units": {"rate": "e-/s", "reach_px": "px"}, "strengths": ["rate"]}
     assert size_of(own) == "rate 118.0 ± 2.0 e⁻/s"

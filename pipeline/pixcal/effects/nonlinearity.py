@@ -7,6 +7,7 @@ from typing import Self
 import numpy as np
 
 from pixcal.estimators.detector.flat_ladder import ladder_response
+from pixcal.estimators.detector.ladder_curve import ladder_curve
 from pixcal.estimators.detector.neighbours import shared_charge
 from pixcal.estimators.detector.response import departure, fit_curve, fit_response
 from pixcal.estimators.detector.transfer_curve import transfer_curve
@@ -154,13 +155,22 @@ class Nonlinearity(Effect):
         quadratic, cubic = (float(np.clip(v, -0.3, 0.3)) for v in found.sizes)
         effect = cls(quadratic, cubic, found.level_e)
         more, refused = None, ""
+        told = found.significance, found.why, found.details
+        bent = None if evidence.fringes else ladder_curve(evidence)
+        if bent is not None:
+            points = np.pad(bent.charge, (1, 0)).tolist(), np.pad(bent.change, (1, 0)).tolist()
+            named = {f"bends[{n}].change_e": float(e) for n, e in enumerate(bent.error, 1)}
+            steps = tuple(dict(zip(named, own, strict=True)) for own in bent.steps.T.tolist())
+            return Estimate(
+                cls(0.0, 0.0, found.level_e, tuple(map(Bend, *points))), named, *told, steps,
+                law="response curve of second and third order", by_law=effect,
+            )  # fmt: skip
         if evidence.fringes and found.significance > SIGNIFICANT:
             part = central_crop(evidence)
             more, agreement = _bends(part, effect.response, found.chi2)
             refused = SETS_DISAGREE if agreement.refused else ""
         errors = np.sqrt(np.diag(found.covariance))
         named = {"quadratic": float(errors[0]), "cubic": float(errors[1])}
-        told = found.significance, found.why, found.details
         if more is None:
             return Estimate(effect, named, *told, refused=refused)
         named |= {f"bends[{n}].change_e": error for n, error in enumerate(more[1])}

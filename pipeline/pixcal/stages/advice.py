@@ -238,6 +238,8 @@ def _parts(name: str, parts: Sequence[Json]) -> str:
 
 
 def _share(part: Json) -> float:
-    """Of a coupling, or of the wave of a ghost, which has a complex amplitude for each term."""
+    """Of a coupling, a point of a response, or the wave of a ghost, complex for each term."""
+    if part.get("level_e"):
+        return abs(float(part["change_e"])) / float(part["level_e"])
     waves = (part[key] for key in ("static", "forward", "backward") if key in part)
     return float(max([abs(part.get("share", 0.0)), *(math.hypot(*wave) for wave in waves)]))

@@ -53,7 +53,7 @@ def transfer_curve(evidence: Evidence, *, whole: bool = False) -> TransferCurve 
 def _transfer_curve(evidence: Evidence, whole: bool) -> TransferCurve | None:
     counted = None if whole else _shared_steps(evidence)
     without = (s for s in evidence.stacks if s.kind != "flat" and _is_enough(s))
-    darks = [sums for s in without if (sums := _of_stack(s, evidence)) is not None]
+    darks = [_read_alone(sums) for s in without if (sums := _of_stack(s, evidence)) is not None]
     points = []
     for stack in filter(_is_enough, evidence.ladder):
         sums = _of_stack(stack, evidence)
@@ -74,6 +74,17 @@ def _transfer_curve(evidence: Evidence, whole: bool) -> TransferCurve | None:
     errors = np.sqrt(np.diag(covariance))
     at_zero, rise = zip(found.tolist(), errors.tolist(), strict=True)
     return TransferCurve(*at_zero, *rise, top, level, share, error)
+
+
+def _read_alone(sums: F64) -> F64:
+    """Sums of frames without light as if they had no dark signal, whose shot noise is as expected.
+
+    It is of low levels, where the response has another slope than at that of flats.
+    """
+    n, _, s12, s22, _, p2, square = sums.T
+    none = np.zeros_like(n)
+    own = np.arange(len(n)) == 0
+    return np.stack([n, none, none, s22, none, p2 - s12 * own, square], axis=1)
 
 
 def shot_share(sums: Iterable[F64], counted: Mask | None = None) -> tuple[float, float] | None:

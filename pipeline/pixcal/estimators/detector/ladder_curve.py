@@ -1,0 +1,87 @@
+"""Response at each level of a ladder of flats, where no polynomial of low order describes it.
+
+The noise of flats goes with the slope of the response, and their levels with the response itself if
+the lamp and its exposure times are steady. Both together give the charge of each level: signal plus
+a departure that a natural spline joins from level to level.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
+
+from pixcal.estimators.detector.flat_ladder import LAMP, ladder
+from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
+from pixcal.model.arrays import F64
+
+MIN_LEVELS = 6  # fewest levels of which a curve is more than a polynomial
+LOOSE = 0.05  # departure over the signal that is unlikely without data
+_GAIN = 0.01  # by which the gain used may be off
+_PARTS = 9  # of the pixels by their response
+
+
+@dataclass(frozen=True)
+class LadderCurve:
+    """Response from level to level."""
+
+    charge: F64  # (n,) e-
+    change: F64  # (n,) signal less charge, e-
+    steps: F64  # (n, m) of the changes by independent errors of one sigma each, e-
+
+    @property
+    def error(self) -> F64:
+        """Of each change (n,), e-."""
+        return np.asarray(np.hypot.reduce(self.steps, axis=1))
+
+
+def ladder_curve(evidence: Evidence) -> LadderCurve | None:
+    """The response; None without a ladder, or where a polynomial describes its noise."""
+    curve, found = transfer_curve(evidence), ladder(evidence)
+    if curve is None or found is None or len(found.times) != len(curve.levels):
+        return None
+    if len(curve.levels) < MIN_LEVELS or not _bends_by_noise(curve):
+        return None
+    return fit_levels(curve, found.times, evidence.flat[evidence.good])
+
+
+def _bends_by_noise(curve: TransferCurve) -> bool:
+    """Whether noise over level is no polynomial of second order of the level."""
+    design = np.stack([(curve.levels / curve.top) ** n for n in range(3)]) / curve.errors
+    value = curve.shares / curve.errors
+    rest = value - np.linalg.lstsq(design.T, value)[0] @ design
+    return sigmas_of_chi2(float(rest @ rest), len(value) - 3) > SIGNIFICANT
+
+
+def fit_levels(curve: TransferCurve, times: F64, flat: F64) -> LadderCurve | None:
+    """Changes at the levels that make the noise, and the levels over time (s), what they are.
+
+    None where noise and levels disagree: the lamp wanders, or bright pixels have another gain.
+    ``flat``: (n,) relative response of the pixels.
+    """
+    parts = np.quantile(flat / flat.mean(), (np.arange(_PARTS) + 0.5) / _PARTS)
+    signal, n = curve.levels[:, None] * parts, len(curve.levels)
+    # One beyond the highest: the end of a natural spline has no curvature, where knees have most.
+    above = max(2 * curve.levels[-1] - curve.levels[-2], float(signal.max()))
+    knots = np.concatenate([[0.0], curve.levels, [above]])
+    unit = LOOSE * knots[1:]
+
+    def rest(sizes: F64) -> F64:
+        gain, rate, offset = sizes[:3] * _GAIN
+        change = CubicSpline(knots, [0.0, *sizes[3:] * unit], bc_type="natural")
+        charge, slope = signal - change(signal), 1 / (1 - change(signal, 1))
+        share = (1 + gain) * (slope**2 * charge).mean(axis=1) / curve.levels
+        line = (1 + rate) * curve.top * times / times[-1] + offset * curve.levels[0]
+        of_lamp = (charge.mean(axis=1) / line - 1) / LAMP
+        return np.concatenate(
+            [(curve.shares - share) / curve.errors, of_lamp, sizes[:1], sizes[3:]]
+        )
+
+    fit = least_squares(rest, np.zeros(n + 4))
+    if sigmas_of_chi2(float(fit.fun[: 2 * n] @ fit.fun[: 2 * n]), n) > SIGNIFICANT:
+        return None
+    sizes, covariance = fit.x[3:], np.linalg.inv(fit.jac.T @ fit.jac)[3:, 3:]
+    change, steps = unit * sizes, unit[:, None] * np.linalg.cholesky(covariance)
+    return LadderCurve(knots[1:] - change, change, steps)
