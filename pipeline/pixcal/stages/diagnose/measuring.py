@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 
 from pixcal.estimators.detector.amplifiers import relative_gain
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
@@ -23,6 +22,7 @@ from pixcal.stages import reduce
 from pixcal.stages.diagnose.description import bench_of, pedestal_of, recordings_of
 from pixcal.stages.diagnose.fitted_set import FittedSet, contrast_surface, light_surface
 from pixcal.stages.diagnose.flat_light import FlatLight
+from pixcal.stages.diagnose.hot_pixels import uncoupled
 from pixcal.stages.diagnose.measured_gain import MeasuredGain
 from pixcal.stages.diagnose.nominal import (
     Measured,
@@ -31,10 +31,6 @@ from pixcal.stages.diagnose.nominal import (
 )
 from pixcal.stages.diagnose.parts import Half, Table
 
-HOT = 40.0  # robust standard deviations of the dark current beyond which a pixel is hot
-# pixels around a hot one that may have got some of its charge: at most a share of `SHARED`
-HOT_REACH = 2
-SHARED = 0.1
 NO_TEST = 10.0  # reduced chi-square of the photon transfer beyond which its gain is not believed
 CORE = 5.0  # robust standard deviations within which the scatter of the dark signal may be noise
 
@@ -210,7 +206,7 @@ def _dark_rate(evidence: Sequence[Evidence], halves: Sequence[Half]) -> F32:
 
     Of negative rates nothing would be left but a higher mean.
     """
-    rate = _mean([_uncoupled(e.dark_rate) for e in evidence])
+    rate = _mean([uncoupled(e.dark_rate, np.random.default_rng(0)) for e in evidence])
     own = parted("bias", halves) and parted("dark", halves)
     noise = _rate_variance(evidence[0]) / (len(evidence) if own else 1)
     rest = rate - np.median(rate)
@@ -229,15 +225,6 @@ def _rate_variance(evidence: Evidence) -> float:
         return 0.0
     charge = float(np.median(np.maximum(evidence.dark_rate, 0))) * times.max()
     return float((evidence.read_noise**2 + charge) / (len(times) * times.var()))
-
-
-def _uncoupled(dark: F64) -> F64:
-    """Dark current without what hot pixels may have given to their neighbours."""
-    rest = dark - np.median(dark)
-    spread = 1.4826 * float(np.median(np.abs(rest)))
-    brightest = maximum_filter(rest, size=2 * HOT_REACH + 1, mode="nearest")
-    beside = (brightest > HOT * spread) & (rest < SHARED * brightest)
-    return np.where(beside, np.median(dark), dark)
 
 
 def _set_truth(found: Sequence[FringeEvidence], frames: Sequence[Indices], count: int) -> SetTruth:

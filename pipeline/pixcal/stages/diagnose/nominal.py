@@ -29,11 +29,12 @@ from pixcal.simulation.shot import Shot
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.flat_light import FlatLight
+from pixcal.stages.diagnose.hot_pixels import uncoupled
 from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_change
 from pixcal.stages.diagnose.parts import Half, Raw, Table, select
 from pixcal.stages.diagnose.undone import IntensityBeforeEffects
 
-_GAIN, _NOISE = 101, 102  # keys of random numbers
+_GAIN, _NOISE, _DARK = 101, 102, 103  # keys of random numbers
 
 
 @dataclass(frozen=True)
@@ -230,7 +231,7 @@ class NominalBench:
         maps = replace(
             m,
             response=m.response * gain,
-            dark_rate=m.dark_rate * gain,
+            dark_rate=uncoupled(m.dark_rate, np.random.default_rng([own_seed, _DARK])) * gain,
             read_noise=noise,
             adu_per_e=m.adu_per_e / gain,
         )
