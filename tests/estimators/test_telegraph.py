@@ -20,9 +20,14 @@ def jumping(
     switching_s: float,
     decades: float = 0.0,
     frames_of_series: Sequence[int] = (30, 20),
+    n: int = 16_000,
+    differ: float = 0.0,
 ) -> list[Series]:
-    """Series of the same pixels, of noise one and jumps with amplitudes about ``amplitude``."""
-    n = 16_000
+    """Series of the same pixels, of noise one and jumps with amplitudes about ``amplitude``.
+
+    The pixels' own noise is log-normal, and differs by the factor that ``differ`` is of.
+    """
+    own = rng.lognormal(0, differ, n) if differ else 1.0
     times = switching_s * 10 ** (decades * (rng.random(n) - 0.5)) if decades else switching_s
     jumps = np.where(rng.random(n) < share, amplitude * rng.standard_exponential(n), 0.0)
     series = []
@@ -30,7 +35,7 @@ def jumping(
         anew = rng.random((frames, n)) < 1 - np.exp(-2 * PERIOD_S / times)
         turns = np.where(anew & (rng.random((frames, n)) < 0.5), -1.0, 1.0)
         turns[0] = rng.choice([-1.0, 1.0], n)
-        noise = rng.standard_normal((frames, n)) + np.cumprod(turns, axis=0) * jumps / 2
+        noise = own * rng.standard_normal((frames, n)) + np.cumprod(turns, axis=0) * jumps / 2
         series.append(Series(noise, np.arange(frames), np.arange(n), 1.0, PERIOD_S))
     return series
 
@@ -49,6 +54,19 @@ def test_pixels_that_hardly_stand_out_tell_share_amplitude_and_time(
     assert abs(found.switching_s - switching_s) < 4 * found.switching_error < 2 * switching_s
     assert found.significance > 8
     assert found.switching_decades == 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("differ", [0.1, 0.2])
+@pytest.mark.parametrize("seed", range(3))
+def test_pixels_of_different_noise_are_no_telegraph_noise(differ: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    series = jumping(rng, 0.02, 6.0, 0.5, 0.0, (60, 20), 4_000, differ)
+    found = find_telegraph(series)
+    assert found is not None
+    assert abs(found.share - 0.02) < 4 * found.share_error < 0.04
+    assert abs(found.amplitude - 6) < 4 * found.amplitude_error < 6
+    assert abs(found.switching_s - 0.5) < 4 * found.switching_error < 0.5
 
 
 @pytest.mark.long

@@ -18,6 +18,9 @@ AMPLITUDES = np.geomspace(0.1, 300, 90)  # amplitudes over the common noise that
 _DRAWN = 600
 PLACES = (np.arange(5) + 0.5) / 5  # of pixels in the range of their stays
 _UNDERFLOW = 1e-200
+# Pixels' own noise is log-normal: nodes as far as this, at least so many, in its deviations, and as
+# dense as this, in those of a variance as the samples tell it
+_REACH, _FEWEST, _STEP = 3.0, 7, 2.0
 
 
 @dataclass(frozen=True)
@@ -26,22 +29,26 @@ class AmplitudeClasses:
 
     likely: F64  # (n, class) likelihood of each pixel's variance over the largest of its own
     largest: F64  # (n, 1) the logarithm of that, over the likelihood of a quiet pixel
-    added: F64  # (class,) variance that an amplitude adds, over the common one
+    quiet: F64  # (n,) logarithm of the likelihood of a quiet pixel of the same noise
+    noise: float  # variance that the pixels have without jumps, over the common one
+    added: F64  # (class,) variance that an amplitude adds, over that
     chances: F64  # chances, products: (level, class) and (lag, level, class) from `_levels`
     products: F64
 
     @classmethod
-    def of(cls, m: Moments, unit: float, stays: "Stays") -> "AmplitudeClasses":
+    def of(cls, m: Moments, unit: float, stays: "Stays", noise: float = 1.0) -> "AmplitudeClasses":
         """Likelihoods of the moments of each pixel."""
-        added = (AMPLITUDES * unit / m.sigma / 2) ** 2
-        levels = m.variance[:, None] * (added / (1 + added))
+        added = (AMPLITUDES * unit / m.sigma / 2) ** 2 / noise
+        variance = m.variance / noise
+        levels = variance[:, None] * (added / (1 + added))
         levels -= np.log1p(added)
-        levels *= m.dof / 2
+        levels *= m.samples_dof / 2
+        quiet = -(variance + np.log(noise)) * m.samples_dof / 2
         largest = levels.max(axis=1, keepdims=True)
         levels -= largest
         np.exp(levels, out=levels)
         of_levels = _levels(tuple(stays.kept(m.period_s, PLACES).tolist()), m.frames)
-        return cls(levels, largest, added, *of_levels)
+        return cls(levels, largest, quiet, noise, added, *of_levels)
 
     def mixed(self) -> F64:
         """Likelihoods (n, class) by what a pixel may have shown of its amplitude."""
@@ -57,7 +64,8 @@ class AmplitudeClasses:
 
     def expected(self, lag: int) -> F64:
         """Products of frames (n, class) to be expected, as in `Moments`, of one of its lags."""
-        return np.asarray((self.likely @ self.products[lag]) * self.added / self.mixed())
+        products = (self.likely @ self.products[lag]) * (self.noise * self.added)
+        return np.asarray(products / self.mixed())
 
 
 @dataclass(frozen=True)
@@ -111,12 +119,45 @@ def _levels(keeps: tuple[float, ...], count: int) -> tuple[F64, F64]:
     return chances, np.stack(products)
 
 
-def joined(pixels: Indices, parts: Sequence[Moments], classes: Iterable[AmplitudeClasses]) -> F64:
-    """Logarithms (pixel, class) of the likelihood ratios of all series together."""
-    total = np.zeros((len(pixels), len(AMPLITUDES)))
+def own_noises(parts: Sequence[Moments]) -> list[tuple[float, float]]:
+    """Variances over the common one that quiet pixels may have, and logarithms of their shares."""
+    dof = np.array([m.samples_dof for m in parts])
+    deviation = float(np.sqrt(np.average([m.spread for m in parts], weights=dof**2)))
+    step = _STEP * np.sqrt(2 / dof.sum())
+    if not deviation:
+        return [(1.0, 0.0)]
+    at = np.linspace(-_REACH, _REACH, max(int(2 * _REACH * deviation / step) + 2, _FEWEST))
+    shares = -(at**2) / 2
+    return list(zip(np.exp(deviation * at), shares - logsumexp(shares), strict=True))
+
+
+def of_own_noise(
+    pixels: Indices, parts: Sequence[Moments], classes: Iterable[AmplitudeClasses]
+) -> tuple[F64, F64]:
+    """Log-likelihoods of all series together with one noise: (pixel, class) over quiet (pixel,)."""
+    total, quiet = np.zeros((len(pixels), len(AMPLITUDES))), np.zeros(len(pixels))
     for m, one in zip(parts, classes, strict=True):
-        np.add.at(total, np.searchsorted(pixels, m.pixel), one.log_ratio())
-    return total
+        at = np.searchsorted(pixels, m.pixel)
+        total[at] += one.log_ratio()  # no pixel is in a series twice
+        quiet[at] += one.quiet
+    return total, quiet
+
+
+def joined(pixels: Indices, parts: Sequence[Moments], unit: float, stays: Stays) -> F64:
+    """Logarithms (pixel, class) of the likelihood ratios of all series together.
+
+    A pixel has the same noise of its own in all of them.
+    """
+    total = np.full((len(pixels), len(AMPLITUDES)), -np.inf)
+    every = np.full(len(pixels), -np.inf)
+    for noise, share in own_noises(parts):
+        # One after the other: each is large.
+        classes = (AmplitudeClasses.of(m, unit, stays, noise) for m in parts)
+        ratio, quiet = of_own_noise(pixels, parts, classes)
+        ratio += quiet[:, None] + share
+        np.logaddexp(total, ratio, out=total)
+        np.logaddexp(every, quiet + share, out=every)
+    return np.asarray(total - every[:, None])
 
 
 @dataclass(frozen=True)

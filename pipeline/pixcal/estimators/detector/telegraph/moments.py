@@ -18,6 +18,9 @@ NOISY = 3.0  # excess of the variance, in its own sigmas, from which a pixel's n
 LAGS = 1, 4  # frames apart whose products tell how long pixels stay, and how widely that differs
 QUIET = 1 << 14  # pixels of usual noise that tell what noise is usual
 _OUTLIER = 5.0
+# by how much the quartiles of n pixels' variances are further apart than those of alike pixels,
+# times the root of n: three errors (of normal numbers)
+_DIFFER = 3.5
 _MIN_FRAMES = 8
 
 
@@ -43,7 +46,8 @@ class Moments:
     # (lag, n) mean product of frames `LAGS` apart; NaN where there are none
     products: F64
     pairs: float  # neighbouring frames, over all but one
-    dof: float  # of the variance: fewer than the samples have where pixels differ anyway
+    samples_dof: float  # of the variance
+    spread: float  # variance from pixel to pixel of the logarithm of the variance that they have
     sigma: float
     period_s: float
     frames: int  # that most pixels have
@@ -54,6 +58,11 @@ class Moments:
         own = np.isin(self.pixel, pixels)
         names = ("pixel", "count", "variance", "kurtosis", "products", "stands_for")
         return replace(self, **{name: getattr(self, name)[..., own] for name in names})
+
+    @property
+    def dof(self) -> float:
+        """Of the variance as it scatters: fewer than the samples have where pixels differ."""
+        return self.samples_dof / (1 + self.spread * self.samples_dof / 2)
 
     @property
     def excess(self) -> F64:
@@ -88,7 +97,8 @@ def moments_of(series: Series) -> Moments | None:
     centre = np.median(variance) * dof / chdtri(dof, 0.5)
     # Half the pixels lie between the quartiles, whatever the noisy ones do.
     low, high = np.quantile(variance / centre, (0.25, 0.75))
-    wide = (high - low) / np.diff(chdtri(dof, (0.75, 0.25)) / dof)[0]
+    wide = float(np.log(high / low) / np.diff(np.log(chdtri(dof, (0.75, 0.25))))[0])
+    differ = wide - 1 > _DIFFER / np.sqrt(len(variance))
     return Moments(
         series.pixel[used],
         n,
@@ -96,7 +106,8 @@ def moments_of(series: Series) -> Moments | None:
         kurtosis,
         products / centre,
         pairs[0],
-        dof / max(float(wide), 1.0) ** 2,
+        dof,
+        (wide**2 - 1) * 2 / dof if differ else 0.0,
         series.sigma * float(np.sqrt(centre)),
         series.period_s if np.isfinite(series.period_s) and series.period_s > 0 else 1.0,
         int(np.median(n)),

@@ -19,6 +19,8 @@ from pixcal.estimators.detector.telegraph.classes import (
     Mixture,
     Stays,
     joined,
+    of_own_noise,
+    own_noises,
 )
 from pixcal.estimators.detector.telegraph.moments import Moments
 from pixcal.model.arrays import F64, Indices
@@ -55,9 +57,7 @@ def find_population(parts: Sequence[Moments], stays: Stays) -> Population:
     stands_for = np.ones(len(pixels))
     for m in parts:
         stands_for[np.searchsorted(pixels, m.pixel)] = m.stands_for
-    # One after the other: each is large.
-    classes = (AmplitudeClasses.of(m, unit, stays) for m in parts)
-    mixture = Mixture.of(joined(pixels, parts, classes))
+    mixture = Mixture.of(joined(pixels, parts, unit, stays))
 
     def weights(p: F64) -> F64:
         """Share of the pixels in each class of amplitudes."""
@@ -154,18 +154,43 @@ def _rest(
     if not len(few):
         return 0.0, 0.0
     own = [m.of(few) for m in parts]
-    classes = [AmplitudeClasses.of(m, population.unit, stays) for m in own]
-    mixture = Mixture.of(joined(few, own, classes))
+    logarithms, expected = _expected(few, own, population.unit, stays, lag)
+    mixture = Mixture.of(logarithms)
     chance = mixture.chance(population.weight)
     of_class = mixture.shares(population.weight)
     total = square = 0.0
-    for m, one in zip(own, classes, strict=True):
+    for m, products in zip(own, expected, strict=True):
         if not len(m.pixel) or np.isnan(m.products[lag]).any():
             continue
         at = np.searchsorted(few, m.pixel)
-        expected = np.einsum("nk,nk->n", of_class[at], one.expected(lag))
-        left = chance[at] * (m.products[lag] + 1 / m.count - chance[at] * expected)
+        of_pixel = np.einsum("nk,nk->n", of_class[at], products)
+        left = chance[at] * (m.products[lag] + 1 / m.count - chance[at] * of_pixel)
         left *= m.stands_for
         total += float(left.sum())
         square += float(left @ left)
     return total, square**0.5
+
+
+def _expected(
+    pixels: Indices, parts: Sequence[Moments], unit: float, stays: Stays, lag: int
+) -> tuple[F64, list[F64]]:
+    """What `joined` gives, and the products of frames (n, class) to be expected of each series."""
+    totals = [np.zeros((len(m.pixel), len(AMPLITUDES))) for m in parts]
+    weight, largest = np.zeros((2, len(pixels), len(AMPLITUDES)))
+    largest -= np.inf
+    every = np.full(len(pixels), -np.inf)
+    for noise, share in own_noises(parts):
+        classes = [AmplitudeClasses.of(m, unit, stays, noise) for m in parts]
+        ratio, quiet = of_own_noise(pixels, parts, classes)
+        ratio += quiet[:, None] + share
+        np.logaddexp(every, quiet + share, out=every)
+        before, largest = largest, np.maximum(largest, ratio)
+        kept, now = np.exp(before - largest), np.exp(ratio - largest)
+        weight = weight * kept + now
+        for m, one, total in zip(parts, classes, totals, strict=True):
+            at = np.searchsorted(pixels, m.pixel)
+            total *= kept[at]
+            total += now[at] * one.expected(lag)
+    ats = (np.searchsorted(pixels, m.pixel) for m in parts)
+    expected = [total / weight[at] for total, at in zip(totals, ats, strict=True)]
+    return largest + np.log(weight) - every[:, None], expected
