@@ -28,7 +28,7 @@ except RuntimeError:
 def inner(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function as a part of the kernels that call it; Python cannot.
 
-    It is not kept by itself, which saves a quarter of the time to compile.
+    It is neither kept nor wrapped by itself: a tenth less to compile for kernels of many parts.
     """
     decorate: Callable[[Callable[..., Any]], Any] = numba.njit(
         nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options
