@@ -25,7 +25,7 @@ def jumping(
 ) -> list[Series]:
     """Series of the same pixels, of noise one and jumps with amplitudes about ``amplitude``.
 
-    The pixels' own noise is log-normal, and differs by the factor that ``differ`` is of.
+    ``differ``: standard deviation of the logarithm of the pixels' own noise.
     """
     own = rng.lognormal(0, differ, n) if differ else 1.0
     times = switching_s * 10 ** (decades * (rng.random(n) - 0.5)) if decades else switching_s
@@ -59,7 +59,7 @@ def test_pixels_that_hardly_stand_out_tell_share_amplitude_and_time(
 @pytest.mark.long
 @pytest.mark.parametrize("differ", [0.1, 0.2])
 @pytest.mark.parametrize("seed", range(3))
-def test_pixels_of_different_noise_are_no_telegraph_noise(differ: float, seed: int) -> None:
+def test_pixels_of_different_noise_do_not_hide_the_population(differ: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     series = jumping(rng, 0.02, 6.0, 0.5, 0.0, (60, 20), 4_000, differ)
     found = find_telegraph(series)

@@ -208,7 +208,7 @@ class Effect(ForwardModel):
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
-        """Significance that `estimate` gives; of many simulations nothing else is wanted."""
+        """Significance that `estimate` gives; of most simulations nothing else is needed."""
         found = cls.estimate(evidence)
         return None if found is None else found.significance
 

@@ -57,8 +57,8 @@ class ForwardModel:
     sources : tuple of str
         Where the default sizes come from.
     quick : bool
-        Whether an estimate takes about a second or less of 10⁷ samples, so that it can be made of
-        many simulations.
+        Whether `Effect.detect` takes about a second or less for 10⁷ samples, so that it can be used
+        on many simulations.
     """
 
     name: ClassVar[str]

@@ -1,4 +1,4 @@
-"""Hot pixels that know nothing of their neighbours."""
+"""Dark current without what hot pixels may have given to their neighbours."""
 
 from typing import TypeVar
 
