@@ -9,7 +9,7 @@ import numpy as np
 
 from pixcal.estimators.detector.noiseless_charge import noiseless_level
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.light import LIGHT_PARTS, light_of
+from pixcal.estimators.frame_series.light import LIGHT_PARTS, FrameLight, light_of
 from pixcal.estimators.frame_series.offset import (
     OffsetSeries,
     dark_offsets,
@@ -17,7 +17,7 @@ from pixcal.estimators.frame_series.offset import (
     offset_modes,
 )
 from pixcal.estimators.frame_series.offset_courses import dark_courses, fringe_courses
-from pixcal.estimators.frame_series.profiled import Profiled, best_shape
+from pixcal.estimators.frame_series.profiled import Profiled, ProfiledFit, best_shape
 from pixcal.estimators.frame_series.variance_components import (
     MAX_STEPS,
     Components,
@@ -176,22 +176,29 @@ class BiasDrift(Effect):
         return max(found, key=lambda e: e.significance, default=None)
 
     @classmethod
+    def detect(cls, evidence: Evidence) -> float | None:
+        """As in `Effect.detect`; time constants of a settling are tried, and not refined."""
+        chances = []
+        if every := _all_series(evidence):
+            full, drift = _drift(every)
+            fit, times = _settling_fits(every)
+            decay = _settling_chance([fit(value, full, 0) for value in times], full)
+            chances.append([drift, decay, _slope_chance(full)])
+        if light := light_of(evidence):
+            there, sloped, chance = _fits_of_runs(light)
+            chances.append([chance, log_chance(_rise(sloped, there))])
+        return max((sigmas(log_chance_of_any(own)) for own in chances), default=None)
+
+    @classmethod
     def _in_runs(cls, evidence: Evidence) -> Estimate | None:
         """A walk or ramp in each fringe set by itself, from B and A of its frames."""
         light = light_of(evidence)
         if light is None:
             return None
-        light = replace(light, dark=())
         at = LIGHT_PARTS.index("offset_walk")
-
-        def found(ramp: bool) -> tuple[Components, Components]:
-            modes = light.modes(LIGHT_PARTS, ramp)
-            return estimate_components(modes), estimate_components(modes, absent=(at - 1, at))
-
-        (there, none), (sloped, _) = found(False), found(True)
-        chance = joint_log_chance(there, none, there.size[-2:])
+        there, sloped, chance = _fits_of_runs(light)
         # What both explain is given to the walk, which allows for more.
-        rise = max(sloped.profile - there.profile, 0.0)
+        rise = _rise(sloped, there)
         law, ramp, errors = "random walk, rms after an hour", 0.0, {}
         if np.sqrt(2 * rise) > STEADY:
             law, there = "ramp", sloped
@@ -219,19 +226,14 @@ class BiasDrift(Effect):
         every = _all_series(evidence)
         if not every:
             return None
-        ramp = [_ramp(s) for s in every]
-        full = estimate_components(offset_modes(every, ramp))
-        level = estimate_components(offset_modes(every, [r[:, :0] for r in ramp]))
+        full, drift = _drift(every)
+        level = estimate_components(offset_modes(every, [_ramp(s)[:, :0] for s in every]))
         # The walk being found anew without the ramp: beside a ramp that is a walk little is left.
-        steady = float(np.sqrt(2 * max(full.profile - level.profile, 0.0)))
-        none = estimate_components(offset_modes(every, ramp), absent=(0, 1))
-        changes = [joint_log_chance(full, none, full.size[:2])]
+        steady = float(np.sqrt(2 * _rise(full, level)))
         best, settling = _settling(every, full)
-        changes.append(settling)
         found = best.found if best else full
-        slope = float(found.beta[0])
-        slope_error = float(np.sqrt(found.shape_covariance((1,))[0, 0]))
-        changes.append(log_chance((slope / slope_error) ** 2 / 2))
+        slope, slope_error = _slope(found)
+        changes = [drift, settling, _slope_chance(found)]
         if not best and steady < STEADY:
             found, slope = level, 0.0
         (jitter, jitter_error), (walk, walk_error) = found.root(0), found.root(1)
@@ -279,8 +281,40 @@ def _ramp(series: OffsetSeries) -> F64:
     return np.asarray(series.time_s[:, None] / HOUR_S)
 
 
-def _settling(every: Sequence[OffsetSeries], plain: Components) -> tuple[Profiled | None, float]:
-    """What decays from the first frame on, where that is sure; and how likely by chance."""
+def _rise(full: Components, less: Components) -> float:
+    """Log-likelihood by which more known shapes fit better."""
+    return max(full.profile - less.profile, 0.0)
+
+
+def _drift(every: Sequence[OffsetSeries]) -> tuple[Components, float]:
+    """Jitter and walk beside a ramp, and how likely the two are by chance."""
+    modes = offset_modes(every, [_ramp(s) for s in every])
+    full, none = estimate_components(modes), estimate_components(modes, absent=(0, 1))
+    return full, joint_log_chance(full, none, full.size[:2])
+
+
+def _slope(found: Components) -> tuple[float, float]:
+    """Slope of the ramp and its error, e-/h."""
+    return float(found.beta[0]), float(np.sqrt(found.shape_covariance((1,))[0, 0]))
+
+
+def _slope_chance(found: Components) -> float:
+    slope, error = _slope(found)
+    return log_chance((slope / error) ** 2 / 2)
+
+
+def _fits_of_runs(light: FrameLight) -> tuple[Components, Components, float]:
+    """A walk in each fringe set, without and beside a ramp, and how likely the former by chance."""
+    light = replace(light, dark=())
+    at = LIGHT_PARTS.index("offset_walk")
+    modes = light.modes(LIGHT_PARTS)
+    there, none = estimate_components(modes), estimate_components(modes, absent=(at - 1, at))
+    sloped = estimate_components(light.modes(LIGHT_PARTS, ramp=True))
+    return there, sloped, joint_log_chance(there, none, there.size[-2:])
+
+
+def _settling_fits(every: Sequence[OffsetSeries]) -> tuple[ProfiledFit, F64]:
+    """Fits of a decay from the first frame on beside a ramp, and the time constants to try, s."""
     step = min(s.step_s for s in every)
     length = max(s.time_s[-1] for s in every) - min(s.time_s[0] for s in every)
 
@@ -288,12 +322,21 @@ def _settling(every: Sequence[OffsetSeries], plain: Components) -> tuple[Profile
         shapes = [np.hstack([_ramp(s), np.exp(-s.time_s / value)[:, None]]) for s in every]
         return estimate_components(offset_modes(every, shapes), start=start, steps=steps)
 
-    times = np.geomspace(3 * step, max(length, 6 * step), SETTLINGS)
-    best = best_shape(fit, times, True, plain)
-    # Every other of the time constants is as good as a trial of its own.
-    growth = max(best.found.profile - plain.profile, 0.0)
-    chance = log_chance_of_any([log_chance(growth)] * (SETTLINGS // 2))
+    return fit, np.geomspace(3 * step, max(length, 6 * step), SETTLINGS)
+
+
+def _settling(every: Sequence[OffsetSeries], plain: Components) -> tuple[Profiled | None, float]:
+    """What decays from the first frame on, where that is sure; and how likely by chance."""
+    best = best_shape(*_settling_fits(every), True, plain)
+    chance = _settling_chance([best.found], plain)
     return best if sigmas(chance) > SIGNIFICANT else None, chance
+
+
+def _settling_chance(fits: Sequence[Components], plain: Components) -> float:
+    """How likely the best of the decays is by chance."""
+    # Every other of the time constants is as good as a trial of its own.
+    growth = max(_rise(found, plain) for found in fits)
+    return log_chance_of_any([log_chance(growth)] * (SETTLINGS // 2))
 
 
 def _with_level(track: Track, evidence: Evidence) -> Track:

@@ -182,20 +182,26 @@ class GhostFringes(Effect):
             for key, error in zip(("static", "forward", "backward"), one.errors, strict=False):
                 errors |= {f"waves[{n}].{key}[{part}]": error for part in (0, 1)}
             errors |= {f"waves[{n}].beat_rad_px[{axis}]": one.errors[3 + axis] for axis in (0, 1)}
-        law, tied, left = _law(found.waves, middle)
-        # Beams interfere with each other: fringes alone, or a static pattern that is not theirs,
-        # is no reflection. What multiplies both alike, in all sets, is the flat's.
-        moving = law == BOTH or any(SINGLE[law][1:])
-        a_beam = left < UNTIED and not (moving and _of_the_flat(found.waves, evidence))
+        law, tied, left = _law(found.waves)
+        by_law = tuple(_wave(one, middle) for one in tied)
         return Estimate(
             cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=tuple(waves)),
             errors,
-            found.significance if a_beam else 0.0,
+            found.significance if _of_a_beam(found.waves, law, left, evidence) else 0.0,
             "fringes of a common vector in " + " and ".join(found.seen_in),
             {"sigmas_by_map": found.by_map},
             law=law,
-            by_law=cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=tied),
+            by_law=cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=by_law),
         )
+
+    @classmethod
+    def detect(cls, evidence: Evidence) -> float | None:
+        """As in `Effect.detect`, from the strongest wave of each set alone."""
+        found = find_waves(evidence, most=1)
+        if found is None:
+            return None
+        law, _, left = _law(found.waves)
+        return found.significance if _of_a_beam(found.waves, law, left, evidence) else 0.0
 
 
 def _wave(found: WaveFit, middle: tuple[float, float]) -> GhostWave:
@@ -217,9 +223,7 @@ def _pair(value: complex) -> tuple[float, float]:
     return float(np.clip(value.real, -0.9, 0.9)), float(np.clip(value.imag, -0.9, 0.9))
 
 
-def _law(
-    waves: Sequence[WaveFit], middle: tuple[float, float]
-) -> tuple[str, tuple[GhostWave, ...], float]:
+def _law(waves: Sequence[WaveFit]) -> tuple[str, list[WaveFit], float]:
     """Law of the amplitudes, the waves that follow it, and the share of chi-square it leaves."""
     laws = {law: [_tied(w, weights) for w in waves] for law, weights in SINGLE.items()}
     both = [_tied_of_both(w) for w in waves]
@@ -235,7 +239,17 @@ def _law(
     if misfit(best) > 2 * misfit(both) + TWO_GHOSTS * len(waves) < static:
         law, best = BOTH, both
     left = misfit(best) / max(sum(one.unrelated for one in best), 1e-300)
-    return law, tuple(_wave(one.wave, middle) for one in best), left
+    return law, [one.wave for one in best], left
+
+
+def _of_a_beam(waves: Sequence[WaveFit], law: str, left: float, evidence: Evidence) -> bool:
+    """Whether the waves are a reflection's, by their law and the share of them that it leaves.
+
+    Beams interfere with each other: fringes alone, or a static pattern that is not theirs, is none.
+    What multiplies both alike, in all sets, is the flat's.
+    """
+    moving = law == BOTH or any(SINGLE[law][1:])
+    return left < UNTIED and not (moving and _of_the_flat(waves, evidence))
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ to the maps of a fit, and how that is undone.
 
 import dataclasses
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -16,7 +17,6 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.arrays import F32, F64
 from pixcal.model.errors import InputError
-from pixcal.simulation.changes import Template, Way
 from pixcal.simulation.forward import DOMAINS, ForwardModel, Stage
 from pixcal.simulation.frame_changes import acts_on_frames_alone
 from pixcal.simulation.frame_fit import fit_frames
@@ -102,7 +102,7 @@ class Estimate:
     by_law : Effect, optional
         The effect as that law has it.
     again : Again, optional
-        The score test of just this effect, where its forward model told of it.
+        A shorter way to find just this effect in other frames.
     in_full : Effect, optional
         The effect with everything that was measured of it, significant or not; None where that is
         the effect itself.
@@ -192,7 +192,7 @@ class Effect(ForwardModel):
         """
         if starts := cls.starts(evidence):
             found_light = fit_light(starts, evidence, cls.smooth_degree)
-            return None if found_light is None else _of_light(found_light)
+            return None if found_light is None else _of_light(found_light, cls.smooth_degree)
         if acts_on_frames_alone(cls):
             series = fit_frames(cls, evidence)
             if series is None:
@@ -203,7 +203,8 @@ class Effect(ForwardModel):
         found = score(cls, evidence)
         if found is None:
             return None
-        again = Again(found.model, found.way, found.template)
+        ask = partial(score_again, found.model, found.way, template=found.template)
+        again = Again(found.model, ask)
         return Estimate(found.model, found.errors, found.significance, found.why, again=again)
 
     @classmethod
@@ -285,20 +286,17 @@ class Effect(ForwardModel):
 
 @dataclass(frozen=True)
 class Again:
-    """The score test of an effect with the parameters that it has, in other frames.
+    """An effect as it was found, looked for in other frames by a shorter way.
 
     Attributes
     ----------
     effect : Effect
-    way : Way
-        How it shows.
-    template : Template, optional
-        What it changes, where that holds for other frames too.
+    ask : callable
+        Its significance in an evidence; None where that does not tell.
     """
 
     effect: Effect
-    way: Way
-    template: Template | None = field(default=None, repr=False, compare=False)
+    ask: Callable[[Evidence], float | None] = field(repr=False, compare=False)
 
     @property
     def name(self) -> str:
@@ -310,13 +308,14 @@ class Again:
         """Of the effect."""
         return self.effect.domains
 
-    def detect(self, evidence: Evidence) -> float:
-        """Its significance; nothing is fitted."""
-        return score_again(self.effect, self.way, evidence, self.template)
+    def detect(self, evidence: Evidence) -> float | None:
+        """Its significance."""
+        return self.ask(evidence)
 
 
-def _of_light(found: LightFit) -> Estimate:
-    """An estimate from the maps."""
+def _of_light(found: LightFit, degree: int) -> Estimate:
+    """An estimate from the maps; other maps are fitted from there on."""
+    here = replace(found.start, model=found.model)
     return Estimate(
         found.model,
         found.errors,
@@ -327,4 +326,10 @@ def _of_light(found: LightFit) -> Estimate:
             for kind, v in found.agreed.items()
         },
         law=found.start.law,
+        again=Again(found.model, partial(_of_light_again, here, degree)),
     )
+
+
+def _of_light_again(start: LightStart, degree: int, evidence: Evidence) -> float | None:
+    found = fit_light([start], evidence, degree)
+    return None if found is None else found.significance

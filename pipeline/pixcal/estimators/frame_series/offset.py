@@ -67,14 +67,13 @@ def fringe_offsets(found: FringeEvidence, flat: F64) -> OffsetSeries | None:
     if len(found.g) < FEWEST or masks is None:
         return None
     good = found.good
-    pattern = np.concatenate([found.theta[:, good], 1 / flat[None, good]]).astype(np.float32)
-    used = np.flatnonzero(good)
-    residual, variance = (
-        np.take(a.reshape(len(a), -1), used, axis=1) for a in (found.residual, found.variance)
-    )
-    weight = np.where(np.isfinite(residual), 1 / variance, np.float32(0))
-    np.nan_to_num(residual, copy=False)
-    quarters = [_sums(pattern, weight, residual, mask[good]) for mask in masks]
+    pattern = np.where(good, np.concatenate([found.theta, 1 / flat[None]]), 0.0)
+    pattern = pattern.astype(np.float32).reshape(len(pattern), -1)
+    residual, variance = (a.reshape(len(a), -1) for a in (found.residual, found.variance))
+    used = np.isfinite(residual) & good.ravel()
+    weight = np.where(used, 1 / variance, np.float32(0))
+    pull = np.where(used, residual, np.float32(0)) * weight
+    quarters = [_sums(np.where(m.ravel(), pattern, 0), weight, pull) for m in masks]
     whole = tuple(np.sum(part, axis=0) for part in zip(*quarters, strict=True))
     fits = [_constant(*sums) for sums in (whole, *quarters)]
     if not all(np.isfinite(f).all() for f in fits):
@@ -134,13 +133,11 @@ def _half(count: int) -> Mask:
     return np.asarray(np.bitwise_count(np.arange(count) // STRIPE) % 2 == 0)
 
 
-def _sums(pattern: F32, weight: F32, residual: F32, mask: Mask) -> tuple[F64, F64]:
-    """Normal matrices (t, n, n) and right sides (t, n) of a fit of patterns to the residual."""
-    used = np.flatnonzero(mask)
-    own, w, rest = (np.take(a, used, axis=1) for a in (pattern, weight, residual))
-    n = len(own)
-    normal = (w @ (own[:, None] * own).reshape(n * n, -1).T).reshape(-1, n, n).astype(float)
-    return normal, ((w * rest) @ own.T).astype(float)
+def _sums(pattern: F32, weight: F32, pull: F32) -> tuple[F64, F64]:
+    """Normal matrices (t, n, n) and right sides (t, n) of a fit of patterns (n, pixels)."""
+    n = len(pattern)
+    normal = (weight @ (pattern[:, None] * pattern).reshape(n * n, -1).T).reshape(-1, n, n)
+    return normal.astype(float), (pull @ pattern.T).astype(float)
 
 
 def _constant(normal: F64, right: F64) -> tuple[F64, F64]:

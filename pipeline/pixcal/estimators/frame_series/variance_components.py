@@ -4,7 +4,8 @@ Series are taken to their walk modes (`walk_modes`), in which white noise and a 
 independent from mode to mode, exactly; other stationary noise is so but for ends and gaps. Each
 mode is then a normal vector of covariance ``sum_i size_i part_i`` about ``known @ beta``. The sizes
 are those of restricted maximum likelihood (Patterson & Thompson 1971, Biometrika 58, 545), by
-Fisher scoring.
+Fisher scoring, and near the end with the average information (Gilmour, Thompson & Cullis 1995,
+Biometrics 51, 1440), which converges faster.
 """
 
 from collections.abc import Sequence
@@ -15,10 +16,11 @@ from scipy.optimize import brentq
 from scipy.special import ndtri_exp
 
 from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
-from pixcal.model.arrays import F64
+from pixcal.model.arrays import F64, Mask
 
 MAX_STEPS = 60
 CONVERGED = 1e-5  # growth of the log-likelihood at which scoring ends
+NEAR = 2.0  # growth from which the average information makes the steps
 
 
 def trace_products(weight: F64, parts: F64) -> F64:
@@ -105,16 +107,12 @@ def estimate_components(
     """
     free = np.ones(len(modes.parts), bool)
     free[list(absent)] = False
-    size = np.where(free, modes.start, 0.0)
-    state = _State(modes, size)
-    if start is not None:
-        try:
-            state = _State(modes, np.where(free, np.maximum(start.size, modes.least), 0.0))
-            size = state.size
-        except np.linalg.LinAlgError:
-            pass  # Sizes below zero elsewhere may be too low here: from the beginning.
+    state = _begin(modes, free, start)
+    size = state.size
+    gain = np.inf
     for _ in range(steps):
-        score, information = state.score(), state.information()
+        score = state.score()
+        information = state.information() if gain > NEAR else state.average_information()
         held = ~free | ((size <= modes.least) & (score <= 0))
         step = np.zeros(len(size))
         step[~held] = inverse_normal(information[np.ix_(~held, ~held)]) @ score[~held]
@@ -139,6 +137,15 @@ def estimate_components(
     return Components(
         size, covariance, state.beta, state.spread, state.likelihood, state.profile, modes
     )
+
+
+def _begin(modes: Modes, free: Mask, start: Components | None) -> "_State":
+    if start is not None:
+        try:
+            return _State(modes, np.where(free, np.maximum(start.size, modes.least), 0.0))
+        except np.linalg.LinAlgError:
+            pass  # Sizes below zero elsewhere may be too low here: from the beginning.
+    return _State(modes, np.where(free, modes.start, 0.0))
 
 
 class _State:
@@ -171,6 +178,14 @@ class _State:
         lost = (self.weighted @ self.spread) @ self.weighted.swapaxes(1, 2)
         more = self.modes.flat @ (seen - self.weight + lost).ravel()
         return np.asarray(self.modes.share * more / 2)
+
+    def average_information(self) -> F64:
+        """Mean (m, m) of Fisher's information and of the curvature of the log-likelihood."""
+        pulled = np.einsum("mnab,nb->mna", self.modes.parts, self.pull)
+        flat = pulled.reshape(len(pulled), -1)
+        weighed = np.einsum("nab,mnb->mna", self.weight, pulled).reshape(len(pulled), -1)
+        known = flat @ self.weighted.reshape(flat.shape[1], -1)
+        return np.asarray(self.modes.share * (flat @ weighed.T - known @ self.spread @ known.T) / 2)
 
     def information(self) -> F64:
         """Fisher's information of the sizes (m, m)."""

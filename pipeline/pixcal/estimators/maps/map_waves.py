@@ -98,8 +98,8 @@ class _Map:
 Maps = Mapping[str, Sequence[_Map]]  # of each set, by its name
 
 
-def find_waves(evidence: Evidence) -> Waves | None:
-    """The strongest waves in the maps of all sets; None without enough pixels.
+def find_waves(evidence: Evidence, most: int = MOST) -> Waves | None:
+    """The strongest waves in the maps of all sets, so many of each; None without enough pixels.
 
     The chance is that of the best of all waves that the window can tell apart; those near the
     fringes' harmonics, near no wave at all, and of rows or columns that repeat are left out.
@@ -116,7 +116,7 @@ def find_waves(evidence: Evidence) -> Waves | None:
     waves = list(best.waves)
     if best.significance > SIGNIFICANT:
         maps: Maps = ways[best.in_flats]
-        for _ in range(MOST - 1):
+        for _ in range(most - 1):
             maps = _less(maps, waves[-len(sets) :])
             more = _strongest(maps, allowed, best.in_flats)
             if more.significance < SIGNIFICANT:
