@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pixcal.effects.lag import Lag
+from pixcal.estimators.detector.flat_ladder import warming
 from pixcal.estimators.detector.frame_lag import lag_of_flats
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.kernels.normals import Key, pixel_normals
@@ -200,31 +201,53 @@ def test_what_the_frame_before_left_comes_out_in_the_first(
         np.testing.assert_allclose(made, expected, atol=1.6)
 
 
-@pytest.mark.parametrize("carried", [0.0, 1.0])
-def test_flats_of_rising_levels_tell_whether_the_detector_was_cleared(carried: float) -> None:
-    rng, share, flicker, shape = np.random.default_rng(5), 0.01, 1e-3, (24, 24)
+def first_flats_of(frames: int, share: float, carried: float, rise: float) -> Evidence:
+    """Flats of rising levels, with lag and a lamp that gets brighter from frame to frame."""
+    rng, flicker, shape = np.random.default_rng(5), 1e-3, (24, 24)
     stacks = [
         Stack("bias", 0.0, np.arange(20), np.arange(20.0), rng.normal(100, 5, (20, *shape)), 0.0)
     ]
-    before = 0.0
+    before, number = 0.0, np.arange(frames)
     for n, level in enumerate(np.linspace(1000, 20_000, 12)):
-        light = level * (1 + flicker * rng.standard_normal(2))
+        light = level * (1 + rise * number + flicker * rng.standard_normal(frames))
         light[0] -= share * (level - carried * before)
-        adu = rng.normal(100 + light[:, None, None], np.sqrt(level), (2, *shape))
-        stacks.append(
-            Stack("flat", 0.1 * (n + 1), np.arange(2), np.arange(2.0), adu, 100.0 + 10 * n)
-        )
+        adu = rng.normal(100 + light[:, None, None], np.sqrt(level), (frames, *shape))
+        stacks.append(Stack("flat", 0.1 * (n + 1), number, 1.0 * number, adu, 100.0 + 10 * n))
         before = level
     maps = {"bias": np.full(shape, 100.0), "dark_rate": np.zeros(shape), "flat": np.ones(shape)}
-    found = lag_of_flats(
-        Evidence(
-            {}, tuple(stacks), 1.0, 5.0, 5.0, **maps, good=np.ones(shape, np.bool_),
-            saturation_adu=65535, pitch_um=5.0, wavelength_nm=600.0, distance_mm=400.0,
-        )
+    return Evidence(
+        {}, tuple(stacks), 1.0, 5.0, 5.0, **maps, good=np.ones(shape, np.bool_),
+        saturation_adu=65535, pitch_um=5.0, wavelength_nm=600.0, distance_mm=400.0,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("carried", [0.0, 1.0])
+@pytest.mark.parametrize(("frames", "rise"), [(2, 0.0), (4, 0.0), (4, 0.006)])
+def test_flats_of_rising_levels_tell_whether_the_detector_was_cleared(
+    frames: int, rise: float, carried: float
+) -> None:
+    found = lag_of_flats(first_flats_of(frames, 0.01, carried, rise))
     assert found is not None
     assert found.carried == carried
-    assert abs(found.share - share) < 4 * found.error < 0.5 * share
+    assert abs(found.share - 0.01) < 4 * found.error < 0.005
+
+
+def test_a_lamp_that_warms_up_in_each_level_is_not_taken_for_it() -> None:
+    evidence = first_flats_of(4, 0.0, 0.0, 0.006)
+    found = Lag.estimate(evidence)
+    assert found is not None
+    assert abs(found.significance) < 4
+    rise, error = warming(evidence)
+    assert abs(rise - 0.006) < 4 * error < 0.002
+
+
+def test_pairs_of_flats_cannot_tell_it_from_a_lamp_that_warms_up() -> None:
+    found = Lag.estimate(first_flats_of(2, 0.0, 0.0, 0.01))
+    assert found is not None
+    assert "lamp that warms up" in found.why
+    found = Lag.estimate(first_flats_of(4, 0.01, 0.0, 0.0))
+    assert found is not None
+    assert "lamp" not in found.why
 
 
 def test_equal_steps_of_the_phase_tell_nothing(acquired: Callable[..., Evidence]) -> None:

@@ -21,6 +21,7 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 TAIL = 1e-3  # share of the charge left behind whose release is brought forward to the last frame
+_TELL_LAMP = 3  # flats of a level from which a lamp that warms up is told from lag
 _TURNS = 3  # of the inverse: each gains a factor of the share
 
 
@@ -239,6 +240,8 @@ class Lag(Effect):
             if found is None:
                 return None
             before = "charge of the frame before" if found.carried else "a clear"
+            if not found.carried and all(len(s.adu) < _TELL_LAMP for s in evidence.ladder):
+                before += "; a lamp that warms up does the same to pairs: take three flats a level"
             return Estimate(
                 cls(float(np.clip(found.share, 0, 0.5)), 0.0, 0.0, carried=found.carried),
                 {"share": found.error},

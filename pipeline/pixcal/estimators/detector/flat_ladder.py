@@ -11,6 +11,7 @@ import numpy as np
 
 from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 
 MIN_RUNGS = 3  # fewest levels of flats that tell a curve from a line
@@ -70,17 +71,42 @@ def level_before(stack: Stack, evidence: Evidence) -> float:
     return max(float((frame - evidence.bias)[evidence.good].mean()) * evidence.gain, 0.0)
 
 
+def warming(evidence: Evidence) -> tuple[float, float]:
+    """Relative rise of the light from frame to frame of each level, and its error.
+
+    Both are zero unless it is significant. First frames, which lag makes fainter, do not count.
+    """
+    rises, weights, squares, freedom = [], [], 0.0, -1
+    for stack in evidence.ladder:
+        light = light_of(evidence, stack)[1:]
+        if len(light) < 2 or light.mean() <= 0:
+            continue
+        time = np.arange(len(light)) - (len(light) - 1) / 2
+        light = light / light.mean() - 1
+        rises.append(float(time @ light / (time @ time)))
+        weights.append(float(time @ time))
+        squares += float(light @ light)
+        freedom += len(light) - 1
+    if freedom < 1:
+        return 0.0, 0.0
+    rise = float(np.average(rises, weights=weights))
+    rest = max(squares - rise**2 * sum(weights), 0.0)
+    error = float(np.sqrt(rest / freedom / sum(weights)))
+    return (rise, error) if abs(rise) > SIGNIFICANT * error else (0.0, 0.0)
+
+
 def flicker(evidence: Evidence) -> tuple[float, float]:
     """Relative change of the lamp from frame to frame, rms, and the degrees of freedom it has."""
     # The first frame of a series may lack a share of its charge, and have one of the frame before:
     # of pairs, what their steps have in common by the levels of both is left out.
+    rise, _ = warming(evidence)
     steps: list[float] = []
     firsts: list[float] = []
     before: list[float] = []
     for stack in evidence.ladder:
         light = light_of(evidence, stack)
         if len(light) > 1 and light.mean() > 0:
-            own = np.diff(light) / light.mean()
+            own = np.diff(light) / light.mean() - rise
             firsts.append(float(own[0]))
             before.append(level_before(stack, evidence) / float(light.mean()))
             steps += own[1:].tolist()

@@ -6,7 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker, level_before
+from pixcal.estimators.detector.flat_ladder import (
+    FLICKER_KNOWN,
+    flicker,
+    level_before,
+    warming,
+)
 from pixcal.estimators.detector.pixel_lag import CLIP, MIN_FRAMES
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.kernels.frame_order import follows
@@ -176,7 +181,7 @@ def lag_of_flats(evidence: Evidence) -> LagOfFlats | None:
 
     It lacks a share of its own level, and has one of the frame before, unless the detector was
     cleared in between: the levels tell which. An offset of first frames is taken from series
-    without light. None where the levels do not tell.
+    without light, a lamp that warms up from the later frames. None where the levels do not tell.
     """
     found = [(s, f) for s in evidence.stacks if (f := _first_frame(s, evidence)) is not None]
     if len(found) <= 2:
@@ -187,22 +192,34 @@ def lag_of_flats(evidence: Evidence) -> LagOfFlats | None:
     before = np.array([level_before(s, evidence) for s, _ in found])
     flat = np.array([s.kind == "flat" for s, _ in found])
     known = 1.0 if before.any() else 0.0
-    fits = [_fit_steps(level - c * before, step, error, flat) for c in (0.0, known)]
+    lamp = warming(evidence)
+    # from the first frame to the middle of the others
+    later = np.array([len(s.adu) / 2 * (s.kind == "flat") for s, _ in found]) * level
+    fits = [_fit_steps(level - c * before, step, error, flat, (later, *lamp)) for c in (0.0, known)]
     carried, (share, of_share, _) = min(
         zip((0.0, known), fits, strict=True), key=lambda one: one[1][2]
     )
     return LagOfFlats(share, of_share, carried)
 
 
-def _fit_steps(lacking: F64, step: F64, error: F64, flat: Mask) -> tuple[float, float, float]:
-    """Share of what first frames lack, its error, and the chi-square of the steps."""
+def _fit_steps(
+    lacking: F64, step: F64, error: F64, flat: Mask, lamp: tuple[F64, float, float]
+) -> tuple[float, float, float]:
+    """Share of what first frames lack, its error, and the chi-square of the steps.
+
+    ``lamp``: what a rise of the light by one a frame changes, the rise, and its error.
+    """
+    later, rise, of_rise = lamp
+    step = step + rise * later
     # The lamp's flicker is that which the fit leaves: before it, lag passes for flicker too.
     design = np.stack([-lacking, np.ones_like(step)])
     scale = np.ones_like(step)
     for _ in range(ROUNDS):
-        weighted = design / (error * scale)
-        covariance = np.linalg.inv(weighted @ weighted.T)
-        found = covariance @ (weighted @ (step / (error * scale)))
+        # The error of the rise is the same in all levels.
+        variance = np.diag((error * scale) ** 2) + of_rise**2 * np.outer(later, later)
+        weighted = np.linalg.solve(variance, design.T).T
+        covariance = np.linalg.inv(weighted @ design.T)
+        found = covariance @ (weighted @ step)
         squares = ((step - found @ design) / error) ** 2
         if flat.sum() >= _MANY_FLATS:
             scale = np.where(flat, np.sqrt(squares[flat].sum() / (flat.sum() - 1)), 1.0)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pixcal.estimators.detector.flat_ladder import LAMP, flicker, ladder, straight_line
+from pixcal.estimators.detector.flat_ladder import LAMP, flicker, ladder, straight_line, warming
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.arrays import F64
 from pixcal.simulation.recording import Recording
@@ -14,7 +14,7 @@ from pixcal.stages.diagnose.undone import IntensityBeforeEffects
 
 SERIES = 8  # frames of a series whose light is taken as it was in each; of fewer it is drawn
 
-_FLICKER = 103  # key of random numbers
+_FLICKER, _RISE = 103, 104  # keys of random numbers
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,8 @@ class FlatLight:
     # time
     flicker: float = 0.0
     wander: float = 0.0
+    # relative rise of the light from frame to frame of each level, and its error
+    rise: tuple[float, float] = (0.0, 0.0)
     # whether the levels are those of one lamp; else they are taken as measured
     one_lamp: bool = False
     freedom: float = math.inf  # degrees of freedom that ``flicker`` is known by
@@ -41,10 +43,12 @@ class FlatLight:
             if np.isfinite(own).sum() >= SERIES:
                 frames[number] = own / np.nanmean(own)
                 frames[number][0] = np.nan
+        rise, of_rise = np.mean([warming(one) for one in evidence], axis=0)
         flickers, freedoms = zip(*map(flicker, evidence), strict=True)
         return cls(
             float(np.mean(flickers)),
             float(np.mean([LAMP if one is None else one.wander for one in found])),
+            (float(rise), float(of_rise)),
             all(one is not None for one in found),
             min(freedoms),
             frames,
@@ -56,11 +60,18 @@ class FlatLight:
         if known is not None and np.isfinite(known[frame]):
             return float(known[frame])
         of_frame = (
-            1 + self._flicker(recording.bench.seed) * recording.rng("lamp", frame).standard_normal()
+            1
+            + self._flicker(recording.bench.seed) * recording.rng("lamp", frame).standard_normal()
+            + self._rise(recording.bench.seed) * (frame - (recording.count - 1) / 2)
         )
         if known is not None or not self.one_lamp:
             return float(of_frame)
         return float(of_frame * (1 + self.wander * recording.rng("lamp").standard_normal()))
+
+    def _rise(self, seed: int) -> float:
+        """Rise of the light in a simulation, as it may be within its error."""
+        rise, error = self.rise
+        return float(rise + error * np.random.default_rng([seed, _RISE]).standard_normal())
 
     def _flicker(self, seed: int) -> float:
         """Flicker in a simulation, as it may be within its error."""
