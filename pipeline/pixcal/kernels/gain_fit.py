@@ -64,6 +64,7 @@ def fit_gain(
     highest: float,
     *,
     level_error: float = 0.0,
+    uneven: float = 0.0,
     straight: bool = False,
 ) -> GainFit | None:
     """Fit the curve through the points of variance against level, from the read noise on.
@@ -77,15 +78,18 @@ def fit_gain(
     read_variance : variance at level zero and its error, ADU²
     highest : highest level to use, ADU
     level_error : by which all levels may be too high or too low, ADU: the bias wanders
+    uneven : spectral density at low frequency of the converter's deviation from its mean line,
+        ADU³: with noise of sigma the local slope varies by rms ``sqrt(uneven / (4 sqrt(pi)
+        sigma³))``, and the variance by twice that
     straight : fit a line only: within few flats the level changes from place to place, as the
         amplifiers do
     """
-    whole = _fit_range(sums, read_variance, highest, level_error, straight)
+    whole = _fit_range(sums, read_variance, highest, level_error, uneven, straight)
     if whole is None or straight or whole.chance > _OFF_CURVE:
         return whole
     best, top = whole, whole.levels[1] / _SHORTER
     while np.count_nonzero((sums[:, 1] > 0) & (sums[:, 1] <= top * sums[:, 0])) >= _SPARE:
-        found = _fit_range(sums, read_variance, top, level_error, straight)
+        found = _fit_range(sums, read_variance, top, level_error, uneven, straight)
         if found is not None and found.chance > _OFF_CURVE and found.error < best.error:
             best = replace(found, step=True)
         top /= _SHORTER
@@ -97,6 +101,7 @@ def _fit_range(
     read_variance: tuple[float, float],
     highest: float,
     level_error: float,
+    uneven: float,
     straight: bool,
 ) -> GainFit | None:
     dof = sums[:, 0]
@@ -115,7 +120,8 @@ def _fit_range(
     slope, chi2 = float((dof * shot).sum() / (dof * level).sum()), 1.0
     expected = slope * level
     for _ in range(_ITERATIONS):
-        weight = dof / (2 * (np.maximum(expected, 0) + read_variance[0]) ** 2)
+        whole = np.maximum(expected, 0) + read_variance[0]
+        weight = 1 / (2 * whole**2 / dof + uneven * np.sqrt(whole / np.pi))
         normal, right = (design * weight) @ design.T / chi2, design @ (weight * shot) / chi2
         of_offset = read_variance[1] ** 2 + (level_error * slope) ** 2
         found = [

@@ -126,12 +126,17 @@ def _highest(power: Callable[[float], float], start: float, width: float) -> flo
 
 def _agreement(codes: I64, there: Mask, step: float) -> float:
     """Share of the gaps that a step foresees, less that of codes it says cannot come."""
-    # The next multiple rounds to the code, or just so: halves go either way.
-    distance = np.abs(codes - np.rint(codes / step) * step)
-    gaps = ~there
-    found = float((distance[gaps] > 0.5 - TIE).mean()) if gaps.any() else 0.0
-    wrong = float((distance[there] > 0.5 + TIE).mean()) if there.any() else 0.0
-    return found - wrong
+    multiple = np.rint(codes / step)
+    distance = np.abs(codes - multiple * step)
+    # Half-way the next multiple rounds up or down: of two such codes one comes, and one does not.
+    tie = np.abs(distance - 0.5) <= TIE
+    two = tie[1:] & tie[:-1] & (multiple[1:] == multiple[:-1])
+    neither = np.count_nonzero(two & ~there[1:] & ~there[:-1])
+    both = np.count_nonzero(two & there[1:] & there[:-1])
+    gaps, foreseen = ~there, distance > 0.5 - TIE
+    wrong = np.count_nonzero((distance > 0.5 + TIE) & there) + both
+    found = np.count_nonzero(foreseen & gaps) - neither
+    return float(found / max(gaps.sum(), 1) - wrong / max(there.sum(), 1))
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from pixcal.estimators.detector.cut_off import variance_at
 from pixcal.model.arrays import F64, I64
 
 POPULATED = 20.0  # counts on both sides from which a code without any is missing
+_BLOCK = 32  # codes whose shifts are added up
 _NEAR = 4  # codes on either side that are looked at
 _FINE = 16  # levels a code
 _REACH = 8.0  # of the noise
@@ -30,8 +31,30 @@ def missing_codes(counts: F64) -> I64:
     return np.flatnonzero((counts == 0) & (np.minimum(below, above) > POPULATED))
 
 
+def step_noise(counts: F64) -> tuple[float, float]:
+    """What missing codes add to samples whose noise spans many codes.
+
+    Returns the variance, and the spectral density at low frequency of how far samples are moved,
+    by code: by it the mean level, and so the noise, of neighbouring levels rises more or less.
+    """
+    beside = np.pad(counts, _NEAR)
+    often = sliding_window_view(beside, 2 * _NEAR + 1).max(axis=1) > POPULATED
+    there = np.flatnonzero((counts > 0) & often)
+    begins = np.concatenate([there[:1], there[:-1] + 1])
+    near = there - begins < 2 * _NEAR
+    moved = np.concatenate(
+        [
+            np.arange(end - begin, -1, -1)
+            for begin, end in zip(begins[near], there[near], strict=True)
+        ]
+    )
+    blocks = moved[: len(moved) // _BLOCK * _BLOCK].reshape(-1, _BLOCK).sum(axis=1)
+    density = float(blocks.var()) / _BLOCK if len(blocks) > 1 else 0.0
+    return float(moved.var()), density
+
+
 def noise_before_missing_codes(
-    variance: float, error: float, means: F64, frames: int, counts: F64
+    variance: float, error: float, means: F64, frames: int, counts: F64, step: float = 1.0
 ) -> tuple[float, float] | None:
     """Noise that has some variance, on average over pixels, once it is converted; and its error.
 
@@ -42,6 +65,7 @@ def noise_before_missing_codes(
     variance, error : of a sample, on average over the pixels, and its standard error
     means : (n,) mean samples of pixels like these, over so many ``frames``
     counts : (code,) how often each code came up
+    step : of the converter, if all of its codes were multiplied by that
     """
     low, high = np.quantile(means, [0.005, 0.995])
     margin = _REACH * np.sqrt(variance) + 2
@@ -52,9 +76,11 @@ def noise_before_missing_codes(
     codes = codes[~np.isin(codes, missing_codes(counts))]
     level = np.arange(low - 2, high + 2, 1 / _FINE)
     best: tuple[float, float, float] | None = None
-    for side in _STANDS_IN:
-        gaps = np.diff(codes)
-        begins = (codes[1:] + codes[:-1]) / 2 - side * (gaps - 1)
+    gaps = np.diff(codes)
+    laws = [(codes[1:] + codes[:-1]) / 2 - side * (gaps - 1) for side in _STANDS_IN]
+    if step > 1:
+        laws.append((np.rint(codes[1:] / step) - 0.5) * step)
+    for begins in laws:
 
         def reached(sigma: float, begins: F64 = begins) -> F64:
             return np.asarray(ndtr((level[:, None] - begins) / sigma))

@@ -8,6 +8,7 @@ import numpy as np
 
 from pixcal.estimators.detector.calibration import Linearity, linearity
 from pixcal.estimators.detector.emva import Measure, full_level, saturation, transfer_points
+from pixcal.estimators.detector.missing_codes import missing_codes, step_noise
 from pixcal.estimators.detector.pair_noise import lost_in_blocks
 from pixcal.kernels.gain_fit import LADDER, GainFit, fit_gain
 from pixcal.kernels.photon_transfer import add_neighbours
@@ -20,6 +21,7 @@ from pixcal.stages.reduce.columns import grid
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.read_noise import (
     bias_wander,
+    code_counts,
     dark_charge,
     is_cut_off,
     of_variance,
@@ -163,7 +165,8 @@ def _gain(
     # With light there is noise enough that rounding adds no more and no less than this.
     dark, lit = sums
     lost = lost_in_blocks(dark)
-    variance = noise**2 + SHEPPARD * job.quantum**2 - lost
+    steps, uneven = _steps(job)
+    variance = noise**2 + steps - lost
     highest = _LINEAR_SHARE * top
     lit = np.where(lit[:, 1:2] <= highest * lit[:, :1], lit, 0.0)
     # Noise of less than half a code is rounded up or down by where its level lies.
@@ -175,6 +178,7 @@ def _gain(
         (variance, 2 * noise * error),
         highest,
         level_error=wander,
+        uneven=uneven,
         straight=len(job.flat) < LADDER,
     )
     if fitted is None or not fitted.error < _GAIN_ERROR * fitted.gain:
@@ -187,6 +191,18 @@ def _gain(
         neighbours={} if everywhere else added,
         uneven=everywhere,
     )
+
+
+def _steps(job: Measuring) -> tuple[float, float]:
+    """What the converter's steps add to the variance (ADU²), and `fit_gain`'s ``uneven`` (ADU³)."""
+    rounding = SHEPPARD * job.quantum**2
+    if not job.quantum:
+        return rounding, 0.0
+    counts = code_counts(job.flat, job)
+    if not len(missing_codes(counts)):
+        return rounding, 0.0
+    variance, density = step_noise(counts)
+    return rounding + variance * job.quantum**2, density * job.quantum**3
 
 
 def _rungs(tables: F64, job: Measuring) -> tuple[F64, Mask]:

@@ -1,9 +1,11 @@
 """Noise of frames without light: of samples, of what lines share, of their mean level."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
+from pixcal.estimators.detector.code_density import step_of
 from pixcal.estimators.detector.emva import Measure
 from pixcal.estimators.detector.missing_codes import missing_codes, noise_before_missing_codes
 from pixcal.estimators.detector.pair_noise import lost_in_blocks
@@ -81,20 +83,26 @@ def _before_rounding(
     means = bias + rate * job.read_series.exptime
     frames, step = len(job.read_series.frames), job.quantum
     in_steps = variance[0] / step**2, variance[1] / step**2
-    levels, counts = means[np.isfinite(means)] / step, _code_counts(job.read_series, job)
+    levels, counts = means[np.isfinite(means)] / step, code_counts([job.read_series], job)
     found = noise_before_rounding(*in_steps, levels, frames)
     if len(missing_codes(counts)):
-        found = noise_before_missing_codes(*in_steps, levels, frames, counts) or found
+        # Few frames without light do not tell whether there is a pattern in what is missing.
+        multiple = step_of(code_counts([job.read_series, *job.flat], job))[0]
+        found = noise_before_missing_codes(*in_steps, levels, frames, counts, multiple) or found
     return found and (step * found[0], step * found[1])
 
 
-def _code_counts(series: Group, job: Measuring) -> F64:
-    """How often each code, in steps, came up in the middle rows of a series."""
-    reader = job.frames[series.array]
-    rows = (middle_rows(reader, n, n + 1).ravel() for n in series.frames)
-    codes = [(np.maximum(own, 0) // job.quantum).astype(int) for own in rows]
-    size = 1 + max(int(own.max()) for own in codes)
-    return np.asarray(sum(np.bincount(own, minlength=size) for own in codes), float)
+def code_counts(groups: Sequence[Group], job: Measuring) -> F64:
+    """How often each code, in steps, came up in the middle rows of some series."""
+    found = np.zeros(0)
+    for group in groups:
+        reader = job.frames[group.array]
+        for n in group.frames:
+            codes = np.maximum(middle_rows(reader, n, n + 1).ravel(), 0) // job.quantum
+            own = np.bincount(codes.astype(np.int64), minlength=len(found)).astype(float)
+            own[: len(found)] += found
+            found = own
+    return found
 
 
 def bias_wander(job: Measuring) -> float:
