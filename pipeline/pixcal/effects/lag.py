@@ -324,8 +324,8 @@ def _by_level(evidence: Evidence, lag: Lag) -> tuple[Lag, dict[str, float]]:
     def trapped(values: F64, charge: F32) -> F32:
         return _trapped(lag, values).lost(charge)[0]
 
-    fit = LossFit(central_crop(evidence, MAX_SAMPLES // 2), lag.level_e)
-    bands, traps = fit.by_level(banded, trapped, lag.share, lag.share * lag.level_e)
+    few, fit = (LossFit(central_crop(evidence, MAX_SAMPLES // n), lag.level_e) for n in (8, 2))
+    bands, traps = fit.by_level(few, banded, trapped, lag.share, lag.share * lag.level_e)
     names = [f"bands[{n}]" for n in range(len(BANDS))]
     if traps is not None:
         found = _trapped(lag, traps.value)

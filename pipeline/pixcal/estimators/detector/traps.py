@@ -101,11 +101,12 @@ class LossFit:
         return FittedLoss(value, covariance, chi2)
 
     def by_level(
-        self, banded: Loss, trapped: Loss, share: float, full: float
+        self, few: "LossFit", banded: Loss, trapped: Loss, share: float, full: float
     ) -> tuple[FittedLoss | None, FittedLoss | None]:
         """Shares of bands of the level, and traps that fill up, if they explain more.
 
         Returns None where the share is the same in all bands; where traps explain no more.
+        ``few``: the same of fewer pixels, on which traps are searched.
         ``banded, trapped``: as of `fit`: from a share of each band; from these, what traps keep and
         what they hold. ``share, full``: that stays on the mean, and of full scale, e-.
         """
@@ -118,8 +119,13 @@ class LossFit:
         if float(away @ precision @ away) < NOT_EVEN:
             return None, None
         starts = [(*even, keep, room * full) for keep in KEEPS for room in ROOMS]
-        best = min(starts, key=lambda start: self.chi2(trapped, start))
-        traps = self.fit(trapped, best, STEPS // 2)
+        few.weigh(banded, even)
+        best = min(starts, key=lambda start: few.chi2(trapped, start))
+        traps = few.fit(trapped, best, STEPS // 2)
+        few.weigh(trapped, traps.value)
+        traps = few.fit(trapped, traps.value, STEPS)
+        if traps.chi2 > few.chi2(banded, bands.value):
+            return bands, None
         self.weigh(trapped, traps.value)
         traps = self.fit(trapped, traps.value, STEPS)
         better = traps.chi2 <= self.chi2(banded, bands.value) - NOT_EVEN
