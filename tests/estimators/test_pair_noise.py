@@ -52,3 +52,22 @@ def test_a_saturated_level_beside_row_noise_adds_nothing() -> None:
     assert noise.lines == ("row",)
     full = np.full((2, *SHAPE), np.nan, np.float32)
     assert not flat_pair_sums(full, np.full(2, np.nan), GAIN, READ, 0.0, noise).any()
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_nearly_full_pixels_of_one_colour_do_not_lower_the_noise_of_the_others(known: bool) -> None:
+    """Under colour filters they stand in the same blocks as pixels that are far from full."""
+    rng, full, charge = np.random.default_rng(6), 5000.0, np.full(SHAPE, 4000.0)
+    charge[::2, ::2] = GAIN * full
+    size = (FLATS, *SHAPE)
+    flats = rng.poisson(charge, size) / GAIN + READ * rng.standard_normal(size)
+    flats = np.where(flats < full, flats, np.nan).astype(np.float32)
+    noise = LineNoise()
+    dark = (READ * rng.standard_normal((2, *SHAPE))).astype(np.float32)
+    noise.add(dark, dark_pair_sums(dark, READ, 0.0), READ, 0.0)
+    levels = np.ones(FLATS)
+    sums = flat_pair_sums(flats, levels, GAIN, READ, 0.0, noise, full if known else np.inf)
+    dof, level, square = sums.sum(axis=0)[:3]
+    off = GAIN * (square - dof * READ**2) / level - 1
+    error = np.sqrt(2 / dof) * (1 + GAIN * READ**2 * dof / level)
+    assert (abs(off) < 4 * error) == known

@@ -176,7 +176,7 @@ def _action(
     because = f": {why}" if why else ""
     if action == "corrected":
         if not with_maps:
-            text = "maps of pixel offsets can be corrected for it"
+            text = "pixcal corrects maps of pixel offsets for it, once there are fringe frames"
         elif _settled(cause, correction, with_maps):
             text = "maps corrected"
         else:

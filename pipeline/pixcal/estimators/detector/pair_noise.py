@@ -24,6 +24,7 @@ LINES = {"row": ((0, 1), (0, 2)), "column": ((1, 0), (2, 0))}  # lags along a li
 
 _SHARED = 5.0  # errors of the noise that a row shares from which it is there
 _PAIR_LAMP_CHANGE = 0.05
+_NEARLY = 5.0  # noise below saturation from which samples of a pixel are cut off
 # Of n normal numbers less their median, n times by how much the variance is less, and by how much
 # each two are anticorrelated: 2 / n by the mean, of which the scatter of the median takes π/2.
 _MEDIAN_TAKES = 2 - math.pi / 2
@@ -80,6 +81,7 @@ def flat_pair_sums(
     read_noise: float,
     quantum: float,
     line_noise: "LineNoise",
+    full: F32 | float = np.inf,
 ) -> F64:
     """The same of flats, each made as bright as the other of its pair.
 
@@ -89,6 +91,7 @@ def flat_pair_sums(
     levels : (t,) their common levels, in any unit; pairs that differ too much are not used
     gain, read_noise, quantum : as of `pair_statistics`
     line_noise : of these pixels
+    full : (y, x) or scalar, where samples saturate, ADU above bias and dark
     """
     blocks = [_NO_BLOCKS]
     for n in range(0, len(frames) - 1, 2):
@@ -96,8 +99,11 @@ def flat_pair_sums(
         if not np.isfinite(a + b) or abs(a - b) > _PAIR_LAMP_CHANGE * (a + b) / 2:
             continue
         first, second = first * ((a + b) / (2 * a)), second * ((a + b) / (2 * b))
+        level = (first + second) / 2
+        noise = np.sqrt(read_noise**2 + np.maximum(level, 0) / gain)
+        # Of nearly full pixels the noise is cut off, beside those of another colour whose is not.
         # Full pixels beside those of an overscan would pass for half-full ones without noise.
-        first[~lit(first + second)] = np.nan
+        first[~lit(level) | (level + _NEARLY * noise > full)] = np.nan
         blocks.append(_blocks(first, second, gain, read_noise, quantum, line_noise.lines or ()))
     return line_noise.put_back(bin_pairs(np.concatenate(blocks)))
 

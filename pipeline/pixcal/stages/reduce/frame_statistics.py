@@ -277,15 +277,20 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
                 column.loud |= _loud(job, frames - levels[:, None, None])
             if lamp or group == job.read_series:
                 frames[:, column.loud] = np.nan
-                _add_pairs(job, column, frames, levels, lamp)
+                full = np.float32(job.saturation) - (0 if pedestal is None else pedestal)
+                _add_pairs(job, column, frames, levels, full if lamp else None)
     return [combination.result() for combination in every]
 
 
-def _add_pairs(job: Measuring, column: _Column, frames: F32, levels: F32, lamp: bool) -> None:
-    """Add the photon transfer of frames 0 and 1, 2 and 3, and so on."""
+def _add_pairs(
+    job: Measuring, column: _Column, frames: F32, levels: F32, full: F32 | float | None
+) -> None:
+    """Add the photon transfer of frames 0 and 1, 2 and 3, and so on; of flats, ``full`` (ADU)."""
     of_samples = job.read_noise, job.quantum
-    if lamp:
-        column.pairs[1] += flat_pair_sums(frames, levels, job.gain, *of_samples, column.line_noise)
+    if full is not None:
+        column.pairs[1] += flat_pair_sums(
+            frames, levels, job.gain, *of_samples, column.line_noise, full
+        )
         return
     frames -= levels[:, None, None]
     sums = dark_pair_sums(frames, *of_samples)
