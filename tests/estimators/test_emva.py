@@ -122,6 +122,19 @@ def test_dark_current_counts_the_drift_of_frames():
     assert dark_slope(np.ones(9), np.ones(9)) is None
 
 
+def test_dark_current_counts_a_black_level_that_is_set_anew_for_each_exposure_time():
+    times = np.repeat(np.arange(8.0), 20)
+    pulls = []
+    for draw in range(60):
+        rng = np.random.default_rng(draw)
+        level = np.repeat(0.5 * rng.standard_normal(8), 20) + 0.05 * rng.standard_normal(160)
+        slope, error = dark_slope(times, 500 + 2.0 * times + level)
+        pulls.append((slope - 2.0) / error)
+    # A Student variable of six degrees of freedom.
+    assert abs(np.mean(pulls)) < 4 / np.sqrt(60)
+    assert abs(np.std(pulls) / np.sqrt(6 / 4) - 1) < 0.3
+
+
 @pytest.mark.parametrize("axis", [0, 1])
 def test_every_second_line_that_is_higher_is_told_with_its_error(axis: int) -> None:
     rng = np.random.default_rng(20)

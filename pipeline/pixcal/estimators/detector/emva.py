@@ -193,7 +193,8 @@ def dynamic_range(full_well: Measure, read_noise: Measure) -> tuple[float, float
 def dark_slope(times: F64, means: F64) -> Measure | None:
     """Dark signal (per second) from the means of frames, with the scatter between them.
 
-    ``times``: (frame,) s. None with fewer than three frames or a single exposure time.
+    A black level that is set anew for each exposure time puts their means off the line: where that
+    scatter is the larger one, it counts. ``times``: (frame,) s. None with fewer than three frames or a single exposure time.
     """
     if len(times) < 3:
         return None
@@ -203,4 +204,10 @@ def dark_slope(times: F64, means: F64) -> Measure | None:
         return None
     slope = float(lever @ means) / square
     rest = means - means.mean() - slope * lever
-    return slope, math.sqrt(float(rest @ rest) / (len(times) - 2) / square)
+    variance = float(rest @ rest) / (len(times) - 2)
+    every, own = np.unique(times, return_inverse=True)
+    if len(every) > 2:
+        count = np.bincount(own)
+        off = np.bincount(own, rest) / count
+        variance = max(variance, float(count @ off**2) / (len(every) - 2))
+    return slope, math.sqrt(variance / square)

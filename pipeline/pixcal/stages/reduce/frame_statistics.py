@@ -277,14 +277,14 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
                 column.loud |= _loud(job, frames - levels[:, None, None])
             if lamp or group == job.read_series:
                 frames[:, column.loud] = np.nan
-                full = np.float32(job.saturation) - (0 if pedestal is None else pedestal)
-                _add_pairs(job, column, frames, levels, full if lamp else None)
+                full = job.saturation - (0.0 if pedestal is None else pedestal)
+                _add_pairs(
+                    job, column, frames, levels, np.asarray(full, np.float32) if lamp else None
+                )
     return [combination.result() for combination in every]
 
 
-def _add_pairs(
-    job: Measuring, column: _Column, frames: F32, levels: F32, full: F32 | float | None
-) -> None:
+def _add_pairs(job: Measuring, column: _Column, frames: F32, levels: F32, full: F32 | None) -> None:
     """Add the photon transfer of frames 0 and 1, 2 and 3, and so on; of flats, ``full`` (ADU)."""
     of_samples = job.read_noise, job.quantum
     if full is not None:
