@@ -194,7 +194,8 @@ def dark_slope(times: F64, means: F64) -> Measure | None:
     """Dark signal (per second) from the means of frames, with the scatter between them.
 
     A black level that is set anew for each exposure time puts their means off the line: where that
-    scatter is the larger one, it counts. ``times``: (frame,) s. None with fewer than three frames or a single exposure time.
+    scatter is the larger one, it counts. ``times``: (frame,) s. None with fewer than three frames
+    or a single exposure time.
     """
     if len(times) < 3:
         return None
