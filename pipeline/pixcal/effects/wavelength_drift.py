@@ -12,7 +12,7 @@ from pixcal.kernels import optics
 from pixcal.kernels.scene import FrameStates, geometry
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
-from pixcal.simulation.frame_fit import fit_frames
+from pixcal.simulation.frame_fit import detect_in_frames, fit_frames
 from pixcal.simulation.recording import Recording
 
 HOUR_S = 3600.0
@@ -92,11 +92,21 @@ class WavelengthDrift(Effect):
             walks = effect.walk > CALM * errors.get("walk", np.inf)
             values, hop_errors = _hops(motion, jumps, walks=walks)
             effect, errors = replace(effect, **values), errors | hop_errors
-        sharpest = max((hop.sigmas for hop in jumps), default=-np.inf)
-        significance = float(max(slow.significance, sharpest))
+        significance = max(slow.significance, _sharpest(motion))
         return Estimate(
             effect, errors, significance, slow.why, {**slow.details, "hops": len(jumps)}
         )
+
+    @classmethod
+    def detect(cls, evidence: Evidence) -> float | None:
+        """As in `Effect.detect`."""
+        motion, slow = motion_of(evidence), detect_in_frames(cls, evidence, leave=("hop",))
+        return None if motion is None or slow is None else max(slow, _sharpest(motion))
+
+
+def _sharpest(motion: Motion) -> float:
+    """Standard deviations by which the clearest hop stands out."""
+    return float(max((h.sigmas for hops in motion.hops.values() for h in hops), default=-np.inf))
 
 
 def _hops(

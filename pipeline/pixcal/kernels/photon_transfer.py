@@ -9,11 +9,13 @@ the expected square of their difference is that sum), so structured light does n
 Charge that neighbours share lowers the variance of single pixels and raises the gain that comes
 out: in proportion to the signal with crosstalk (Moore, Ninkov & Forrest 2006), bending the curve
 with brighter-fatter. The noise is not lost: it stands in the covariances of neighbours, which are
-measured as far as `REACH` and added where they are significant.
+measured as far as `REACH` and added as far as they are likely.
 """
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -39,9 +41,9 @@ LAGS = np.array(
 # of the sums: degrees of freedom, level, variance and the covariance of each of `LAGS`
 COLUMNS = 3 + len(LAGS)
 
-# errors beyond which neighbours share noise, and beyond which others may where some do
-SHARED, _ALSO = 4.0, 2.0
+SHARED = 4.0  # errors beyond which neighbours share noise
 _EVERYWHERE = 0.5  # least covariance at any lag over the largest of noise that is not of neighbours
+_SIZES = 12  # of covariances of neighbours that are tried
 # least share of a block's pixels, along each axis, that have a neighbour at a lag in it
 _PAIRED = 1 - REACH / BLOCK
 _CLIP = 5.0
@@ -174,35 +176,90 @@ def neighbour_noise(frames: F32, lags: Sequence[tuple[int, int]]) -> float:
     return total * len(frames) / (len(frames) - 1)
 
 
-def add_neighbours(lit: F64, dark: F64) -> tuple[F64, dict[tuple[int, int], float]]:
+@dataclass(frozen=True)
+class SharedNoise:
+    """What covariances of neighbours may be, over the shot noise, before they are measured.
+
+    Normal numbers that fall off with a power of the distance. Their size is ``nothing``, by that
+    chance, or any from the ``smallest``, or from the error if that is less, to the ``largest``.
+    All of a kernel have one size in common; each differs from it by ``own`` times as much.
+    """
+
+    nothing: float = 0.3
+    smallest: float = 2e-3
+    largest: float = 0.1
+    powers: tuple[float, ...] = (2.0, 3.0, 6.0)  # of charge that pushes (2, 3), of capacitance
+    own: float = 0.3
+
+    def total(self, shares: F64, error: float) -> tuple[F64, float]:
+        """By how much each of the shares counts in the noise that all share, and its variance.
+
+        ``shares``: covariances (12,) at `LAGS` over the shot noise, each with this error. The
+        average over sizes and powers, each with the weight of its evidence, as of the gain
+        (`gain_fit`).
+        """
+        count = len(LAGS)
+        # The mean that is taken off a block is of noise that is shared, and so larger.
+        seen, twice = np.eye(count) - 2 / BLOCK**2, 2 * (1 + 1 / BLOCK**2)
+        logs, weights, variances = [0.0], [np.zeros(count)], [0.0]
+        sizes = np.geomspace(min(error, self.smallest), self.largest, _SIZES)
+        for power, size in product(self.powers, sizes):
+            falling = size * np.hypot(*LAGS.T) ** -power
+            before = np.outer(falling, falling) + np.diag((self.own * falling) ** 2)
+            spread = seen @ before @ seen.T / error**2 + np.eye(count)
+            learnt = before @ seen.T @ np.linalg.inv(spread) / error**2
+            unlikely = shares @ (np.linalg.solve(spread, shares) - shares) / error**2
+            logs.append(-(unlikely + np.linalg.slogdet(spread)[1]) / 2)
+            weights.append(twice * learnt.sum(axis=0))
+            variances.append(twice**2 * float((before - learnt @ seen @ before).sum()))
+        some = (1 - self.nothing) / (len(logs) - 1)
+        chance = np.exp(np.array(logs) - max(logs)) * [self.nothing, *[some] * (len(logs) - 1)]
+        chance /= chance.sum()
+        weight = chance @ np.array(weights)
+        apart = (np.array(weights) - weight) @ shares
+        return weight, float(chance @ (np.array(variances) + apart**2))
+
+
+SHARED_NOISE = SharedNoise()
+
+
+def add_neighbours(
+    lit: F64, dark: F64, expected: SharedNoise = SHARED_NOISE
+) -> tuple[F64, dict[tuple[int, int], float]]:
     """Noise with that which neighbours share, (N_BINS, 3), and the lags (y, x) it came from.
 
     Covariances beyond those without light are added to the variance of the pixel itself, twice for
-    the two neighbours, where they are significant over all levels. Where any is, less is needed of
-    the others: a kernel that reaches the nearest pixels reaches those on the diagonal a little, and
-    in twelve lags a little adds up. Each lag comes with its significance: one below `SHARED` may
-    be there by chance. The lag is (0, 0) alone where all pixels share noise. ``lit`` and ``dark``
-    are from `bin_pairs`, of flats and of frames without light.
+    the two neighbours. Each is too noisy to be told by itself: all lags together say how much of
+    them is likely, and what remains unknown is in the degrees of freedom. Lags that count for more
+    than half come with their significance: one below `SHARED` may be there by chance. The lag is
+    (0, 0) alone where all pixels share noise. ``lit`` and ``dark`` are from `bin_pairs`, of flats
+    and of frames without light.
     """
     sums = lit[:, :3].copy()
     used = np.flatnonzero((lit[:, 0] > 0) & (lit[:, 1] > 0))
     without = dark.sum(axis=0)
     if not len(used) or not without[0] > 0:
         return sums, {}
-    dof, level, variance, *_ = (lit[used] / np.maximum(lit[used, :1], 1)).T
+    none = without / without[0]
     dof = lit[used, 0]
-    beyond = lit[used, 3:] / dof[:, None] - without[3:] / without[0]
+    level, variance = (lit[used, 1:3] / dof[:, None]).T
+    beyond = lit[used, 3:] / dof[:, None] - none[3:]
     weight = dof * level / np.maximum(variance, 1e-100) ** 2
     error = math.hypot(
         math.sqrt((weight**2 * variance**2 / dof).sum()),
-        weight.sum() * without[2] / without[0] / math.sqrt(without[0]),
+        weight.sum() * none[2] / math.sqrt(without[0]),
     )
-    shared = weight @ beyond
+    shared, shot = weight @ beyond, float(weight @ (variance - none[2]))
     if shared.min() > _EVERYWHERE * shared.max() and shared.min() > SHARED * error:
         return sums, {(0, 0): float(shared.min() / error)}
+    if not shot > 0:
+        return sums, {}
+    counted, unknown = expected.total(shared / shot, error / shot / _PAIRED)
+    sums[used, 2] += dof * (beyond @ counted)
+    sums[used] /= 1 + unknown / (2 * (error / shot) ** 2)
     errors = np.abs(shared) * _PAIRED / error
-    significant = errors > (_ALSO if (errors > SHARED).any() else SHARED)
-    sums[used, 2] += dof * 2 * beyond[:, significant].sum(axis=1)
-    sums[used] /= 1 + 2 * significant.sum() / _PAIRED**2
-    lags = LAGS[significant].tolist()
-    return sums, {(y, x): float(e) for (y, x), e in zip(lags, errors[significant], strict=True)}
+    return sums, {
+        (y, x): float(e)
+        for (y, x), e, times in zip(LAGS.tolist(), errors, counted, strict=True)
+        if times > 1
+    }

@@ -19,7 +19,7 @@ from pixcal.model.arrays import F32, F64
 from pixcal.model.errors import InputError
 from pixcal.simulation.forward import DOMAINS, ForwardModel, Stage
 from pixcal.simulation.frame_changes import acts_on_frames_alone
-from pixcal.simulation.frame_fit import fit_frames
+from pixcal.simulation.frame_fit import detect_in_frames, fit_frames
 from pixcal.simulation.light_fit import LightFit, LightStart, fit_light
 from pixcal.simulation.numbers import numbers, with_numbers
 from pixcal.simulation.score import score, score_again
@@ -210,6 +210,9 @@ class Effect(ForwardModel):
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
         """Significance that `estimate` gives; of most simulations nothing else is needed."""
+        inherited = all("estimate" not in vars(c) for c in cls.__mro__[: cls.__mro__.index(Effect)])
+        if inherited and acts_on_frames_alone(cls) and not cls.starts(evidence):
+            return detect_in_frames(cls, evidence)
         found = cls.estimate(evidence)
         return None if found is None else found.significance
 

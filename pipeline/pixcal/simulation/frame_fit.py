@@ -56,6 +56,58 @@ def fit_frames(
 
     Strengths to ``leave`` are not looked at.
     """
+    found = _taken(kind, evidence, leave)
+    if found is None:
+        return None
+    fit, changes = found.fit, found.changes
+    model, errors = fit.values()
+    for own, line in found.lines:
+        if line is not None and line.sure:
+            model, of_line = _swung(model, own, line, fit.basis)
+            errors |= of_line
+    kinds = {w.channels is LIGHT for w in fit.basis.every}
+    told = ["intensity and contrast"] * (True in kinds) + ["the fringe vector"] * (False in kinds)
+    return FrameFit(
+        model,
+        errors,
+        found.significance,
+        f"changes of {' and '.join(told)} from frame to frame, the same in two halves of the "
+        f"pixels{ALIKE if False in kinds and not changes.crossed else ''}",
+        {f"{field}_sigmas": sigmas(chance) for field, chance in found.chances.items()},
+    )
+
+
+def detect_in_frames(
+    kind: type[ForwardModel], evidence: Evidence, leave: Sequence[str] = ()
+) -> float | None:
+    """Significance that `fit_frames` gives, without sizes and errors."""
+    found = _taken(kind, evidence, leave)
+    return None if found is None else found.significance
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """Strengths of a model as the series of the frames show them."""
+
+    fit: "_Fit"
+    changes: FrameChanges
+    lines: list[tuple[list[Strength], Line | None]]  # strengths of each line of the spectrum
+
+    @property
+    def chances(self) -> dict[str, float]:
+        """Logarithm of the chance of each field where there is none of it."""
+        of_lines = {
+            own[0].field: 0.0 if line is None else line.log_chance for own, line in self.lines
+        }
+        return self.fit.chances | of_lines
+
+    @property
+    def significance(self) -> float:
+        """Of all fields, sigma."""
+        return sigmas(log_chance_of_any(list(self.chances.values())))
+
+
+def _taken(kind: type[ForwardModel], evidence: Evidence, leave: Sequence[str]) -> _Taken | None:
     changes = evidence.once("changes of frames", make=lambda: FrameChanges(evidence))
     every = changes.series(kind())
     strengths = strengths_of(every, kind(), leave)
@@ -65,25 +117,9 @@ def fit_frames(
     fit = _Fit(kind(), FrameBasis(changes, every, plain))
     for field in dict.fromkeys(s.field for s in sorted(plain, key=lambda s: s.steady)):
         fit.take([s for s in plain if s.field == field])
-    model, errors = fit.values()
-    chances = dict(fit.chances)
-    for field in dict.fromkeys(s.field for s in strengths if s.of_line):
-        own = [s for s in strengths if s.field == field]
-        line = changes.line(own[0])
-        chances[field] = 0.0 if line is None else line.log_chance
-        if line is not None and line.sure:
-            model, of_line = _swung(model, own, line, fit.basis)
-            errors |= of_line
-    kinds = {w.channels is LIGHT for w in every}
-    told = ["intensity and contrast"] * (True in kinds) + ["the fringe vector"] * (False in kinds)
-    return FrameFit(
-        model,
-        errors,
-        sigmas(log_chance_of_any(list(chances.values()))),
-        f"changes of {' and '.join(told)} from frame to frame, the same in two halves of the "
-        f"pixels{ALIKE if False in kinds and not changes.crossed else ''}",
-        {f"{field}_sigmas": sigmas(chance) for field, chance in chances.items()},
-    )
+    fields = dict.fromkeys(s.field for s in strengths if s.of_line)
+    lines = [[s for s in strengths if s.field == field] for field in fields]
+    return _Taken(fit, changes, [(own, changes.line(own[0])) for own in lines])
 
 
 class _Fit:
