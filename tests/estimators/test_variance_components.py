@@ -209,5 +209,7 @@ def test_sums_of_traces() -> None:
     parts[1, 3:], parts[4, :10] = 0.0, 0.0
     product = np.einsum("nab,inbc->inac", weight, parts)
     np.testing.assert_allclose(
-        trace_products(weight, parts), np.einsum("inab,jnba->ij", product, product), rtol=1e-10
+        trace_products(weight, parts.transpose(2, 3, 0, 1)),
+        np.einsum("inab,jnba->ij", product, product),
+        rtol=1e-10,
     )

@@ -732,10 +732,10 @@ def test_real_frames_give_the_gain_and_noise_of_their_camera(tmp_path: Path) -> 
     # With what pixels on the diagonal and beyond may share unnoticed.
     assert gain["error"] < 0.006 * gain["measured"]
     # Its package looks at single pixels. At 64,000 e- their charge moves the boundaries of others
-    # by 0.4 % of the variance a neighbour, which counts here.
+    # by 0.4 % of the variance a neighbour and less on the diagonal, which counts here.
     assert gain["neighbours"][:1] == [[0, 1]]
     assert [1, 0] in gain["neighbours"]
-    assert 0.98 < gain["measured"] / np.mean(ESIS_GAINS) < 1.0
+    assert 0.97 < gain["measured"] / np.mean(ESIS_GAINS) < 0.985
     assert noise["measured"] / gain["measured"] == pytest.approx(
         np.sqrt(np.mean(np.square(ESIS_NOISES))), 0.01
     )

@@ -10,6 +10,7 @@ Biometrics 51, 1440), which converges faster.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import brentq
@@ -24,10 +25,13 @@ NEAR = 2.0  # growth from which the average information makes the steps
 
 
 def trace_products(weight: F64, parts: F64) -> F64:
-    """Sum over modes of tr(W D_i W D_j), (m, m), of weights (n, c, c) and parts (m, n, c, c)."""
-    products = weight @ parts
-    turned = products.swapaxes(2, 3)
-    return np.asarray(products.reshape(len(parts), -1) @ turned.reshape(len(parts), -1).T)
+    """Sum over modes of tr(W D_i W D_j), (m, m), of weights (n, c, c) and parts (c, c, m, n).
+
+    Element by element of the few channels, over all modes at once.
+    """
+    own, each = np.ascontiguousarray(weight.transpose(1, 2, 0)), range(len(parts))
+    products = [[sum(own[a, k] * parts[k, b] for k in each) for b in each] for a in each]
+    return np.asarray(sum(products[a][b] @ products[b][a].T for a in each for b in each))
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,11 @@ class Modes:
     def flat(self) -> F64:
         """``parts`` as (m, n c c), for sums over all else."""
         return self.parts.reshape(len(self.parts), -1)
+
+    @cached_property
+    def by_channel(self) -> F64:
+        """``parts`` as (c, c, m, n), for sums over the modes."""
+        return np.ascontiguousarray(self.parts.transpose(2, 3, 0, 1))
 
 
 @dataclass(frozen=True)
@@ -189,7 +198,7 @@ class _State:
 
     def information(self) -> F64:
         """Fisher's information of the sizes (m, m)."""
-        return np.asarray(self.modes.share * trace_products(self.weight, self.modes.parts) / 2)
+        return np.asarray(self.modes.share * trace_products(self.weight, self.modes.by_channel) / 2)
 
 
 def _log_determinant(matrix: F64) -> float:
