@@ -21,7 +21,7 @@ from pixcal.stages.diagnose.comparison import (
     shrinkage,
 )
 from pixcal.stages.diagnose.rejection import MIN_LOGLIK_GAIN_WEAK, doubtful
-from pixcal.stages.diagnose.search import CONFIRM, MAX_CAUSES, SCREEN, Search
+from pixcal.stages.diagnose.search import CONFIRM, MAX_CAUSES, SCREEN, SIMULATIONS, Search
 
 KEYS: tuple[Key, ...] = (
     ("harmonics", "a"),
@@ -559,3 +559,27 @@ def test_a_cause_always_has_a_gap_that_it_closes() -> None:
         data = REFERENCE.on_scale(curves((), seed, {"left": 0.0025}))
         assert bool(differing(found.nominal, found.final, data)) >= bool(found.accepted)
         assert left <= 1
+
+
+def test_a_search_ends_within_its_simulations_and_tells_what_it_has_not_decided() -> None:
+    truth = {label: 0.4 / 2**n for n, label in enumerate(SINGLE)}
+    data = REFERENCE.on_scale(curves((), 500, truth))
+    made: set[tuple[frozenset[Effect], int]] = set()
+
+    def noted(
+        benches: Sequence[Sequence[Effect]], seeds: int, label: str, asked: Sequence[str]
+    ) -> list[list[dict[Key, Curve]] | str]:
+        made.update((frozenset(bench), seed) for bench in benches for seed in range(seeds))
+        return simulate(benches, seeds, label, asked)
+
+    spent = []
+    for most in (60, 150, SIMULATIONS):
+        made.clear()
+        named = {label: candidate(label, size, 1e3 * size) for label, size in truth.items()}
+        found = Search(REFERENCE, data, noted, lambda *_: {}, most).run(named)
+        undecided = [c for c in named.values() if c.reason.startswith("not decided")]
+        assert found.accepted
+        assert len(made) <= most
+        assert len(found.accepted) == MAX_CAUSES or undecided
+        spent.append(len(found.accepted))
+    assert spent == sorted(set(spent))

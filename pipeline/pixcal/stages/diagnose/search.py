@@ -44,6 +44,7 @@ PROMISING = 0.25  # share of the best gain from which a candidate is simulated m
 KNOWN_TO = 3.0  # with its effect known to one part in this: what one simulation leaves open
 MAX_CAUSES = 5  # causes that are accepted at most
 AS_GOOD = 0.1  # by which the gain of a candidate may be less than the best, to count as its equal
+SIMULATIONS = 300  # that a search may use; two causes take some 80
 SIMILAR = 0.7  # fraction of a candidate's significance that another effect may produce
 
 Simulate = Callable[[Sequence[Effects], int, str, Sequence[str]], Sequence[list[Curves] | str]]
@@ -61,6 +62,7 @@ class Search:
         first bench.
     estimates : ``estimates(effects, names)`` gives the significance of candidates on a simulation
         of the fitted frames with some effects
+    most : number of simulations that the search may use
     """
 
     def __init__(
@@ -69,8 +71,10 @@ class Search:
         data: Mapping[Key, F64],
         simulate: Simulate,
         estimates: Estimates,
+        most: int = SIMULATIONS,
     ) -> None:
-        self._simulate, self._estimates = simulate, estimates
+        self._ask, self._estimates, self._most = simulate, estimates, most
+        self._made: dict[frozenset[Effect], int] = {}  # simulations of each bench
         self.comparison = Comparison(reference, data)
 
     def run(self, candidates: Mapping[str, Candidate]) -> SearchResult:
@@ -92,6 +96,7 @@ class Search:
     ) -> bool:
         """Accept the candidate that the held-out frames favour most; False if they favour none."""
         self._reject_insignificant(causes, remaining)
+        self._reject_undecided(causes, remaining)
         if not remaining:
             return False
         laws, replays = self._tried(causes, remaining)
@@ -174,6 +179,31 @@ class Search:
             if size < least or estimate.effect.is_null:
                 remaining[name].reason = f"not significant ({size:z.1f} sigma{beside})"
                 del remaining[name]
+
+    def _reject_undecided(self, causes: Accepted, remaining: dict[str, Candidate]) -> None:
+        """Leave out the weakest candidates where all would take more simulations than are left.
+
+        What it takes to accept one more cause and to weigh all at the end is kept for that.
+        """
+        count = len(causes.effects) + 1
+        weighed = count * (2 * CONFIRM + SCREEN) + count * (count - 1) // 2 * CONFIRM
+        left = self._most - sum(self._made.values()) - CONFIRM - weighed
+        sizes = {n: c.significance * causes.shares.get(n, 1.0) for n, c in remaining.items()}
+        for name in sorted(sizes, key=lambda n: -sizes[n]):
+            candidate = remaining[name]
+            left -= SCREEN * (len(candidate.variants(causes.shares.get(name, 1.0))) + 1)
+            if left < 0:
+                candidate.reason = (
+                    f"not decided: a search may use {self._most} simulations, and too few are left"
+                )
+                del remaining[name]
+
+    def _simulate(
+        self, benches: Sequence[Effects], seeds: int, label: str, asked: Sequence[str]
+    ) -> Sequence[list[Curves] | str]:
+        for bench in map(frozenset, benches):
+            self._made[bench] = max(self._made.get(bench, 0), seeds)
+        return self._ask(benches, seeds, label, asked)
 
     def _tried(
         self, causes: Accepted, remaining: dict[str, Candidate]
