@@ -92,6 +92,23 @@ def test_steps_are_found_from_gaps(step: float) -> None:
     assert abs(found - step) < 2 * error < 2e-3 * step
 
 
+def test_codes_that_are_uneven_for_bright_samples_alone_are_those_of_another_gain() -> None:
+    rng, good = np.random.default_rng(2), np.ones(1_500_000, bool)
+    faint, bright = (rng.normal(m, s, good.size).astype(int) for m, s in ((900, 90), (3000, 300)))
+    missing, low = rng.random(12_000) < 0.25, rng.random(good.size) < 0.3
+    dual = np.where(low, bright, bright // 4 * 4)  # pixels differ in offset
+    for codes, expected in (
+        ((faint, bright), False),
+        ((faint, dual), True),
+        ((faint + missing[faint], bright + missing[bright]), False),
+    ):
+        counts = histogram([np.stack(codes).astype(np.uint16)], good)
+        assert counts is not None
+        widths = code_widths(counts, 10.0)
+        assert widths is not None
+        assert widths.uneven_above == expected
+
+
 def test_codes_beside_saturation_are_not_wide() -> None:
     rng = np.random.default_rng(9)
     samples = np.minimum(np.rint(rng.normal(3900, 150, (40, 100, 100))), 4000).astype(np.uint16)

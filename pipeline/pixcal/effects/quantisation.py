@@ -27,6 +27,10 @@ from pixcal.simulation.shot import Shot
 FARTHEST = 0.98
 FEW_MISSING = 1.1  # step up to which wrong bits may be why codes never come, every so often
 _KEY = 997
+_OTHER_GAIN = (
+    "only codes of bright samples are uneven, as in a camera that reads bright pixels at another "
+    "gain (dual gain, HDR)"
+)
 
 
 @dataclass(frozen=True)
@@ -190,6 +194,7 @@ class Quantisation(Effect):
             sigmas_of_best(*found),
             "missing codes, and code counts compared with neighbouring codes",
             {"sigmas": found, "codes": 0 if widths is None else len(widths.number)},
+            refused=_OTHER_GAIN if widths is not None and widths.uneven_above else "",
         )
 
 

@@ -35,6 +35,9 @@ _UNEVEN = 2e-3
 _BIT_FITS, _SETTLED = 12, 0.1
 # codes of noise below which the peak of dark frames is too narrow for a local fit
 MIN_NOISE = 1.4
+# shares of the codes below which they may be even and above which they may not; how much larger
+# than chance the squares of the widths are then, and how many codes below may be as uneven
+_SPLITS, _CLEAR, _EVEN = (0.03, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75), 25.0, 0.05
 LOWEST_RIPPLE = 1 / 16  # turns a code
 
 
@@ -184,6 +187,23 @@ class CodeWidths:
         chance = 1 / (2 * variance**2 + variance**3)
         sigmas = float(chance @ excess / np.sqrt(chance.sum()))
         return size / more, error / more, sigmas
+
+    @property
+    def uneven_above(self) -> bool:
+        """Whether codes are uneven from some code on, and even below.
+
+        So it is in files of cameras that read bright pixels at another gain, in coarser steps.
+        """
+        square = self.width**2
+        for share in _SPLITS:
+            split = int(share * len(square))
+            typical = float(np.median(square[split:]))
+            told = self.variance[:split] < typical / _CLEAR
+            like = square[:split][told] > typical / 4
+            clear = typical > _CLEAR * np.median(self.variance[split:])
+            if clear and len(like) >= FEWEST_CODES and like.mean() < _EVEN:
+                return True
+        return False
 
     def bits(self, scatter: float) -> tuple[F64, F64]:
         """By how much each bit's weight is off, in codes, the least first; and the covariance.
