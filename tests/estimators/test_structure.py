@@ -119,3 +119,11 @@ def test_outliers_are_told_from_a_strong_pattern() -> None:
     assert np.isnan(left[7, 9])
     assert np.isnan(left[40, 3])
     assert np.isfinite(left).sum() >= values.size - 4
+
+
+def test_terms_need_not_be_known_where_the_map_is_not() -> None:
+    rng = np.random.default_rng(8)
+    terms = rng.standard_normal((3, 40, 30))
+    values = np.tensordot([2.0, -1.0, 0.5], terms, 1)
+    values[3, 4] = terms[:, 3, 4] = np.nan
+    np.testing.assert_allclose(fit_terms(values, terms), [2.0, -1.0, 0.5])

@@ -46,13 +46,16 @@ def legendre(shape: tuple[int, ...], degree: int) -> F64:
 
 
 def fit_terms(values: F64, terms: F64) -> F64:
-    """Least-squares coefficients (term,) of maps (term, y, x) in a map with NaN."""
+    """Least-squares coefficients (term,) of maps (term, y, x) in a map with NaN.
+
+    Where it is NaN, they may be so too.
+    """
     good = np.isfinite(values)
     # Zeros, not copies without the pixels that are left out: those take longer than all the rest.
     design = terms.reshape(len(terms), -1)
-    inside = design if good.all() else design * good.ravel()
+    inside = design if good.all() else np.where(good.ravel(), design, 0)
     # Few terms of many pixels: the normal equations take a hundredth of the time of an SVD.
-    right = design @ np.where(good, values, 0).ravel()
+    right = inside @ np.where(good, values, 0).ravel()
     return np.asarray(inverse_normal(inside @ inside.T, 1e-12) @ right)
 
 

@@ -12,12 +12,12 @@ import numpy as np
 from scipy.special import chdtri
 
 from pixcal.kernels.frame_order import follows
-from pixcal.model.arrays import F64, Indices
+from pixcal.model.arrays import F64, Indices, Mask
 
 NOISY = 3.0  # excess of the variance, in its own sigmas, from which a pixel's noise is looked at
 LAGS = 1, 4  # frames apart whose products tell how long pixels stay, and how widely that differs
 QUIET = 1 << 14  # pixels of usual noise that tell what noise is usual
-_OUTLIER = 5.0
+_OUTLIER = 5.0  # standard deviations
 # by how much the quartiles of n pixels' variances are further apart than those of alike pixels,
 # times the root of n: three errors (of normal numbers)
 _DIFFER = 3.5
@@ -74,9 +74,7 @@ class Moments:
 def moments_of(series: Series) -> Moments | None:
     """Moments of the noise of each pixel; None where there are too few frames."""
     x = series.noise - np.nanmedian(series.noise, axis=0)
-    # One wild sample is a particle's; noise of two levels has more of them, or none.
-    wild = np.abs(x) > _OUTLIER
-    x[wild & (wild.sum(axis=0) == 1)] = np.nan
+    x[_particles(x)] = np.nan
     n = np.isfinite(x).sum(axis=0).astype(float)
     used = n > _MIN_FRAMES
     if not used.any():
@@ -113,6 +111,19 @@ def moments_of(series: Series) -> Moments | None:
         int(np.median(n)),
         np.ones(np.count_nonzero(used)),
     )
+
+
+def _particles(noise: F64) -> Mask:
+    """Samples (t, n) far beyond all others of their pixel: noise of two levels has more, or none.
+
+    Beyond those of the pixel itself: without its largest samples the noise of a noisy pixel would
+    have a flat top.
+    """
+    square = np.nan_to_num(noise**2)
+    largest, n = square.max(axis=0), np.isfinite(noise).sum(axis=0)
+    others = (square.sum(axis=0) - largest) / np.maximum(n - 2, 1)
+    found: Mask = square > _OUTLIER**2 * np.maximum(others, 1)
+    return np.asarray(found & (found.sum(axis=0) == 1))
 
 
 def thinned(parts: Sequence[Moments]) -> list[Moments]:
