@@ -47,6 +47,16 @@ def test_any_ladder_tells_the_gain(steps: list[tuple[float, float]], tmp_path: P
     assert report["warnings"] == []
 
 
+@pytest.mark.parametrize("frames", [1, 2])
+def test_single_flats_are_said_to_tell_no_gain(frames: int, tmp_path: Path) -> None:
+    _, report = reduced(
+        Detector(**CAMERA, flats=ladder([(t, 1) for t in LEVELS], frames)), 1, tmp_path
+    )
+    assert (report["gain_e_per_adu"]["measured"] is None) == (frames == 1)
+    said = [warning for warning in report["warnings"] if "at least two flats" in warning]
+    assert bool(said) == (frames == 1)
+
+
 def test_levels_of_one_exposure_time_are_told_apart(tmp_path: Path) -> None:
     flats = ladder([(0.5, lamp) for lamp in (0.2, 0.6, 1.0)], 4)
     evidence, report = reduced(Detector(**CAMERA, flats=flats), 2, tmp_path)

@@ -138,6 +138,11 @@ def _group_flats(found: Exposures, times: list[float | None], steps: Sequence[in
             f"{unexposed} of {len(times)} flat frames have an exposure time of 0 s: not used; list "
             "them under frames.bias if they hold no light"
         )
+    if all(len(group.frames) < 2 for group in found.flat):
+        found.warnings.append(
+            "no two flats have the same level: gain and PRNU are not measured; take at least two "
+            "flats at each level"
+        )
 
 
 def _time_fringes(found: Exposures, name: str, times: list[float | None]) -> None:
