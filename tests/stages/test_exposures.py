@@ -41,7 +41,7 @@ def test_the_read_noise_is_that_of_the_bias_frames_else_of_most_darks() -> None:
 
 
 def test_darks_of_two_times_are_enough_without_bias() -> None:
-    found = group_exposures(tables(dark=[1.0, 2.0], flat=[1.0], fringes__a=[0.5]))
+    found = group_exposures(tables(dark=[1.0, 2.0], flat=[1.0, 1.0], fringes__a=[0.5]))
     assert found.has_rate
     assert found.warnings == []
 

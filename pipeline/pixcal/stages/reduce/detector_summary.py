@@ -198,10 +198,10 @@ def _steps(job: Measuring) -> tuple[float, float]:
     rounding = SHEPPARD * job.quantum**2
     if not job.quantum:
         return rounding, 0.0
-    counts = code_counts(job.flat, job)
-    if not len(missing_codes(counts)):
+    # Within one level: codes between those of two need not come.
+    if not any(len(missing_codes(code_counts([group], job))) for group in job.flat):
         return rounding, 0.0
-    variance, density = step_noise(counts)
+    variance, density = step_noise(code_counts(job.flat, job))
     return rounding + variance * job.quantum**2, density * job.quantum**3
 
 
