@@ -5,6 +5,7 @@ about a line that need not go through nothing. A curve through them is the detec
 noise of the flats bends with it, as far as that is precise enough to tell; else it is the lamp's.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,16 +73,23 @@ def level_before(stack: Stack, evidence: Evidence) -> float:
 
 
 def warming(evidence: Evidence) -> tuple[float, float]:
-    """Relative rise of the light from frame to frame of each level, and its error.
+    """Relative rise of the light from frame to frame of each level, and its error."""
+    return rise_of([light_of(evidence, stack) for stack in evidence.ladder])
 
-    Both are zero unless it is significant. First frames, which lag makes fainter, do not count.
+
+def rise_of(series: Sequence[F64]) -> tuple[float, float]:
+    """Relative rise from frame to frame that series of light (t,) share, and its error.
+
+    Both are zero unless it is significant. First frames, which lag makes fainter, do not count, nor
+    do those that are NaN.
     """
     rises, weights, squares, freedom = [], [], 0.0, -1
-    for stack in evidence.ladder:
-        light = light_of(evidence, stack)[1:]
+    for whole in series:
+        time = 1.0 + np.flatnonzero(np.isfinite(whole[1:]))
+        light = whole[time.astype(int)]
         if len(light) < 2 or light.mean() <= 0:
             continue
-        time = np.arange(len(light)) - (len(light) - 1) / 2
+        time -= time.mean()
         light = light / light.mean() - 1
         rises.append(float(time @ light / (time @ time)))
         weights.append(float(time @ time))

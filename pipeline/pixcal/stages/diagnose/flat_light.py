@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pixcal.estimators.detector.flat_ladder import LAMP, flicker, ladder, straight_line, warming
+from pixcal.estimators.detector.flat_ladder import LAMP, flicker, ladder, rise_of, straight_line
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.arrays import F64
 from pixcal.simulation.recording import Recording
@@ -43,12 +43,12 @@ class FlatLight:
             if np.isfinite(own).sum() >= SERIES:
                 frames[number] = own / np.nanmean(own)
                 frames[number][0] = np.nan
-        rise, of_rise = np.mean([warming(one) for one in evidence], axis=0)
         flickers, freedoms = zip(*map(flicker, evidence), strict=True)
         return cls(
             float(np.mean(flickers)),
             float(np.mean([LAMP if one is None else one.wander for one in found])),
-            (float(rise), float(of_rise)),
+            # Of all frames of a level: a part may have two of them.
+            rise_of(list(light.values())),
             all(one is not None for one in found),
             min(freedoms),
             frames,
