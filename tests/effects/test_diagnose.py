@@ -25,7 +25,7 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.stages import correct, diagnose, fit, ingest, reduce, simulate
-from pixcal.stages.diagnose import inquiry, look, stage, trial, windows
+from pixcal.stages.diagnose import inquiry, stage, trial, windows
 from pixcal.stages.diagnose.look import look_at
 from pixcal.stages.diagnose.windows import chosen_windows, frames_of_half, split, whole_of
 from pixcal_cli.main import invoke
@@ -69,8 +69,8 @@ def few_references(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(inquiry, "REFERENCES", 6)
 
 
-def diagnosed(run: Path, runtime: Runtime = SYNC, **options: Any) -> dict[str, Any]:
-    diagnose.run(run, diagnose.Config(**options), runtime)
+def diagnosed(run: Path, **options: Any) -> dict[str, Any]:
+    diagnose.run(run, diagnose.Config(**options), SYNC)
     found: dict[str, Any] = json.loads((run / "products" / "diagnosis.json").read_text())
     return found
 
@@ -323,7 +323,7 @@ def test_an_effect_of_the_users_own_is_found(reduced: Callable[..., Path], tmp_p
             hdus[0].data = np.round(frames).astype(np.uint16)
     ingest.run(raw, run, ingest.Config(), SYNC)
     reduce.run(run, reduce.Config(), SYNC)
-    found = diagnosed(run, Runtime("processes", 2), only=("flicker", "lag"), own=(file,))
+    found = diagnosed(run, only=("flicker", "lag"), own=(file,))
     assert [cause["effect"] for cause in found["causes"]] == ["flicker"]
     assert found["causes"][0]["parameters"]["size"] == pytest.approx(0.01, rel=0.05)
 
@@ -458,18 +458,6 @@ def test_few_frames_without_fringes_are_looked_at_in_more_pixels(shape: tuple[in
     for a, b in combinations((wide, *also), 2):
         assert any(p[0] >= q[1] or p[1] <= q[0] for p, q in zip(a, b, strict=True))
     assert chosen_windows(shape, 5000) == (plain, tried)
-
-
-@pytest.mark.parametrize(("frames", "memory_mib", "where"), [
-    (300, 2048, "processes"), (300, 1400, "local"), (20, 2048, "local")
-])  # fmt: skip
-def test_large_simulations_have_processes_where_the_memory_allows(
-    frames: int, memory_mib: int, where: str
-) -> None:
-    half = {f"fringes/{name}": tuple(range(frames)) for name in ("vertical", "horizontal")}
-    runtime = Runtime("local", 2, memory_mib << 20)
-    simulations, estimates, _ = look._memory(half, 128 * 128, runtime)
-    assert (simulations.cluster, estimates.cluster) == (where, "local")
 
 
 def test_detectors_of_few_enough_samples_are_looked_at_whole() -> None:

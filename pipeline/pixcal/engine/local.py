@@ -99,12 +99,6 @@ def _process_pool(workers: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(workers, get_context("spawn"), _begin_worker)
 
 
-def end_processes() -> None:
-    """Let the worker processes go: they keep their memory as long as they live."""
-    if _process_pool.cache_info().currsize:
-        _process_pool.cache_clear()
-
-
 def _begin_worker() -> None:
     # Ctrl-C reaches workers too; what to do about it is the business of the process they work for.
     signal.signal(signal.SIGINT, signal.SIG_IGN)

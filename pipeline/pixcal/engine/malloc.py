@@ -32,12 +32,6 @@ def keep_arrays() -> None:
     _mallopt(_ARENA_MAX, 1)
 
 
-def give_back() -> None:
-    """Give what is free back to the kernel, for other processes."""
-    with suppress(AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
-
-
 def _set(mmap: int, trim: int) -> None:
     """Sizes (bytes) from which arrays are mapped by themselves, and free memory goes back."""
     _mallopt(_MMAP_THRESHOLD, mmap)

@@ -32,8 +32,7 @@ class Runtime(Running):
     Attributes
     ----------
     cluster : str
-        ``local``, ``threads``, ``processes``, ``sync``, or the address ``tcp://…`` of a Dask
-        scheduler. ``local``: in threads, but for tasks that are Python for the most part.
+        ``threads``, ``processes``, ``sync``, or the address ``tcp://…`` of a Dask scheduler.
     workers : int
         Local threads or processes; 0 means as many as there are cores. On a Dask cluster, tasks
         that each of its workers does at the same time; 0 means as many as it has threads.
@@ -44,7 +43,7 @@ class Runtime(Running):
     """
 
     def __post_init__(self) -> None:
-        known = ("local", "threads", "processes", "sync")
+        known = ("threads", "processes", "sync")
         if self.cluster not in known and not self.remote:
             raise InputError(
                 f"--cluster {self.cluster}: not one of {', '.join(known)}, nor an address tcp://…"
@@ -66,12 +65,6 @@ class Runtime(Running):
     def here(self) -> "Runtime":
         """The same in this process, for what is too large to be sent about."""
         return self if self.cluster == "sync" else replace(self, cluster="threads")
-
-    @property
-    def apart(self) -> "Runtime":
-        """The same for tasks that would wait for each other's interpreter: in processes."""
-        own = self.cluster == "local" and self.n_workers > 1
-        return replace(self, cluster="processes") if own else self
 
     def with_workers(self, workers: int) -> "Runtime":
         """The same with another number of local workers, as a memory plan asks for."""
@@ -130,7 +123,7 @@ def run_tasks(
             )  # fmt: skip
         elif runtime.cluster == "processes":
             run_in_processes(function, items, runtime.n_workers, ended)
-        elif runtime.cluster in ("local", "threads") and len(items) > 1:
+        elif runtime.cluster == "threads" and len(items) > 1:
             run_in_threads(function, items, runtime.n_workers, ended)
         else:
             run_here(function, items, ended)

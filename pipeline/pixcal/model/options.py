@@ -44,10 +44,9 @@ class Running:
     """How a command runs; no result depends on it."""
 
     cluster: str = quantity(
-        "local",
-        metavar="local|threads|processes|sync|tcp://…",
-        doc="Run tasks here (local: in threads, large simulations of a diagnosis in processes), or "
-        "on the Dask cluster at this address.",
+        "threads",
+        metavar="threads|processes|sync|tcp://…",
+        doc="Run tasks here, or on the Dask cluster at this address.",
     )
     workers: int = quantity(0, low=0, high=4096, shown="all cores", doc="Number of parallel tasks.")
     memory: int = quantity(

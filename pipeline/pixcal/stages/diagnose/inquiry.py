@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from pixcal.engine.malloc import give_back
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.expectation import Reference, expect_nominal, expect_with
@@ -87,8 +86,6 @@ def inquire(
             candidate.reason = _needs(kinds[name], look.facts)
     estimates = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
     trials = Trials(look.windows, scratch, look.runtime, signatures, estimates, SCREEN)
-    if look.runtime.cluster == "processes":
-        give_back()
     (nominal,) = trials.curves([base], REFERENCES, "nominal bench")
     if isinstance(nominal, str):
         where = "--nominal" if base else f"{run_dir}: its nominal bench"

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pixcal.engine.plan import BASE_BYTES, Plan, make_plan
+from pixcal.engine.plan import Plan, make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.acquisition import Acquisition
@@ -27,8 +27,6 @@ from pixcal.storage.stage import read_acquisition, require
 EVIDENCE_BYTES = 34
 # a sample of bias, dark or flat: as it was read, in the run made of it, and as a real number
 CALIBRATION_BYTES = 12
-SIMULATION_BYTES = 24  # a simulation in a process of its own, for each sample of all fringe sets
-MANY = 2_000_000  # samples of a simulation from which it is worth starting processes
 LOOK_BYTES = 50  # what the statistics of one set need beside it, for each sample of the largest set
 ESTIMATE_BYTES = 130  # what the hungriest estimate, that of crosstalk, needs beside it
 FEWEST_FRAMES = 24  # fringe frames in each half
@@ -131,18 +129,13 @@ def _memory(half: Half, pixels: int, runtime: Runtime) -> tuple[Runtime, Runtime
     held = EVIDENCE_BYTES * evidence + CALIBRATION_BYTES * pixels * frames
     need, estimates = held + LOOK_BYTES * largest, ESTIMATE_BYTES * largest
     for_estimates = make_plan("diagnose", estimates, held, runtime)
-    few = runtime.with_workers(for_estimates.workers)
-    apart, beside = runtime.apart, held + estimates
-    if apart.cluster == "processes" and evidence >= MANY:
-        one = BASE_BYTES + SIMULATION_BYTES * evidence
-        if Plan(one, 0, apart.n_workers).total <= runtime.memory:
-            return apart, few, Plan(one, beside, apart.n_workers).total <= runtime.memory
     plan = make_plan("diagnose", need, 0, runtime)
     room = (
-        runtime.cluster in ("local", "threads")
+        runtime.cluster == "threads"
         and plan.workers > 1
-        and Plan(need, beside, plan.workers - 1).total <= runtime.memory
+        and Plan(need, held + estimates, plan.workers - 1).total <= runtime.memory
     )
+    few = runtime.with_workers(for_estimates.workers)
     return runtime.with_workers(plan.workers), few, room
 
 

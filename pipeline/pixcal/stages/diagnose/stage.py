@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 
 from pixcal.effects import known_effects, parse_effects
-from pixcal.engine.local import end_processes
 from pixcal.engine.malloc import keep_arrays
 from pixcal.engine.run import Runtime
 from pixcal.model.bench import load_bench
@@ -50,11 +49,7 @@ def _diagnose(
     """Write ``diagnosis.json`` and ``curves.json``."""
     made.scratch.mkdir(exist_ok=True)
     keep_arrays()
-    try:
-        own = inquire(run_dir, kinds, base, made.scratch, runtime)
-    finally:
-        if runtime.cluster == "local":
-            end_processes()
+    own = inquire(run_dir, kinds, base, made.scratch, runtime)
     diagnosis, curves = describe(
         own.found, own.data, own.look.measured, own.reference, own.look.facts, places(own)
     )

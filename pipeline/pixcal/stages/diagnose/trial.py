@@ -1,7 +1,6 @@
 """The bench taken again: simulations of the windows that are looked at, through the same stages."""
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -118,10 +117,8 @@ class Trials:
         if beside is None:
             results = run_tasks(work, moved, self.runtime, label=label)
         else:
-            with ThreadPoolExecutor(1) as here:
-                answer = here.submit(beside)
-                results = run_tasks(work, moved, self.runtime, label=label)
-                answer.result()
+            others: list[Callable[[], Any]] = [partial(work, item) for item in moved]
+            _, *results = run_tasks(_call, [beside, *others], self.runtime.here, label=label)
         # What is refused as moved may do as it was.
         again = [
             n
@@ -142,6 +139,10 @@ class Trials:
         """Statistics of a window by itself, of a bench that `curves` has simulated."""
         made = [self._made[frozenset(bench), seed] for seed in range(seeds)]
         return [r[number] for r in made if not isinstance(r, str)]
+
+
+def _call(task: Callable[[], Any]) -> Any:
+    return task()
 
 
 def _kept_or_made(
