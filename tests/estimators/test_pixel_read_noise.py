@@ -36,6 +36,26 @@ def test_variances_seen_again_scatter_as_those_that_were_measured(
     assert other == pytest.approx(one, rel=0.06)
 
 
+@pytest.mark.parametrize("count", [24, 40])
+@pytest.mark.parametrize("tail", [0.1, 0.3, 0.5])
+def test_a_heavy_tail_is_drawn_as_heavy(tail: float, count: int) -> None:
+    """As of amplifiers of pixels, some of which are much noisier."""
+    rng = np.random.default_rng(8)
+    shape = (131, 127)
+    sigma = 15 * (1 + rng.exponential(tail, shape)) * rng.lognormal(0, 0.1, shape)
+    stack = (sigma * rng.standard_normal((count, *shape))).astype(np.float32)
+    drawn = PixelNoise.of([stack], np.ones(shape, bool)).drawn(np.random.default_rng(3))
+    again = (drawn * rng.standard_normal((count, *shape))).std(axis=0, ddof=1)
+    seen = stack.std(axis=0, ddof=1)
+    for share, off in ((0.01, 0.025), (0.1, 0.015), (0.9, 0.015), (0.99, 0.03), (0.998, 0.06)):
+        one, other = (np.quantile(noise / np.median(noise), share) for noise in (seen, again))
+        assert other == pytest.approx(one, rel=off)
+    # Pixel by pixel as close as their own scatter lets know.
+    one, other, known = np.log(sigma).ravel(), np.log(drawn).ravel(), np.log(seen).ravel()
+    told = np.corrcoef(one, known)[0, 1]
+    assert np.corrcoef(one, other)[0, 1] > 0.9 * told**2
+
+
 def test_a_noisy_pixel_stays_noisy() -> None:
     stack = frames(0.1, 40)
     stack[:, 7, 11] *= 10

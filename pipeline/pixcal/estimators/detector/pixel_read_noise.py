@@ -2,8 +2,9 @@
 
 The variance of a pixel in n frames has a relative error of sqrt(2 / (n - 1)), often more than
 pixels differ by. What is drawn here has both the scatter that pixels truly have and the values
-that single pixels are seen to have, as far as they can be known: a draw from the posterior, the
-logarithm of the variance being normal with a few outliers.
+that single pixels are seen to have, as far as they can be known: a draw from the posterior. How
+pixels are distributed, with what tail, is found from all of them, as the likeliest distribution on
+a grid (Kiefer & Wolfowitz 1956, Ann. Math. Statist. 27, 887).
 """
 
 from collections.abc import Sequence
@@ -12,19 +13,22 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import digamma, polygamma
 
-from pixcal.model.arrays import F32, F64, Mask
+from pixcal.model.arrays import F32, F64, Indices, Mask
 
 FEWEST = 8  # frames that tell pixels apart
-OUTLIER = 4.0  # standard deviations of all pixels beyond which a pixel's own variance is believed
+OUTLIER = 4.0  # standard deviations of all pixels beyond which one does not count in their mean
+FINENESS, MOST = 4, 256  # points of the grid for each error of a logarithm, and of the whole grid
+TURNS = 300  # of expectation and maximisation
+BROAD = 0.01  # share of the distribution to begin with that is spread over the whole grid
 
 
 @dataclass(frozen=True)
 class PixelNoise:
     """Relative read noise of the pixels: what is known of it."""
 
-    # mean, scatter: (y, x) of the logarithm of the variance over its mean in the detector
-    mean: F64
-    scatter: F64
+    place: Indices  # (y, x) class of pixels of the same variance as seen, or -1 where not known
+    cumulative: F64  # (class, n) chances of true variances up to each of the grid
+    log: F64  # (n,) even grid of logarithms of the variance over its mean in the detector
     rounding: float = 0.0  # share of the variance that the converter's rounding adds
 
     @classmethod
@@ -39,27 +43,50 @@ class PixelNoise:
             rest = frames - frames.mean(axis=0)
             rest -= np.median(rest[:, good], axis=1)[:, None, None]
             squares += np.einsum("tyx,tyx->yx", rest, rest, dtype=float)
-        variance = np.maximum(squares / freedom, 1e-12)
+        seen = np.log(np.maximum(squares / freedom, 1e-12)[good])
         half = freedom / 2
         # A variance of normal samples, about its true value, in logarithms.
-        log = np.log(variance) - (digamma(half) - np.log(half))
-        error = float(polygamma(1, half))
-        middle = float(np.median(log[good]))
-        seen = (1.4826 * float(np.median(np.abs(log[good] - middle)))) ** 2
-        true = max(seen - error, 0.0)
-        # Most pixels are as the population is; those far from it are as they were seen.
-        far = np.abs(log - middle) > OUTLIER * np.sqrt(max(seen, error))
-        share = np.where(far, 1.0, true / (true + error))
-        mean = share * (log - middle)
-        scatter = np.sqrt(np.where(far, error, share * error))
-        mean = np.where(good, mean, 0.0)
-        ordinary = good & ~far
-        if ordinary.any():
-            mean = mean - np.log(np.mean(np.exp(mean + scatter**2 / 2)[ordinary]))
-        return cls(mean, np.where(good, scatter, 0.0), rounding)
+        bias, error = float(digamma(half) - np.log(half)), float(polygamma(1, half))
+        middle = float(np.median(seen))
+        seen -= middle
+        spread = (1.4826 * float(np.median(np.abs(seen)))) ** 2
+        step = max(np.sqrt(error) / FINENESS, float(np.ptp(seen)) / (MOST - 3))
+        log = np.arange(np.floor(seen.min() / step) - 1, np.ceil(seen.max() / step) + 2) * step
+        cells = np.rint((seen - log[0]) / step).astype(int)
+        # Of a class the logarithm as seen is that of the grid.
+        ratio = log[:, None] - log
+        chance = np.exp(half * (ratio + 1 - np.exp(ratio)))
+        true = max(spread - error, (step / 3) ** 2)
+        start = np.exp(-0.5 * (log + bias) ** 2 / true)
+        start = (1 - BROAD) * start / start.sum() + BROAD / len(log)
+        posterior = chance * _likeliest(chance, np.bincount(cells, minlength=len(log)), start)
+        posterior /= posterior.sum(axis=1, keepdims=True)
+        ordinary = np.abs(seen) <= OUTLIER * np.sqrt(max(spread, error))
+        mean = float(np.mean((posterior @ np.exp(log))[cells[ordinary]]))
+        place = np.full(good.shape, -1)
+        place[good] = cells
+        return cls(place, np.cumsum(posterior, axis=1), log - np.log(mean), rounding)
 
     def drawn(self, rng: np.random.Generator) -> F32:
         """Read noise (y, x) before rounding of every pixel over the detector's."""
-        log = self.mean + self.scatter * rng.standard_normal(self.mean.shape)
+        known = self.place >= 0
+        own, n = self.place[known], len(self.log)
+        chance, within = rng.random((2, *self.place.shape))
+        # One search in all distributions, one after the other.
+        order = (self.cumulative + np.arange(len(self.cumulative))[:, None]).ravel()
+        index = np.clip(np.searchsorted(order, own + chance[known]) - own * n, 0, n - 1)
+        log = np.zeros(self.place.shape)
+        log[known] = self.log[index] + (within[known] - 0.5) * (self.log[1] - self.log[0])
         before = (np.exp(log) - self.rounding) / (1 - self.rounding)
         return np.sqrt(np.maximum(before, 0)).astype(np.float32)
+
+
+def _likeliest(chance: F64, count: Indices, start: F64) -> F64:
+    """Distribution (n,) of true values for which as many (class,) are seen, of chances (class, n).
+
+    By expectation and maximisation, from a start.
+    """
+    found = start
+    for _ in range(TURNS):
+        found = found * (chance.T @ (count / np.maximum(chance @ found, 1e-300))) / count.sum()
+    return np.asarray(found)
