@@ -11,6 +11,7 @@ from pixcal.kernels.photon_transfer import (
     LAGS,
     N_BINS,
     SHARED,
+    WithNeighbours,
     add_neighbours,
     bin_pairs,
     pair_statistics,
@@ -58,11 +59,11 @@ def measure_shared(
     dark = pairs(np.zeros_like(scenes[0]))
     variance = dark[:, 2].sum() / dark[:, 0].sum()
     lit = np.asarray(sum(pairs(scene) for scene in scenes))
-    sums, added = add_neighbours(lit, dark) if neighbours else (lit[:, :3], {})
+    shared = add_neighbours(lit, dark) if neighbours else WithNeighbours(lit[:, :3])
     error = variance * np.sqrt(2 / dark[:, 0].sum())
-    fitted = fit_gain(sums, (variance, error), np.inf)
+    fitted = fit_gain(shared.sums, (variance, error), np.inf, common=shared.error)
     assert fitted is not None
-    return fitted, added
+    return fitted, shared.lags
 
 
 def flats(shape: tuple[int, int], levels: tuple[float, ...]) -> list[F64]:
@@ -95,6 +96,15 @@ def test_charge_that_neighbours_share_does_not_bias_the_gain(share: list[list[fl
     assert fitted.error < 0.01 * GAIN
     biased = measure_shared(scenes, np.array(share), 10, neighbours=False)[0]
     assert biased.gain > 1.05 * GAIN
+
+
+@pytest.mark.parametrize("coupling", [0.0, 0.01])
+def test_points_scatter_about_the_curve_by_their_noise(coupling: float) -> None:
+    """What is not known of the noise that neighbours share is common to all points."""
+    share = coupling * np.array([[0, 1, 0], [1, -4, 1], [0, 1, 0]]) + np.pad([[1]], 1)
+    uneven = np.broadcast_to(np.linspace(5e3, 4e4, 813), (701, 813))
+    fitted, _ = measure_shared([uneven, uneven], share, 12)
+    assert 0.5 < fitted.chi2_reduced < 1.6
 
 
 def deflected(rng: np.random.Generator, level: float, push: F64, shape: tuple[int, int]) -> F64:
@@ -133,8 +143,8 @@ def test_noise_shared_below_notice_is_in_the_gain_or_in_its_error(
         return bin_pairs(pair_statistics(first, second, gain=1.5, read_noise=3.0, quantum=1.0))
 
     for _ in range(12):
-        sums, _ = add_neighbours(pairs(3e4) + pairs(3e4), pairs(0.0))
-        fitted = fit_gain(sums, (READ_ADU**2, 0.1), np.inf)
+        shared = add_neighbours(pairs(3e4) + pairs(3e4), pairs(0.0))
+        fitted = fit_gain(shared.sums, (READ_ADU**2, 0.1), np.inf, common=shared.error)
         assert fitted is not None
         off.append(fitted.gain / GAIN - 1)
         pulls.append((fitted.gain - GAIN) / fitted.error)
@@ -156,9 +166,9 @@ def test_a_lamp_that_flickers_by_rows_is_no_charge_that_neighbours_share() -> No
         )
 
     lit = np.asarray(sum(pairs(level) for level in (1e4, 2e4, 4e4)))
-    sums, added = add_neighbours(lit, pairs(0.0))
-    assert list(added) == [(0, 0)]
-    assert (sums == lit[:, :3]).all()
+    found = add_neighbours(lit, pairs(0.0))
+    assert list(found.lags) == [(0, 0)]
+    assert (found.sums == lit[:, :3]).all()
 
 
 @pytest.mark.parametrize("rows", [0.0, 3.0])

@@ -65,6 +65,7 @@ def fit_gain(
     *,
     level_error: float = 0.0,
     uneven: float = 0.0,
+    common: float = 0.0,
     straight: bool = False,
 ) -> GainFit | None:
     """Fit the curve through the points of variance against level, from the read noise on.
@@ -74,22 +75,28 @@ def fit_gain(
 
     Parameters
     ----------
-    sums : (N_BINS, 3) from `photon_transfer.add_neighbours`
+    sums : (N_BINS, 3) of `photon_transfer.WithNeighbours`
     read_variance : variance at level zero and its error, ADU²
     highest : highest level to use, ADU
     level_error : by which all levels may be too high or too low, ADU: the bias wanders
     uneven : spectral density at low frequency of the converter's deviation from its mean line,
         ADU³: with noise of sigma the local slope varies by rms ``sqrt(uneven / (4 sqrt(pi)
         sigma³))``, and the variance by twice that
+    common : relative error of the noise at all levels alike
     straight : fit a line only: within few flats the level changes from place to place, as the
         amplifiers do
     """
-    whole = _fit_range(sums, read_variance, highest, level_error, uneven, straight)
+
+    def fit(highest: float) -> GainFit | None:
+        found = _fit_range(sums, read_variance, highest, level_error, uneven, straight)
+        return found and replace(found, error=math.hypot(found.error, common * found.gain))
+
+    whole = fit(highest)
     if whole is None or straight or whole.chance > _OFF_CURVE:
         return whole
     best, top = whole, whole.levels[1] / _SHORTER
     while np.count_nonzero((sums[:, 1] > 0) & (sums[:, 1] <= top * sums[:, 0])) >= _SPARE:
-        found = _fit_range(sums, read_variance, top, level_error, uneven, straight)
+        found = fit(top)
         if found is not None and found.chance > _OFF_CURVE and found.error < best.error:
             best = replace(found, step=True)
         top /= _SHORTER

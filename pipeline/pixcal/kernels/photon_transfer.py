@@ -14,7 +14,7 @@ measured as far as `REACH` and added as far as they are likely.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
@@ -177,6 +177,17 @@ def neighbour_noise(frames: F32, lags: Sequence[tuple[int, int]]) -> float:
 
 
 @dataclass(frozen=True)
+class WithNeighbours:
+    """Noise of pixels with that which they share with their neighbours."""
+
+    sums: F64  # (N_BINS, 3) degrees of freedom, level and variance, as of `bin_pairs`
+    lags: dict[tuple[int, int], float] = field(default_factory=dict)  # (y, x), and significance
+    # of the shot noise, relative, and so of the gain, at all levels alike: what may be shared
+    # beyond what was added, or not be
+    error: float = 0.0
+
+
+@dataclass(frozen=True)
 class SharedNoise:
     """What covariances of neighbours may be, over the shot noise, before they are measured.
 
@@ -223,23 +234,21 @@ class SharedNoise:
 SHARED_NOISE = SharedNoise()
 
 
-def add_neighbours(
-    lit: F64, dark: F64, expected: SharedNoise = SHARED_NOISE
-) -> tuple[F64, dict[tuple[int, int], float]]:
-    """Noise with that which neighbours share, (N_BINS, 3), and the lags (y, x) it came from.
+def add_neighbours(lit: F64, dark: F64, expected: SharedNoise = SHARED_NOISE) -> WithNeighbours:
+    """Noise with that which neighbours share.
 
     Covariances beyond those without light are added to the variance of the pixel itself, twice for
     the two neighbours. Each is too noisy to be told by itself: all lags together say how much of
-    them is likely, and what remains unknown is in the degrees of freedom. Lags that count for more
-    than half come with their significance: one below `SHARED` may be there by chance. The lag is
-    (0, 0) alone where all pixels share noise. ``lit`` and ``dark`` are from `bin_pairs`, of flats
-    and of frames without light.
+    them is likely. The noise of what is added is in the degrees of freedom. Lags that count for
+    more than half come with their significance: one below `SHARED` may be there by chance. The lag
+    is (0, 0) alone where all pixels share noise. ``lit`` and ``dark`` are from `bin_pairs`, of
+    flats and of frames without light.
     """
     sums = lit[:, :3].copy()
     used = np.flatnonzero((lit[:, 0] > 0) & (lit[:, 1] > 0))
     without = dark.sum(axis=0)
     if not len(used) or not without[0] > 0:
-        return sums, {}
+        return WithNeighbours(sums)
     none = without / without[0]
     dof = lit[used, 0]
     level, variance = (lit[used, 1:3] / dof[:, None]).T
@@ -251,15 +260,18 @@ def add_neighbours(
     )
     shared, shot = weight @ beyond, float(weight @ (variance - none[2]))
     if shared.min() > _EVERYWHERE * shared.max() and shared.min() > SHARED * error:
-        return sums, {(0, 0): float(shared.min() / error)}
+        return WithNeighbours(sums, {(0, 0): float(shared.min() / error)})
     if not shot > 0:
-        return sums, {}
-    counted, unknown = expected.total(shared / shot, error / shot / _PAIRED)
+        return WithNeighbours(sums)
+    noise = error / shot
+    counted, unknown = expected.total(shared / shot, noise / _PAIRED)
+    of_added = float((counted**2).sum())
     sums[used, 2] += dof * (beyond @ counted)
-    sums[used] /= 1 + unknown / (2 * (error / shot) ** 2)
+    sums[used] /= 1 + of_added / 2
     errors = np.abs(shared) * _PAIRED / error
-    return sums, {
+    lags = {
         (y, x): float(e)
         for (y, x), e, times in zip(LAGS.tolist(), errors, counted, strict=True)
         if times > 1
     }
+    return WithNeighbours(sums, lags, math.sqrt(max(unknown - of_added * noise**2, 0.0)))

@@ -104,7 +104,7 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     levels, usable = _rungs(tables, job)
     sums = pair_sums(folder, job)
     # Pixels that are full saturate the flats though no sample of the converter does.
-    points = transfer_points(add_neighbours(sums[1], sums[0])[0])
+    points = transfer_points(add_neighbours(sums[1], sums[0]).sums)
     well = saturation(points)
     full = usable & (levels > (sum(well) if well else math.inf))
     usable &= ~full
@@ -172,23 +172,24 @@ def _gain(
     # Noise of less than half a code is rounded up or down by where its level lies.
     smooth = lit[:, 2:3] > _SMOOTH * job.quantum**2 * lit[:, :1]
     lit = np.where(smooth, lit, 0.0) if smooth.any() else lit
-    shared, added = add_neighbours(lit, dark)
+    shared = add_neighbours(lit, dark)
     fitted = fit_gain(
-        shared,
+        shared.sums,
         (variance, 2 * noise * error),
         highest,
         level_error=wander,
         uneven=uneven,
+        common=shared.error,
         straight=len(job.flat) < LADDER,
     )
     if fitted is None or not fitted.error < _GAIN_ERROR * fitted.gain:
         return None
-    everywhere = (0, 0) in added
+    everywhere = (0, 0) in shared.lags
     at_zero, of_zero = fitted.read_variance
     return replace(
         fitted,
         read_variance=(at_zero + lost, of_zero),
-        neighbours={} if everywhere else added,
+        neighbours={} if everywhere else shared.lags,
         uneven=everywhere,
     )
 
