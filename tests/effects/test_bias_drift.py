@@ -198,12 +198,15 @@ def test_a_settling_is_found(
     acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench]
 ) -> None:
     effect = BiasDrift(0.2, 0.0, 0.0, 8.0, 3.0)
-    found = BiasDrift.estimate(in_the_dark(acquired(), make_effect_bench(), effect))
+    evidence = in_the_dark(acquired(), make_effect_bench(), effect)
+    found = BiasDrift.estimate(evidence)
     assert found is not None
     assert isinstance(found.effect, BiasDrift)
     assert abs(found.effect.settle_e - 8) < 4 * found.errors["settle_e"] < 4
     assert abs(found.effect.settle_s - 3) < 4 * found.errors["settle_s"] < 3
     assert found.significance > 5
+    # By time constants that are not refined.
+    assert BiasDrift.detect(evidence) == pytest.approx(found.significance, rel=0.1)
 
 
 def test_row_and_column_noise_is_not_taken_for_it(
@@ -272,6 +275,7 @@ def test_a_walk_of_the_fringe_runs_alone_is_found(acquired: Callable[..., Eviden
     assert found is not None
     assert isinstance(found.effect, BiasDrift)
     assert found.significance > 8
+    assert BiasDrift.detect(evidence) == pytest.approx(found.significance)
     # Of two runs a walk shows its size in few modes.
     assert found.effect.run_walk_e_h == pytest.approx(600, rel=0.5)
     assert found.effect.walk_e_h == 0

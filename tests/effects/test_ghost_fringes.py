@@ -109,10 +109,12 @@ def test_it_is_found_with_its_parent(
     acquired: Callable[..., Evidence], parent: str, share: float, in_flats: bool
 ) -> None:
     on = {"share": share, "phase_rad": 1.0, "parent": parent, "in_flats": in_flats}
-    found = GhostFringes.estimate(acquired(None, {"ghost_fringes": on}))
+    evidence = acquired(None, {"ghost_fringes": on})
+    found = GhostFringes.estimate(evidence)
     assert found is not None
     assert isinstance(found.effect, GhostFringes)
     assert found.effect.in_flats == in_flats
+    assert GhostFringes.detect(evidence) == pytest.approx(found.significance)
     assert found.significance > 5
     wave = np.exp(1j)
     wanted = {
