@@ -182,8 +182,8 @@ class WithNeighbours:
 
     sums: F64  # (N_BINS, 3) degrees of freedom, level and variance, as of `bin_pairs`
     lags: dict[tuple[int, int], float] = field(default_factory=dict)  # (y, x), and significance
-    # of the shot noise, relative, and so of the gain, at all levels alike: what may be shared
-    # beyond what was added, or not be
+    # relative error of the shot noise, and so of the gain, common to all levels: neighbours may
+    # share more or less than was added
     error: float = 0.0
 
 

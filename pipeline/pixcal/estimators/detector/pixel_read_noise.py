@@ -17,8 +17,8 @@ from pixcal.model.arrays import F32, F64, Indices, Mask
 
 FEWEST = 8  # frames that tell pixels apart
 OUTLIER = 4.0  # standard deviations of all pixels beyond which one does not count in their mean
-FINENESS, MOST = 4, 256  # points of the grid for each error of a logarithm, and of the whole grid
-TURNS = 300  # of expectation and maximisation
+FINENESS, MOST = 4, 256  # points of the grid: for each error of a logarithm, and at most
+STEPS = 300  # of expectation maximisation
 BROAD = 0.01  # share of the distribution to begin with that is spread over the whole grid
 
 
@@ -26,9 +26,9 @@ BROAD = 0.01  # share of the distribution to begin with that is spread over the 
 class PixelNoise:
     """Relative read noise of the pixels: what is known of it."""
 
-    place: Indices  # (y, x) class of pixels of the same variance as seen, or -1 where not known
-    cumulative: F64  # (class, n) chances of true variances up to each of the grid
-    log: F64  # (n,) even grid of logarithms of the variance over its mean in the detector
+    bin: Indices  # (y, x) bin of the measured variance; -1 in masked pixels
+    cumulative: F64  # (bin, n) cumulative posterior probability on the grid of true variances
+    log: F64  # (n,) that grid: logarithm of the variance over its mean, in equal steps
     rounding: float = 0.0  # share of the variance that the converter's rounding adds
 
     @classmethod
@@ -52,41 +52,41 @@ class PixelNoise:
         spread = (1.4826 * float(np.median(np.abs(seen)))) ** 2
         step = max(np.sqrt(error) / FINENESS, float(np.ptp(seen)) / (MOST - 3))
         log = np.arange(np.floor(seen.min() / step) - 1, np.ceil(seen.max() / step) + 2) * step
-        cells = np.rint((seen - log[0]) / step).astype(int)
-        # Of a class the logarithm as seen is that of the grid.
+        # The bins of measured variances lie about the points of the grid.
+        bins = np.rint((seen - log[0]) / step).astype(int)
         ratio = log[:, None] - log
         chance = np.exp(half * (ratio + 1 - np.exp(ratio)))
         true = max(spread - error, (step / 3) ** 2)
         start = np.exp(-0.5 * (log + bias) ** 2 / true)
         start = (1 - BROAD) * start / start.sum() + BROAD / len(log)
-        posterior = chance * _likeliest(chance, np.bincount(cells, minlength=len(log)), start)
+        posterior = chance * _likeliest(chance, np.bincount(bins, minlength=len(log)), start)
         posterior /= posterior.sum(axis=1, keepdims=True)
         ordinary = np.abs(seen) <= OUTLIER * np.sqrt(max(spread, error))
-        mean = float(np.mean((posterior @ np.exp(log))[cells[ordinary]]))
-        place = np.full(good.shape, -1)
-        place[good] = cells
-        return cls(place, np.cumsum(posterior, axis=1), log - np.log(mean), rounding)
+        mean = float(np.mean((posterior @ np.exp(log))[bins[ordinary]]))
+        binned = np.full(good.shape, -1)
+        binned[good] = bins
+        return cls(binned, np.cumsum(posterior, axis=1), log - np.log(mean), rounding)
 
     def drawn(self, rng: np.random.Generator) -> F32:
         """Read noise (y, x) before rounding of every pixel over the detector's."""
-        known = self.place >= 0
-        own, n = self.place[known], len(self.log)
-        chance, within = rng.random((2, *self.place.shape))
+        known = self.bin >= 0
+        own, n = self.bin[known], len(self.log)
+        chance, within = rng.random((2, *self.bin.shape))
         # One search in all distributions, one after the other.
         order = (self.cumulative + np.arange(len(self.cumulative))[:, None]).ravel()
         index = np.clip(np.searchsorted(order, own + chance[known]) - own * n, 0, n - 1)
-        log = np.zeros(self.place.shape)
+        log = np.zeros(self.bin.shape)
         log[known] = self.log[index] + (within[known] - 0.5) * (self.log[1] - self.log[0])
         before = (np.exp(log) - self.rounding) / (1 - self.rounding)
         return np.sqrt(np.maximum(before, 0)).astype(np.float32)
 
 
 def _likeliest(chance: F64, count: Indices, start: F64) -> F64:
-    """Distribution (n,) of true values for which as many (class,) are seen, of chances (class, n).
+    """Distribution (n,) of true values that makes the counts (bin,) likeliest.
 
-    By expectation and maximisation, from a start.
+    By expectation maximisation from a start; ``chance``: (bin, n) likelihood of each true value.
     """
     found = start
-    for _ in range(TURNS):
+    for _ in range(STEPS):
         found = found * (chance.T @ (count / np.maximum(chance @ found, 1e-300))) / count.sum()
     return np.asarray(found)
