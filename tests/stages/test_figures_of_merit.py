@@ -98,8 +98,10 @@ def test_few_levels_one_of_full_pixels_give_the_gain_beside_an_overscan(tmp_path
     acquisition = write_camera(tmp_path / "acq", (500, 6000, 11000), overscan=14)
     reduced = pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run"))
     gain = reduced.reduction["figures_of_merit"]["conversion_gain"]
-    assert abs(gain["value"] - GAIN) < 4 * gain["error"] < 0.04 * GAIN
-    assert reduced.reduction["gain_e_per_adu"]["chi2_reduced"] < 2
+    # Two levels leave one degree of freedom, whose scatter is in the error; of so few samples the
+    # noise that neighbours may share is known to 0.8 %.
+    assert abs(gain["value"] - GAIN) < 3 * gain["error"] < 0.06 * GAIN
+    assert reduced.reduction["gain_e_per_adu"]["chi2_reduced"] < 10
     mask = np.asarray(reduced.detector["mask"])
     assert (mask[:, :14] != 0).all()
     assert (mask[:, 14:] != 0).mean() < 1e-4
