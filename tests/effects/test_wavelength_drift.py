@@ -122,6 +122,31 @@ def test_what_looks_like_it_is_not_taken_for_it(acquired: Acquired, alike: dict[
     assert found.significance < 4
 
 
+def of_one_set(name: str, axis: str, end: float) -> dict[str, Any]:
+    """Fringe vectors of one set that move evenly along an axis, to an end (rad/px)."""
+    course = {"set": name, "time_s": [0.0, 41.86], "value": [0.0, end]}
+    return {"fringe_drift": STILL | {f"along_{axis}": [course]}}
+
+
+@pytest.mark.quick(1)
+@pytest.mark.parametrize(
+    ("effects", "refused"),
+    [
+        # The other set moved by as much along the same axis is a motion of the fibres.
+        (of_one_set("vertical", "x", 1e-4), True),
+        (drift(ramp=1e-2) | {"fringe_drift": STILL | {"ramp": [1e-2, -5e-3]}}, False),
+        (of_one_set("horizontal", "y", -1e-4), True),
+        (drift(ramp=1e-2), False),
+    ],
+)
+def test_sets_that_move_each_by_itself_are_no_change_of_the_wavelength(
+    acquired: Acquired, effects: dict[str, Any], refused: bool
+) -> None:
+    found = WavelengthDrift.estimate(acquired(None, effects))
+    assert found is not None
+    assert ("disagree" in found.refused) == refused
+
+
 @pytest.mark.long
 def test_with_one_direction_of_fringes_what_exceeds_the_motion_across_counts(
     acquired: Acquired,

@@ -10,12 +10,14 @@ from pixcal.estimators.frame_series.fringe_motion import Hop, Motion, colour_of,
 from pixcal.estimators.frame_series.hopping import Hopping, find_hopping, scatter_of
 from pixcal.kernels import optics
 from pixcal.kernels.scene import FrameStates, geometry
+from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.frame_fit import detect_in_frames, fit_frames
 from pixcal.simulation.recording import Recording
 
 HOUR_S = 3600.0
+SETS_DIFFER = "fringe sets disagree: a wavelength changes all fringe vectors by the same share"
 # scatter about two levels, over that from frame to frame, up to which there are no more
 LEVEL = 1.5
 CALM = 2.0  # errors of a walk up to which the levels hold still
@@ -93,9 +95,9 @@ class WavelengthDrift(Effect):
             values, hop_errors = _hops(motion, jumps, walks=walks)
             effect, errors = replace(effect, **values), errors | hop_errors
         significance = max(slow.significance, _sharpest(motion))
-        return Estimate(
-            effect, errors, significance, slow.why, {**slow.details, "hops": len(jumps)}
-        )
+        details = {**slow.details, "hops": len(jumps), "sets_differ_sigmas": slow.sets_differ}
+        refused = SETS_DIFFER if slow.sets_differ > SIGNIFICANT else ""
+        return Estimate(effect, errors, significance, slow.why, details, refused=refused)
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:

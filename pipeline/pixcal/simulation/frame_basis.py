@@ -102,14 +102,22 @@ class FrameBasis:
         shapes: Mapping[str, float],
         start: Components | None = None,
         steps: int = MAX_STEPS,
+        *,
+        by_set: bool = False,
     ) -> Components:
         """Sizes of strengths: the random ones come first in ``size``, the steady ones in ``beta``.
 
         Shape parameters are by the field of the strength; the rest is as of `estimate_components`.
+        With ``by_set`` there follow in ``beta`` the departures of each later set from the first.
         """
         own = [(s.steady, self.own(s, shapes.get(s.field))) for s in strengths]
         parts = [*(v for steady, v in own if not steady), *self._nuisances.values()]
         known = [v for steady, v in own if steady]
+        if by_set:
+            later = [n for n, w in enumerate(self.every) if w.recording is not None][1:]
+            known += [
+                [w * (n == one) for n, w in enumerate(v)] for v in list(known) for one in later
+            ]
         modes = assemble(
             [w.series for w in self.every],
             lambda s: np.stack([part[self._number[id(s)]] for part in parts]),

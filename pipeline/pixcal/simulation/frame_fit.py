@@ -47,6 +47,8 @@ class FrameFit:
     significance: float
     why: str
     details: dict[str, float]  # standard deviations by which each field is there
+    # standard deviations by which each set has strengths of its own, of those that are steady
+    sets_differ: float = -np.inf
 
 
 def fit_frames(
@@ -74,6 +76,7 @@ def fit_frames(
         f"changes of {' and '.join(told)} from frame to frame, the same in two halves of the "
         f"pixels{ALIKE if False in kinds and not changes.crossed else ''}",
         {f"{field}_sigmas": sigmas(chance) for field, chance in found.chances.items()},
+        fit.sets_differ(),
     )
 
 
@@ -195,6 +198,20 @@ class _Fit:
             errors[s.key] = float(np.hypot(error, np.linalg.norm(owed)))
             model = with_numbers(model, {s.key: self._value(s, found)})
         return model, {key: error for key, error in errors.items() if error > 0}
+
+    def sets_differ(self) -> float:
+        """Standard deviations by which sets have steady strengths of their own."""
+        steady, sets = (
+            sum(s.steady for s in self.taken),
+            sum(w.recording is not None for w in self.basis.every),
+        )
+        if not steady or sets < 2:
+            return -np.inf
+        together, apart = (
+            self.basis.components(self.taken, self.shapes, by_set=own) for own in (False, True)
+        )
+        more = steady * (sets - 1)
+        return sigmas(log_chance(apart.profile - together.profile, (more + 1) // 2))
 
     def _place(self, of: Strength) -> int:
         return [s for s in self.taken if s.steady == of.steady].index(of)

@@ -6,6 +6,7 @@ frame's own phase takes up.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -52,6 +53,13 @@ def profile(share: Sequence[float] | F64, rows: F64) -> F64:
     return np.asarray(make_interp_spline(at, np.array(share), k=min(3, len(share) - 1))(rows))
 
 
+@cache
+def _terms(rows: int) -> F64:
+    """What a profile is at so many rows (y, KNOTS) for a unit at each of its knots; mean zero."""
+    terms = profile(np.eye(KNOTS), np.linspace(0, 1, rows))
+    return np.asarray(terms - terms.mean(axis=0))
+
+
 def find_settling(sets: Sequence[RowSums]) -> Settling:
     """The likeliest profile, of the last step or the next, along either way around the turn."""
     origins = [None, *(2 * np.pi * n / ORIGINS for n in range(ORIGINS))]
@@ -81,9 +89,7 @@ def _fit(sets: Sequence[RowSums], way: int, origin: float | None) -> tuple[float
         # Of B, A cos phi and A sin phi, what a turn of the phase does, times the step.
         other = step[:, None] * np.stack([np.zeros(len(step)), -sine, cosine], axis=1)
         own, vector = sums.share(other[sums.inside])
-        at = np.linspace(0, 1, len(vector))
-        terms = np.stack([profile(unit, at) for unit in np.eye(KNOTS)], axis=1)
-        terms -= terms.mean(axis=0)
+        terms = _terms(len(vector))
         normal += terms.T @ own @ terms
         right += terms.T @ vector
         if np.any(f.dk):

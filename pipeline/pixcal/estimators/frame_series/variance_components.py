@@ -168,13 +168,13 @@ class _State:
         covariance = (size @ modes.flat).reshape(modes.parts.shape[1:])
         root = np.linalg.cholesky(covariance)
         inverse = np.linalg.inv(root)
-        self.weight = np.einsum("nba,nbc->nac", inverse, inverse)
-        self.weighted = np.einsum("nab,nbp->nap", self.weight, modes.known)
+        self.weight = inverse.swapaxes(1, 2) @ inverse
+        self.weighted = self.weight @ modes.known
         normal = np.tensordot(modes.known, self.weighted, axes=((0, 1), (0, 1)))
         self.spread = inverse_normal(normal)
-        self.beta = self.spread @ np.einsum("nap,na->p", self.weighted, modes.values)
-        rest = modes.values - np.einsum("nap,p->na", modes.known, self.beta)
-        self.pull = np.einsum("nab,nb->na", self.weight, rest)
+        self.beta = self.spread @ np.tensordot(self.weighted, modes.values, ((0, 1), (0, 1)))
+        rest = modes.values - modes.known @ self.beta
+        self.pull = (self.weight @ rest[:, :, None])[:, :, 0]
         log_determinant = 2 * np.log(np.einsum("naa->na", root)).sum()
         square = float(log_determinant + np.einsum("na,na->", rest, self.pull))
         self.profile = -0.5 * modes.share * square
@@ -190,11 +190,14 @@ class _State:
 
     def average_information(self) -> F64:
         """Mean (m, m) of Fisher's information and of the curvature of the log-likelihood."""
-        pulled = np.einsum("mnab,nb->mna", self.modes.parts, self.pull)
-        flat = pulled.reshape(len(pulled), -1)
-        weighed = np.einsum("nab,mnb->mna", self.weight, pulled).reshape(len(pulled), -1)
-        known = flat @ self.weighted.reshape(flat.shape[1], -1)
-        return np.asarray(self.modes.share * (flat @ weighed.T - known @ self.spread @ known.T) / 2)
+        # Channel by channel: einsum is slow over axes this short.
+        parts, each = self.modes.by_channel, range(len(self.modes.by_channel))
+        pull, weight = self.pull.T, self.weight.transpose(1, 2, 0)
+        pulled = [sum(parts[a, b] * pull[b] for b in each) for a in each]
+        weighed = [sum(weight[a, b] * pulled[b] for b in each) for a in each]
+        known = sum(pulled[a] @ self.weighted[:, a] for a in each)
+        fisher = sum(pulled[a] @ weighed[a].T for a in each)
+        return np.asarray(self.modes.share * (fisher - known @ self.spread @ known.T) / 2)
 
     def information(self) -> F64:
         """Fisher's information of the sizes (m, m)."""
