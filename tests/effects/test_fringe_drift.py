@@ -63,10 +63,12 @@ def test_what_is_not_random_is_told_for_a_fit_that_holds_the_vector(
     ],
 )
 def test_its_parameters_are_found(acquired: Acquired, parameters: dict[str, Any]) -> None:
-    found = FringeDrift.estimate(acquired(None, {"fringe_drift": OFF | parameters}))
+    evidence = acquired(None, {"fringe_drift": OFF | parameters})
+    found = FringeDrift.estimate(evidence)
     assert found is not None
     assert isinstance(found.effect, FringeDrift)
     assert found.significance > 6
+    assert FringeDrift.detect(evidence) == pytest.approx(found.significance, rel=0.01)
     for name, truth in (OFF | parameters).items():
         for axis, value in enumerate(truth if isinstance(truth, list) else [truth]):
             key = f"{name}[{axis}]" if isinstance(truth, list) else name

@@ -56,6 +56,8 @@ PATTERNS: Mapping[str, Mapping[int, float]] = {
     "mimic": {0: 1.0, 1: 0.5, 4: 1.0},
     "unknown": {2: 1.0, 3: 1.0, 4: 1.0, 5: 1.0, 1: 1.0},
     "little": {5: 1.0},
+    "more": {4: 1.0, 5: 1.0},
+    "left, measured": {0: 1.0, 1: 0.5, 5: 10.0},
     **{f"single {row}": {row: 1.0} for row in range(len(KEYS))},
 }
 SINGLE = tuple(f"single {row}" for row in range(len(KEYS)))
@@ -409,6 +411,24 @@ def test_a_replay_is_taken_whose_law_is_without_promise() -> None:
     assert found.accepted[0] == "left"
     assert found.final.effects[0] == wrong.replay
     assert left < 0.05
+
+
+@pytest.mark.parametrize(
+    ("companion", "accepted"), [("little", ("left",)), ("more", ("more", "left"))]
+)
+def test_a_second_cause_needs_what_the_first_one_as_measured_does_not_bring_about(
+    companion: str, accepted: tuple[str, ...]
+) -> None:
+    truth = {"left": 0.003, companion: 0.03}
+    left = replace(candidate("left", 0.003), replay=Toy("left, measured", 0.003))
+    object.__setattr__(left.replay, "name", "left")
+    found, gap = search(truth, [left, candidate(companion, 0.03)])
+    assert found.accepted == accepted
+    assert gap < 0.05
+    if accepted == ("left",):
+        assert found.candidates["left"].alone is not None
+        assert found.final.effects == (left.replay,)
+        assert "left, as measured frame by frame" in found.candidates[companion].reason
 
 
 def test_a_candidate_that_other_seeds_refuse_is_told_so() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.profiled import Profiled, best_shape
+from pixcal.estimators.frame_series.profiled import HALVINGS, Profiled, best_shape
 from pixcal.estimators.frame_series.spectral_line import Line
 from pixcal.estimators.frame_series.variance_components import (
     MAX_STEPS,
@@ -84,7 +84,7 @@ def detect_in_frames(
     kind: type[ForwardModel], evidence: Evidence, leave: Sequence[str] = ()
 ) -> float | None:
     """Significance that `fit_frames` gives, without sizes and errors."""
-    found = _taken(kind, evidence, leave)
+    found = _taken(kind, evidence, leave, halvings=1)
     return None if found is None else found.significance
 
 
@@ -110,14 +110,19 @@ class _Taken:
         return sigmas(log_chance_of_any(list(self.chances.values())))
 
 
-def _taken(kind: type[ForwardModel], evidence: Evidence, leave: Sequence[str]) -> _Taken | None:
+def _taken(
+    kind: type[ForwardModel],
+    evidence: Evidence,
+    leave: Sequence[str],
+    halvings: int = HALVINGS,
+) -> _Taken | None:
     changes = evidence.once("changes of frames", make=lambda: FrameChanges(evidence))
     every = changes.series(kind())
     strengths = strengths_of(every, kind(), leave)
     if not strengths:
         return None
     plain = [s for s in strengths if not s.of_line]
-    fit = _Fit(kind(), FrameBasis(changes, every, plain))
+    fit = _Fit(kind(), FrameBasis(changes, every, plain), halvings)
     for field in dict.fromkeys(s.field for s in sorted(plain, key=lambda s: s.steady)):
         fit.take([s for s in plain if s.field == field])
     fields = dict.fromkeys(s.field for s in strengths if s.of_line)
@@ -128,8 +133,8 @@ def _taken(kind: type[ForwardModel], evidence: Evidence, leave: Sequence[str]) -
 class _Fit:
     """Strengths of a model, taken in field by field."""
 
-    def __init__(self, start: ForwardModel, basis: FrameBasis) -> None:
-        self.start, self.basis = start, basis
+    def __init__(self, start: ForwardModel, basis: FrameBasis, halvings: int) -> None:
+        self.start, self.basis, self._halvings = start, basis, halvings
         self.taken: list[Strength] = []
         self.chances: dict[str, float] = {}  # logarithm, of each field where there is none of it
         # of each field with a shape: the profile, and how many strengths were fitted with it
@@ -165,7 +170,8 @@ class _Fit:
         def fit(value: float, start: Components | None, steps: int = MAX_STEPS) -> Components:
             return self.basis.components(every, {**self.shapes, field: value}, start, steps)
 
-        found = best_shape(fit, self.basis.trials(own[0]), steady, before if steady else None)
+        start, trials = before if steady else None, self.basis.trials(own[0])
+        found = best_shape(fit, trials, steady, start, self._halvings)
         if getattr(self.start, own[0].shape or "") == 0.0:
             plain = fit(0.0, None)
             if sigmas(log_chance(_likelihood(own, found.found, plain))) < SIGNIFICANT:

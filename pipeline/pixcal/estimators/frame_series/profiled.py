@@ -40,12 +40,17 @@ class Profiled:
 
 
 def best_shape(
-    fit: ProfiledFit, trials: F64, steady: bool, start: Components | None = None
+    fit: ProfiledFit,
+    trials: F64,
+    steady: bool,
+    start: Components | None = None,
+    halvings: int = HALVINGS,
 ) -> Profiled:
     """The best of some values (n,), in equal steps of the logarithm, and between them.
 
     Likelihoods of a steady one, of known shapes, are compared without restriction; known shapes are
-    tried at first at the sizes of the start.
+    tried at first at the sizes of the start. The likelihood needs fewer ``halvings`` of the steps
+    than the value.
     """
 
     def high(found: Components) -> float:
@@ -58,7 +63,7 @@ def best_shape(
     log_value = float(np.log(trials[best]))
     found = fit(float(trials[best]), fits[best])
     width = float(np.log(trials[1] / trials[0]))
-    for _ in range(HALVINGS):
+    for _ in range(halvings):
         # A parabola through the three, ever closer; its curvature is the information.
         sides = tuple(fit(float(np.exp(log_value + w)), found) for w in (-width, width))
         below, above = (high(side) - high(found) for side in sides)

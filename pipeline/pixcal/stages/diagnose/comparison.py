@@ -121,6 +121,11 @@ class Comparison:
             variance[key] = variance[key] + (LAW_ERROR * (mean - nominal[key])) ** 2
         return self._trial(trial.effects, replace(trial.expected, variance=variance))
 
+    def gain_over(self, fewer: Trial, trial: Trial) -> float:
+        """Rise of the log-likelihood by a cause, allowing for other laws of those without it."""
+        with_it, without = (self.allowing_for_laws(t, fewer) for t in (trial, fewer))
+        return with_it.log_likelihood - without.log_likelihood
+
     def gain_where_differing(self, start: Trial, trial: Trial, own: Key) -> float:
         """Rise of the log-likelihood by the test statistics that differ from ``start``.
 

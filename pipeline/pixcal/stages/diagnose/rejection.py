@@ -20,6 +20,11 @@ def similar_to(name: str) -> str:
     return f"explained by {name}, which has a similar signature"
 
 
+def explained_by_other_law(name: str) -> str:
+    """Why a cause is taken back that an accepted one makes needless as it was measured."""
+    return f"{name}, as measured frame by frame, explains the data as well without it"
+
+
 def needed_gain(candidate: Candidate) -> float:
     """Gain in log-likelihood of the held-out frames that a candidate needs."""
     return MIN_LOGLIK_GAIN if candidate.significance >= SIGNIFICANT else MIN_LOGLIK_GAIN_WEAK
@@ -41,11 +46,7 @@ def redundant(
     comparison: Comparison, current: Trial, without: Mapping[str, Trial]
 ) -> Rejection | None:
     """A cause without which the held-out frames are about as likely as with all causes."""
-    gains = {
-        name: comparison.allowing_for_laws(current, trial).log_likelihood
-        - comparison.allowing_for_laws(trial, trial).log_likelihood
-        for name, trial in without.items()
-    }
+    gains = {name: comparison.gain_over(trial, current) for name, trial in without.items()}
     least = min(gains, key=lambda name: gains[name], default=None)
     if least is None or gains[least] >= MIN_LOGLIK_GAIN:
         return None

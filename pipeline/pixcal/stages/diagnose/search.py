@@ -28,6 +28,7 @@ from pixcal.stages.diagnose.comparison import MIN_LOGLIK_GAIN, Comparison, Trial
 from pixcal.stages.diagnose.rejection import (
     MIN_LOGLIK_GAIN_WEAK,
     doubtful,
+    explained_by_other_law,
     needed_gain,
     redundant,
     similar_to,
@@ -324,11 +325,13 @@ class Search:
             if isinstance(fewer, str):
                 break
             candidates[name].reason = reason
-            for candidate in candidates.values():
-                if candidate.reason == similar_to(name):
-                    candidate.reason = f"similar to {name}, which was rejected: {reason}"
-            del effects[name]
+            _reject(name, reason, effects, candidates)
             current = fewer
+        while (replayed := self._needless(effects, current, candidates)) is not None:
+            name, by, current = replayed
+            _reject(name, explained_by_other_law(by), effects, candidates)
+            effects |= {one: e for one in effects for e in current.effects if e.name == one}
+            without = self._each_left_out(effects)
         for name, effect in effects.items():
             # Of as many simulations as all together: three tell little of what is random.
             alone = self._confirmed((effect,))
@@ -344,6 +347,33 @@ class Search:
             {name: others for name, others in alike.items() if others},
             self._by_laws(effects, candidates),
         )
+
+    def _needless(
+        self, effects: Mapping[str, Effect], current: Trial, candidates: Mapping[str, Candidate]
+    ) -> tuple[str, str, Trial] | None:
+        """A cause that others make needless as they were measured, whatever their laws.
+
+        With the one that does, and the bench without the cause. Only causes of the same step of the
+        light's way and of the same domains can stand in for each other so.
+        """
+        for name in sorted(effects, key=lambda n: candidates[n].significance):
+            own = effects[name]
+            replays = {
+                n: replay
+                for n, e in effects.items()
+                if n != name and e.acts_at == own.acts_at and set(e.domains) >= set(own.domains)
+                if (replay := candidates[n].replay) is not None and replay != e
+            }
+            if not replays:
+                continue
+            rest = tuple(replays.get(n, e) for n, e in effects.items() if n != name)
+            trial = self._confirmed(rest)
+            if (
+                isinstance(trial, Trial)
+                and self.comparison.gain_over(trial, current) < MIN_LOGLIK_GAIN
+            ):
+                return name, next(iter(replays)), trial
+        return None
 
     def _by_laws(
         self, effects: Mapping[str, Effect], candidates: Mapping[str, Candidate]
@@ -366,3 +396,14 @@ class Search:
         # All at once, side by side; below they are at hand.
         self._simulate(list(benches.values()), CONFIRM, "each cause left out", ())
         return {name: self._start(benches.get(name, ())) for name in effects}
+
+
+def _reject(
+    name: str, reason: str, effects: dict[str, Effect], candidates: Mapping[str, Candidate]
+) -> None:
+    """Take a cause back, and what was rejected for its sake."""
+    candidates[name].reason = reason
+    for candidate in candidates.values():
+        if candidate.reason == similar_to(name):
+            candidate.reason = f"similar to {name}, which was rejected: {reason}"
+    del effects[name]

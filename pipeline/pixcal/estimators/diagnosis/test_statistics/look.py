@@ -119,8 +119,13 @@ class Look:
 
     @cached_property
     def maps(self) -> dict[str, F64]:
-        """Offset (px), contrast and light (relative), (y, x) about zero; NaN in bad pixels."""
-        theta, good = self.found.theta, self.good
+        """Offset (px), contrast and light (relative), (y, x) about zero; NaN in bad pixels.
+
+        And NaN along the edges: what pixels there share with those beyond no simulation knows.
+        """
+        theta, good = self.found.theta, np.zeros_like(self.good)
+        inside = (slice(EDGE, -EDGE), slice(EDGE, -EDGE))
+        good[inside] = self.good[inside]
         iota = np.where(good, theta[0], np.nan)
         contrast = np.where(good, np.hypot(theta[1], theta[2]), np.nan) / iota
         light = iota / smooth_surface(iota, good)
@@ -172,6 +177,7 @@ class Look:
         }
 
 
+EDGE = 2  # pixels along the edges of the window that maps leave out
 LEVELS = 8  # bins of level
 CODES = 64  # codes whose remainders are told apart, a power of two
 CELLS = 4  # cells of the window along each side
