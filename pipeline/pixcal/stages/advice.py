@@ -175,7 +175,9 @@ def _action(
     why = treated["why"] if treated else treatment_of_kind(kind, *shapes)[1] if kind else ""
     because = f": {why}" if why else ""
     if action == "corrected":
-        if not with_maps:
+        if not with_maps and cause["on_map"]["rms_px"]:
+            text = "'pixcal fit RUN --with-diagnosis' makes maps corrected for it"
+        elif not with_maps:
             text = "pixcal corrects maps of pixel offsets for it, once there are fringe frames"
         elif _settled(cause, correction, with_maps):
             text = "maps corrected"
