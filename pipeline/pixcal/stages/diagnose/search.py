@@ -324,7 +324,6 @@ class Search:
             fewer = self._confirmed(rest) if rest else self.comparison.nominal
             if isinstance(fewer, str):
                 break
-            candidates[name].reason = reason
             _reject(name, reason, effects, candidates)
             current = fewer
         while (replayed := self._needless(effects, current, candidates)) is not None:
@@ -364,7 +363,7 @@ class Search:
                 if n != name and e.acts_at == own.acts_at and set(e.domains) >= set(own.domains)
                 if (replay := candidates[n].replay) is not None and replay != e
             }
-            if not replays:
+            if not replays or sum(self._made.values()) + CONFIRM > self._most:
                 continue
             rest = tuple(replays.get(n, e) for n, e in effects.items() if n != name)
             trial = self._confirmed(rest)
