@@ -110,10 +110,12 @@ def test_fringes_get_the_harmonics_of_the_polynomial(
     assert third.min() > 5
 
 
+@pytest.mark.long
 def test_its_coefficients_are_found(bent: tuple[Evidence, Estimate]) -> None:
     assert_found_well(bent[1], Nonlinearity())
 
 
+@pytest.mark.long
 def test_its_significance_needs_no_estimate(bent: tuple[Evidence, Estimate]) -> None:
     evidence, found = bent
     assert Nonlinearity.detect(replace(evidence)) == found.significance

@@ -65,6 +65,7 @@ def test_a_bump_is_found(acquired: Callable[..., Evidence], bump: float) -> None
         assert apart.std() < 0.05 * flattened(np.log1p(truth), 2).std() + 1e-4
 
 
+@pytest.mark.long
 def test_unequal_fibres_are_not_taken_for_it(acquired: Callable[..., Evidence]) -> None:
     """Beams that also point apart: a gradient of the visibility along and across the baseline."""
     unequal = {
@@ -76,7 +77,8 @@ def test_unequal_fibres_are_not_taken_for_it(acquired: Callable[..., Evidence]) 
     assert found.significance < 4
 
 
-@pytest.mark.parametrize("other", ["rolling_shutter", "flat_error"])
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("other", ["flat_error", "rolling_shutter"])
 def test_others_are_not_taken_for_it(acquired: Callable[..., Evidence], other: str) -> None:
     """A rolling shutter lowers the visibility by rows, and leaves the mean light."""
     found = Straylight.estimate(acquired(None, {other: {}}))

@@ -110,6 +110,7 @@ def with_noise(evidence: Evidence, gain: np.ndarray) -> Evidence:
     return replace(evidence, stacks=tuple(stacks))
 
 
+@pytest.mark.long
 def test_pixels_that_are_only_noisier_are_not_taken_for_it(
     acquired: Callable[..., Evidence],
 ) -> None:

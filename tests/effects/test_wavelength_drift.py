@@ -96,6 +96,7 @@ def test_hops_are_found(acquired: Acquired, hop: float, rate: float) -> None:
     assert found.significance > 6
 
 
+@pytest.mark.long
 def test_beside_a_walk_the_error_of_hops_is_honest(acquired: Acquired) -> None:
     hop, rate, walk = 3e-4, 250.0, 3e-3
     found = WavelengthDrift.estimate(acquired(None, drift(hop=hop, hops_per_h=rate, walk=walk)))

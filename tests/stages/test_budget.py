@@ -33,6 +33,7 @@ def changed(folder: Path, **places: Any) -> Path:
     return file
 
 
+@pytest.mark.long
 def test_a_simulated_run_reaches_what_was_promised(tmp_path: Path) -> None:
     """`crb_median_px` of the fit, and the real scatter of the fit about the truth."""
     bench = ROOT / "tests/bench.yaml"

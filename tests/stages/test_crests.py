@@ -17,6 +17,8 @@ from pixcal.stages.crests import Config, stage
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.manifest import read_json, write_json
 
+pytestmark = pytest.mark.long
+
 SYNC = Runtime("sync")
 SETS = {"vertical": (6.0, 0.0), "diagonal": (-3.0, 4.5)}
 

@@ -340,6 +340,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "runtime", [Runtime(workers=2), Runtime(cluster="processes", workers=2)], ids=str
 )
