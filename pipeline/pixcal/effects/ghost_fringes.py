@@ -23,6 +23,7 @@ SINGLE = {
     "ghost of the fixed fibre: static and moving fringes": (1, 0, 1),
 }
 BOTH = "ghosts of both fibres"
+OF_ONE, OF_BOTH = 2, 4  # of the six numbers of a wave, those that a law leaves free
 # chi-square of a wave that the second ghost must explain at least, and that static fringes have
 TWO_GHOSTS = 25.0
 UNTIED = 0.5  # share of the chi-square of the waves that the law of a beam may leave
@@ -168,6 +169,7 @@ class GhostFringes(Effect):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Waves that mean light and fringes share, set by set (`find_waves`).
 
+        Amplitudes depart from the law as far as they do so by more than their noise.
         What true offsets, crosstalk or a flat do is in one of the maps alone, and is not claimed.
         """
         found = find_waves(evidence)
@@ -177,13 +179,13 @@ class GhostFringes(Effect):
         middle = (evidence.origin[1] + (nx - 1) / 2, evidence.origin[0] + (ny - 1) / 2)
         waves: list[GhostWave] = []
         errors: dict[str, float] = {}
-        for n, one in enumerate(found.waves):
-            waves.append(_wave(one, middle))
+        law, tied, left = _law(found.waves)
+        for n, (one, own) in enumerate(zip(found.waves, tied.shrunk(found.waves), strict=True)):
+            waves.append(_wave(own, middle))
             for key, error in zip(("static", "forward", "backward"), one.errors, strict=False):
                 errors |= {f"waves[{n}].{key}[{part}]": error for part in (0, 1)}
             errors |= {f"waves[{n}].beat_rad_px[{axis}]": one.errors[3 + axis] for axis in (0, 1)}
-        law, tied, left = _law(found.waves)
-        by_law = tuple(_wave(one, middle) for one in tied)
+        by_law = tuple(_wave(one, middle) for one in tied.waves)
         return Estimate(
             cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=tuple(waves)),
             errors,
@@ -223,7 +225,33 @@ def _pair(value: complex) -> tuple[float, float]:
     return float(np.clip(value.real, -0.9, 0.9)), float(np.clip(value.imag, -0.9, 0.9))
 
 
-def _law(waves: Sequence[WaveFit]) -> tuple[str, list[WaveFit], float]:
+@dataclass(frozen=True)
+class TiedWaves:
+    """Waves whose amplitudes follow a law, and how badly they are fitted."""
+
+    waves: list[WaveFit]
+    misfit: float  # chi-square that the law leaves,
+    freedom: int  # and by noise alone
+
+    def shrunk(self, measured: Sequence[WaveFit]) -> list[WaveFit]:
+        """The measured waves, nearer to the law by the share that noise has in their misfit.
+
+        Stein's estimator (James & Stein 1961): all departures are taken for normal numbers of one
+        size, in errors.
+        """
+        share = max(1 - self.freedom / max(self.misfit, 1e-300), 0.0)
+        return [
+            replace(
+                by_law,
+                static=by_law.static + share * (one.static - by_law.static),
+                forward=by_law.forward + share * (one.forward - by_law.forward),
+                backward=by_law.backward + share * (one.backward - by_law.backward),
+            )
+            for one, by_law in zip(measured, self.waves, strict=True)
+        ]
+
+
+def _law(waves: Sequence[WaveFit]) -> tuple[str, TiedWaves, float]:
     """Law of the amplitudes, the waves that follow it, and the share of chi-square it leaves."""
     laws = {law: [_tied(w, weights) for w in waves] for law, weights in SINGLE.items()}
     both = [_tied_of_both(w) for w in waves]
@@ -232,14 +260,15 @@ def _law(waves: Sequence[WaveFit]) -> tuple[str, list[WaveFit], float]:
         return sum(one.misfit for one in tied)
 
     law = min(laws, key=lambda name: misfit(laws[name]))
-    best = laws[law]
+    best, unknown = laws[law], OF_ONE
     static = sum(abs(w.static) ** 2 / w.errors[0] ** 2 for w in waves)
     # Two ghosts have more free numbers, and must explain much that one does not. Coupled pixels
     # leave no static fringes.
     if misfit(best) > 2 * misfit(both) + TWO_GHOSTS * len(waves) < static:
-        law, best = BOTH, both
+        law, best, unknown = BOTH, both, OF_BOTH
     left = misfit(best) / max(sum(one.unrelated for one in best), 1e-300)
-    return law, [one.wave for one in best], left
+    tied = TiedWaves([one.wave for one in best], misfit(best), (6 - unknown) * len(best))
+    return law, tied, left
 
 
 def _of_a_beam(waves: Sequence[WaveFit], law: str, left: float, evidence: Evidence) -> bool:
