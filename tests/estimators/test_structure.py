@@ -106,6 +106,9 @@ def test_bad_pixels_do_not_matter() -> None:
     found = true_offsets(holes, np.zeros(SHAPE), plane())
     assert np.isfinite(found.kept).all()
     assert not found.kept[::7, ::5].any()
+    # In a simulation they are pixels like all others.
+    drawn = found.drawn(np.random.default_rng(8))[::7, ::5]
+    assert drawn.std() == pytest.approx(np.nanstd(holes), rel=4 / np.sqrt(2 * drawn.size))
 
 
 def test_outliers_are_told_from_a_strong_pattern() -> None:

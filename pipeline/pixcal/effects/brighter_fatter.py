@@ -152,13 +152,13 @@ def _alone(evidence: Evidence, falloff: float) -> Boundaries | None:
     """Boundaries that leave nothing to a bent response, if noise does not speak against them.
 
     A response that is free beside them makes them uncertain, and one uncertain beside the other
-    either seems to be needed.
+    either seems to be needed. What boundaries of another shape would explain as well asks for none.
     """
     found = boundaries_alone(evidence, LEVEL, POWERS, falloff)
     if found.against > _NEEDED:
         found = boundaries_alone(evidence, LEVEL, POWERS, falloff, by_axis=True)
     noise = shared_charge(evidence, boundary_shifts(found.falloff_px))
-    if noise is None or found.against > _NEEDED:
+    if noise is None or found.against > max(_NEEDED, found.shapes):
         return None
     apart = abs(found.shift * (1 + found.along_y) / 2 - noise.size)
     return found if apart < _DISAGREE * np.hypot(found.shift_error, noise.variance**0.5) else None

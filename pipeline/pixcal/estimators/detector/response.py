@@ -139,7 +139,10 @@ class Boundaries:
     shift: float  # shift, shift_error: by an electron, px, for this falloff
     shift_error: float
     with_falloff: float  # by how much the shift changes with the falloff's error, px
-    against: float  # chi-square by which a bent response beside them would fit better
+    # against, shapes: chi-square by which a bent response beside them, and boundaries alone that
+    # move by any function of the distance, would fit better
+    against: float
+    shapes: float
     # shift of boundaries between rows over that between columns, and by how much it changes with
     # the falloff's error; its own error is zero where it was held
     along_y: float
@@ -164,8 +167,14 @@ def boundaries_alone(
         sums = [(sum(n for n, _ in sums), sum(r for _, r in sums))]  # type: ignore[list-item]
     fine = _of_fine_falloffs(powers)
     sums = [(fine @ normal @ fine.T, fine @ right) for normal, right in sums]
-    found = [_alone(sums, powers, powers + n) for n in range(len(_FINE_PX))]
-    return _best_falloff(np.array(found), otherwise_px)
+    found = np.array([_alone(sums, powers, powers + n) for n in range(len(_FINE_PX))])
+    return _best_falloff(found, otherwise_px, _of_any_shape(sums, powers))
+
+
+def _of_any_shape(sums: Sequence[tuple[F64, F64]], powers: int) -> float:
+    """Chi-square that boundaries explain by themselves whose shift is any sum of all falloffs."""
+    every = [(normal[powers:, powers:], right[powers:]) for normal, right in sums]
+    return float(sum(right @ inverse_normal(normal) @ right for normal, right in every))
 
 
 def _of_fine_falloffs(powers: int) -> F64:
@@ -278,8 +287,11 @@ def _alone(
     return UNIT * float(sizes[0]), UNIT**2 / float(information[0]), gain, beside, ratio, error
 
 
-def _best_falloff(found: F64, otherwise_px: float) -> Boundaries:
-    """By a parabola about the best; ``found`` is what `_alone` tells of each of `_FINE_PX`."""
+def _best_falloff(found: F64, otherwise_px: float, of_any: float) -> Boundaries:
+    """By a parabola about the best; ``found`` is what `_alone` tells of each of `_FINE_PX`.
+
+    ``of_any``: chi-square that boundaries of any shape explain.
+    """
     best = int(np.clip(np.argmax(found[:, 2]), _BESIDE, len(found) - 1 - _BESIDE))
     near = np.array([best - _BESIDE, best, best + _BESIDE])
     at = np.log(_FINE_PX[near] / _FINE_PX[best])
@@ -288,18 +300,29 @@ def _best_falloff(found: F64, otherwise_px: float) -> Boundaries:
     error = 1 / np.sqrt(-curved) if curved < 0 else np.inf
     if error > TOLD:
         given = int(np.argmin(np.abs(_FINE_PX - otherwise_px)))
-        size, variance, _, against, ratio, own = found[given].tolist()
-        return Boundaries(otherwise_px, np.inf, size, variance**0.5, 0.0, against, ratio, own, 0.0)
+        size, variance, gain, against, ratio, own = found[given].tolist()
+        return Boundaries(
+            otherwise_px, np.inf, size, variance**0.5, 0.0, against, of_any - gain, ratio, own, 0.0
+        )
     top = float(-slope / (2 * curved))
     # Not beyond what was tried; how far that is from the best is not known then.
     there = float(np.clip(top, *np.log(_FINE_PX[[0, -1]] / _FINE_PX[best])))
     error = float(np.hypot(error, top - there))
-    size, variance, _, against, ratio, own = (
+    size, variance, gain, against, ratio, own = (
         value + float(np.polyval(bend, there))
         for value, bend in zip(found[best].tolist(), bends, strict=True)
     )
     rises = [error * float(np.polyval(np.polyder(bend), there)) for bend in bends]
     falloff = float(_FINE_PX[best] * np.exp(there))
     return Boundaries(
-        falloff, falloff * error, size, variance**0.5, rises[0], against, ratio, own, rises[4]
+        falloff,
+        falloff * error,
+        size,
+        variance**0.5,
+        rises[0],
+        against,
+        of_any - gain,
+        ratio,
+        own,
+        rises[4],
     )

@@ -125,11 +125,15 @@ class OffsetModel:
     terms: F64
     # (term,) of the coefficients of the terms, by chance, in offsets such as those that were kept
     scatter: F64
+    unknown: Mask  # (y, x) where there was no map,
+    rms: float  # and offsets are drawn with this rms, px
 
     def drawn(self, rng: np.random.Generator) -> F64:
         """A map (y, x): kept as it was, and taken out as it may be by chance; px."""
         size = self.scatter * rng.standard_normal(len(self.scatter))
-        return np.asarray(self.kept + np.tensordot(size, self.terms, 1))
+        drawn = self.kept + np.tensordot(size, self.terms, 1)
+        drawn[self.unknown] += self.rms * rng.standard_normal(np.count_nonzero(self.unknown))
+        return np.asarray(drawn)
 
 
 def true_offsets(delta: F64, sigma: F64, psi: F64) -> OffsetModel:
@@ -156,7 +160,7 @@ def true_offsets(delta: F64, sigma: F64, psi: F64) -> OffsetModel:
         squares[: len(bending)] += variance * _steps_at_large(rest)
     scatter = np.sqrt(squares / (terms**2).sum(axis=(1, 2)))
     kept = np.nan_to_num(rest * np.sqrt(true / max(variance, 1e-300)))
-    return OffsetModel(kept, terms, scatter)
+    return OffsetModel(kept, terms, scatter, ~np.isfinite(rest), true**0.5)
 
 
 def _steps_at_large(rest: F64) -> F64:
