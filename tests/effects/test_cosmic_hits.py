@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 from scipy.special import erf
 
-from pixcal.effects.cosmic_hits import CosmicHits, Hits
+from pixcal.effects.cosmic_hits import CosmicHits
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.tracks import GRAZING, add_tracks, draw_tracks
 from pixcal.model.bench import Bench
@@ -137,38 +137,3 @@ def test_without_an_exposure_time_frames_last_as_long_as_they_are_apart(
     assert found is not None
     rates = [e.effect.rate_cm2_s for e in (known, found) if isinstance(e.effect, CosmicHits)]
     assert rates[1] == pytest.approx(rates[0] * 0.02 / 0.14, rel=1e-6)
-
-
-def test_measured_hits_are_added_to_their_samples_whatever_the_piece() -> None:
-    """And nowhere else, from whichever rows a frame is made."""
-    hits = Hits("v", (0, 3, 3, 3, 8), (1, 4, 4, 6, 0), (2, 0, 5, 1, 0), (9.0, 1.5, 20.0, 7.0, 5.0))
-    whole = np.zeros((7, 6), np.float32)
-    hits.add(whole, 3, 0)
-    assert {(int(y), int(x)): float(whole[y, x]) for y, x in np.argwhere(whole)} == {
-        (4, 0): 1.5, (4, 5): 20.0, (6, 1): 7.0,
-    }  # fmt: skip
-    parts = [np.zeros((n, 6), np.float32) for n in (5, 2)]
-    for part, first in zip(parts, (0, 5), strict=True):
-        hits.add(part, 3, first)
-    np.testing.assert_array_equal(np.concatenate(parts), whole)
-    np.testing.assert_allclose(hits.scaled(0.5).samples[3], hits.samples[3] / 2)
-
-
-def test_what_frames_did_is_replayed(acquired: Callable[..., Evidence]) -> None:
-    """The samples of hits are those far above the noise, with the charge that they have more."""
-    evidence = acquired(None, {"cosmic_hits": {"rate_cm2_s": 2e4, "electrons_per_um": 400.0}})
-    effect = CosmicHits(2e4, 400.0).replayed(evidence)
-    assert effect is not None
-    assert {h.set for h in effect.hits} == set(evidence.fringes)
-    for hits in effect.hits:
-        found = evidence.fringes[hits.set]
-        frame, row, column, charge = hits.samples
-        at = np.searchsorted(found.frame, frame), row, column
-        assert len(charge) > 100
-        assert found.good[row, column].all()
-        noise = np.sqrt(found.variance[at])
-        assert (charge > 2.9 * noise * evidence.flat[row, column]).all()
-        # Without them hardly anything is left beyond the noise.
-        rest = np.where(found.good, found.residual / np.sqrt(found.variance), 0)
-        rest[at] = 0
-        assert (rest > 6.5).sum() < 0.05 * len(charge)

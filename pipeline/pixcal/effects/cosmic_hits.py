@@ -1,16 +1,14 @@
 """Particles that leave their charge in one frame: muons, and electrons of radioactive decay."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Self
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.significance import sigmas_of_count
 from pixcal.kernels.tracks import add_tracks, draw_tracks
 from pixcal.model.arrays import F32, F64, Indices, Mask
@@ -36,35 +34,6 @@ _SKEW = 5.0
 
 
 @dataclass(frozen=True)
-class Hits:
-    """Charge that hits left in the frames of a fringe set, sample by sample."""
-
-    set: str = quantity(doc="name of the fringe set")
-    frame: tuple[int, ...] = quantity((), low=0, high=2**31, doc="numbers of the frames, ascending")
-    row: tuple[int, ...] = quantity((), low=0, high=2**31, doc="rows of the samples")
-    column: tuple[int, ...] = quantity((), low=0, high=2**31, doc="columns of the samples")
-    charge_e: tuple[float, ...] = quantity((), unit="e-", low=0, high=1e9, doc="their charges")
-
-    def scaled(self, factor: float) -> Self:
-        """The same hits with ``factor`` times the charge."""
-        return replace(self, charge_e=tuple(factor * charge for charge in self.charge_e))
-
-    @cached_property
-    def samples(self) -> tuple[Indices, Indices, Indices, F32]:
-        """Frames, rows, columns and charges (n,)."""
-        frame, row, column = (np.array(part, int) for part in (self.frame, self.row, self.column))
-        return frame, row, column, np.array(self.charge_e, np.float32)
-
-    def add(self, charge: F32, frame: int, first_row: int) -> None:
-        """Add those of a frame to rows of its charge (y, x), e-."""
-        frames, rows, columns, charges = self.samples
-        own = slice(*np.searchsorted(frames, (frame, frame + 1)))
-        y, x = rows[own] - first_row, columns[own]
-        there = (y >= 0) & (y < charge.shape[0]) & (x < charge.shape[1])
-        charge[y[there], x[there]] += charges[own][there]
-
-
-@dataclass(frozen=True)
 class CosmicHits(Effect):
     """Straight tracks of particles through the sensitive layer, in proportion to the exposure time.
 
@@ -78,7 +47,7 @@ class CosmicHits(Effect):
     acts_at = Stage.CHARGE
     order = 2
     domains = ("noise",)
-    strengths = ("rate_cm2_s", "hits")
+    strengths = ("rate_cm2_s",)
     left_because = "few samples are hit, and most of them are masked"
     frames_needed = ("dark",)
     sources = (
@@ -102,24 +71,12 @@ class CosmicHits(Effect):
     diffusion_um: float = quantity(
         1.5, unit="um", above=0, high=100, doc="rms width of the charge cloud at collection"
     )
-    hits: tuple[Hits, ...] = quantity(
-        (), doc="hits as measured; sets that have them get no other tracks"
-    )
 
     def charge(self, charge: F32, shot: Shot) -> F32:
         detector = shot.bench.detector
         pitch = detector.pitch_um
         area = np.prod([(n + 2 * MARGIN_PX) * pitch * 1e-4 for n in detector.shape])
         recording = shot.recording
-        full = np.float32(np.inf if detector.full_well_e is None else detector.full_well_e)
-        if recording.kind == "fringes" and self.hits:
-            name = recording.bench.frames.fringes[recording.number].name
-            measured = [hits for hits in self.hits if hits.set == name]
-            found = charge.copy()
-            for hits in measured:
-                hits.add(found, shot.frame, shot.rows[0])
-            if measured:
-                return np.minimum(found, full)
         rng = recording.pixel_rng(self.name, shot.frame)
         # Where no exposure time is known, frames with light last as long as they are apart.
         seconds = recording.exptime_s or (recording.period_s if recording.kind != "bias" else 0.0)
@@ -129,7 +86,8 @@ class CosmicHits(Effect):
         found = charge.copy()
         tracks = self.tracks(rng, count, pitch, detector.shape)
         add_tracks(found, tracks, self.diffusion_um / pitch, shot.rows[0])
-        return np.minimum(found, full)
+        full = np.inf if detector.full_well_e is None else detector.full_well_e
+        return np.minimum(found, np.float32(full))
 
     def tracks(
         self, rng: np.random.Generator, count: int, pitch_um: float, shape: tuple[int, int],
@@ -174,36 +132,6 @@ class CosmicHits(Effect):
             {"hits": count, "expected_by_chance": chance, "seen_cm2_s": seen},
         )
 
-    def replayed(self, evidence: Evidence) -> Self | None:
-        """As in `Effect.replayed`: the samples of each hit that was found."""
-        flat = evidence.flat.astype(np.float32)
-        hits = tuple(_measured(f, flat) for f in evidence.fringes.values())
-        return replace(self, hits=tuple(one for one in hits if one.frame)) if hits else None
-
-
-def _measured(f: FringeEvidence, flat: F32) -> Hits:
-    """Samples of the hits of a set beyond the noise."""
-    ratio = np.asarray(f.residual / np.sqrt(f.variance), np.float32)
-    ratio[:, ~f.good] = np.nan
-    up, _, _ = _outliers(ratio)
-    beyond = ratio > JOINED
-    places = []
-    for frame in np.flatnonzero(up.any(axis=(1, 2))):
-        labels = _groups(up[frame], beyond[frame])
-        rows, columns = np.nonzero(beyond[frame] & np.isin(labels, labels[up[frame]]))
-        places.append((np.full(len(rows), frame), rows, columns))
-    if not places:
-        return Hits(f.name)
-    frame, row, column = np.concatenate(places, axis=1)
-    charge = f.residual[frame, row, column] * flat[row, column]
-    return Hits(
-        f.name,
-        tuple(map(int, f.frame[frame])),
-        tuple(map(int, row)),
-        tuple(map(int, column)),
-        tuple(float(c) for c in charge.round(1)),
-    )
-
 
 @dataclass(frozen=True)
 class _Search:
@@ -235,38 +163,27 @@ def _search(residual: F32, sigma: F32, exposure: float) -> _Search:
     """Outliers of residuals (t, y, x) with some sigma; ``exposure`` is that of a sample, cm² s."""
     ratio = residual / sigma
     usable = np.isfinite(ratio)
-    up, down, limit = _outliers(ratio)
-    hits = _hits(up, ratio > JOINED)
-    n = int(np.count_nonzero(usable))
-    sigmas = np.quantile(sigma[usable][::97], np.linspace(0.02, 0.98, 25)) if n else np.ones(1)
-    return _Search(
-        exposure * n,
-        n,
-        limit,
-        np.array([residual[hit].max() for hit in hits]),
-        np.array([sigma[hit].mean() for hit in hits]),
-        len(_hits(down, ratio < -JOINED)),
-        sigmas,
-        bool(sigmas[-1] < 1.5 * sigmas[0]),
-    )
-
-
-def _outliers(ratio: F32) -> tuple[Mask, Mask, float]:
-    """Residuals over sigma (t, y, x) far above and far below zero, and how far; no noisy pixels."""
     # Of every seventh sample: what the noise is beyond what was predicted.
     some = np.abs(ratio.ravel()[::7])
     wide = 1.4826 * float(np.nanmedian(some)) if np.isfinite(some).any() else 1.0
     limit = np.float32(THRESHOLD * max(wide, 1.0))
     up, down = ratio > limit, ratio < -limit
     often = np.count_nonzero(up | down, axis=0) > _OFTEN
-    return up & ~often, down & ~often, float(limit)
-
-
-def _groups(outliers: Mask, joined: Mask) -> Indices:
-    """Number (y, x) of the group that a sample of a frame lies in or beside; zero in none."""
-    together = ndimage.binary_dilation(joined | outliers, np.ones((3, 3)))
-    labels, _ = ndimage.label(together, np.ones((3, 3)))
-    return np.asarray(labels)
+    up &= ~often
+    down &= ~often
+    hits = _hits(up, ratio > JOINED)
+    n = int(np.count_nonzero(usable))
+    sigmas = np.quantile(sigma[usable][::97], np.linspace(0.02, 0.98, 25)) if n else np.ones(1)
+    return _Search(
+        exposure * n,
+        n,
+        float(limit),
+        np.array([residual[hit].max() for hit in hits]),
+        np.array([sigma[hit].mean() for hit in hits]),
+        len(_hits(down, ratio < -JOINED)),
+        sigmas,
+        bool(sigmas[-1] < 1.5 * sigmas[0]),
+    )
 
 
 def _hits(outliers: Mask, joined: Mask) -> list[Samples]:
@@ -276,8 +193,10 @@ def _hits(outliers: Mask, joined: Mask) -> list[Samples]:
     """
     found = []
     for frame in np.flatnonzero(outliers.any(axis=(1, 2))):
+        together = ndimage.binary_dilation(joined[frame] | outliers[frame], np.ones((3, 3)))
+        labels, _ = ndimage.label(together, np.ones((3, 3)))
         rows, columns = np.nonzero(outliers[frame])
-        groups = _groups(outliers[frame], joined[frame])[rows, columns]
+        groups = labels[rows, columns]
         for group in np.unique(groups):
             own = groups == group
             found.append((np.full(own.sum(), frame), rows[own], columns[own]))

@@ -211,8 +211,6 @@ def _strength(cause: Json, name: str, unit: str) -> str:
     if not isinstance(value, Sequence) or not value:
         return ""
     if isinstance(value[0], Mapping):
-        if "charge_e" in value[0]:
-            return f"{sum(len(part['charge_e']) for part in value)} samples as measured"
         if "value" not in value[0]:
             return _parts(name, value)
         axis = "" if name.endswith("tracks") else label
