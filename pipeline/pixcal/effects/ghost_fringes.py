@@ -9,6 +9,7 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.maps.map_waves import WaveFit, find_waves
 from pixcal.kernels.scene import DetectorMaps, LightMaps, Rows
+from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
 from pixcal.model.arrays import C128, F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
@@ -169,7 +170,7 @@ class GhostFringes(Effect):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Waves that mean light and fringes share, set by set (`find_waves`).
 
-        Amplitudes depart from the law as far as they do so by more than their noise.
+        Amplitudes depart from the law where they do so by more than chance.
         What true offsets, crosstalk or a flat do is in one of the maps alone, and is not claimed.
         """
         found = find_waves(evidence)
@@ -180,7 +181,10 @@ class GhostFringes(Effect):
         waves: list[GhostWave] = []
         errors: dict[str, float] = {}
         law, tied, left = _law(found.waves)
-        for n, (one, own) in enumerate(zip(found.waves, tied.shrunk(found.waves), strict=True)):
+        columns = [abs(f.k[0]) >= abs(f.k[1]) for f in evidence.fringes.values()]
+        alike = max(sum(columns), len(columns) - sum(columns))
+        taken = tied.shrunk(found.waves, alike)
+        for n, (one, own) in enumerate(zip(found.waves, taken, strict=True)):
             waves.append(_wave(own, middle))
             for key, error in zip(("static", "forward", "backward"), one.errors, strict=False):
                 errors |= {f"waves[{n}].{key}[{part}]": error for part in (0, 1)}
@@ -233,13 +237,16 @@ class TiedWaves:
     misfit: float  # chi-square that the law leaves,
     freedom: int  # and by noise alone
 
-    def shrunk(self, measured: Sequence[WaveFit]) -> list[WaveFit]:
-        """The measured waves, nearer to the law by the share that noise has in their misfit.
+    def shrunk(self, measured: Sequence[WaveFit], alike: int) -> list[WaveFit]:
+        """The measured waves, nearer to the law by the share that chance has in their misfit.
 
-        Stein's estimator (James & Stein 1961): all departures are taken for normal numbers of one
-        size, in errors.
+        They follow the law unless they depart from it significantly; then by Stein's estimator
+        (James & Stein 1961): all departures are taken for normal numbers of one size, in errors.
+        ``alike``: sets along one axis, to whose waves the true offsets do the same.
         """
-        share = max(1 - self.freedom / max(self.misfit, 1e-300), 0.0)
+        chi2, freedom = self.misfit / alike, self.freedom // alike
+        sure = sigmas_of_chi2(max(chi2, 1e-9), max(freedom, 1)) > SIGNIFICANT
+        share = 1 - freedom / chi2 if sure else 0.0
         return [
             replace(
                 by_law,
