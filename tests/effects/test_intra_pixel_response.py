@@ -67,6 +67,7 @@ def test_width_and_scatter_are_found(
     assert abs(found.effect.width_rms_px - rms) < 4 * allowed
     assert found.errors["width_rms_px"] < 0.2 * rms
     assert found.significance > 5
+    assert not found.refused
 
 
 @pytest.mark.quick(1)
@@ -99,3 +100,22 @@ def test_hot_pixels_that_no_dark_shows_are_no_scatter(acquired: Callable[..., Ev
     estimate = IntraPixelResponse.estimate(replace(evidence, fringes=fringes))
     assert estimate is not None
     assert abs(estimate.significance) < 4
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_scatter_that_crossed_fringes_share_is_not_of_widths(
+    acquired: Callable[..., Evidence], shared: bool
+) -> None:
+    """The same part of the amplitude of each pixel, whatever the fringes, or one for each axis."""
+    evidence, rng = acquired(), np.random.default_rng(4)
+    shape = evidence.good.shape
+    both, fringes = rng.standard_normal(shape), {}
+    for (name, found), rms in zip(evidence.fringes.items(), (6e-3, 2e-3), strict=True):
+        part = rms * (both if shared else rng.standard_normal(shape))
+        change = np.concatenate([np.zeros((1, *shape)), found.theta[1:] * part])
+        more = np.tensordot(found.g, change, 1).astype(np.float32)
+        fringes[name] = replace(found, theta=found.theta + change, electrons=found.electrons + more)
+    found = IntraPixelResponse.estimate(replace(evidence, fringes=fringes))
+    assert found is not None
+    assert found.significance > 4
+    assert bool(found.refused) == shared

@@ -1,6 +1,7 @@
 """Pixels that have a width: the fringe is averaged over their response."""
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,16 @@ from pixcal.estimators.maps.structure import without_outliers
 from pixcal.kernels import optics
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.scene import TILE, DetectorMaps, LightMaps, Rows, chip_map, geometry
+from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
 
 REPEAT = 0.002  # to what part the visibility of two pairs of fibres is taken to be the same
+# sine of the angle between fringes from which widths along x and y act on them separately
+CROSSED = 0.5
+SHARED = "the visibility scatters alike in sets of crossed fringes, which widths do not bring about"
 _MIN_PIXELS = 200
 _APART = 1.1
 _TURNS = 60
@@ -86,7 +91,7 @@ class IntraPixelResponse(Effect):
         here: the noise of neighbours does that. The scatter of the width is what two halves of the
         frames share in the visibility of single pixels, beyond what neighbours, rows and columns
         share, as far as it grows with the fourth power of the fringe vector: lag, which scatters
-        too, does not.
+        too, does not. It is refused where fringes of crossed directions share most of the scatter.
         """
         sets = [f for f in evidence.fringes.values() if np.count_nonzero(f.good) > _MIN_PIXELS]
         spacing = [np.hypot(*f.k) for f in sets]
@@ -95,7 +100,7 @@ class IntraPixelResponse(Effect):
         k = np.array([f.k for f in sets])
         square, error = _width(k, np.array([_log_visibility(f) for f in sets]))
         width = float(np.sqrt(np.clip(square, 0, 9)))
-        scatter, its_error = _scatter(sets, max(width, 0.5), _bias_variance(evidence))
+        scatter, its_error, shared = _scatter(sets, max(width, 0.5), _bias_variance(evidence))
         rms = float(np.sqrt(max(scatter, 0.0)))
         width_error = error / (2 * max(width, np.sqrt(error)))
         return Estimate(
@@ -109,6 +114,7 @@ class IntraPixelResponse(Effect):
             float(scatter / its_error),
             "visibility that varies from pixel to pixel, more strongly at shorter fringe periods",
             {"of_width": float(square / error), "of_scatter": float(scatter / its_error)},
+            refused=SHARED if shared else "",
         )
 
 
@@ -148,23 +154,55 @@ def _bias_variance(evidence: Evidence) -> float:
     return evidence.read_noise**2 / sum(counts) if counts else 0.0
 
 
-def _scatter(sets: list[FringeEvidence], width: float, bias_variance: float) -> tuple[float, float]:
-    """Variance of the width from pixel to pixel and its error, px²."""
+def _scatter(
+    sets: list[FringeEvidence], width: float, bias_variance: float
+) -> tuple[float, float, bool]:
+    """Variance of the width from pixel to pixel and its error, px².
+
+    And whether most scatter of the visibility is the same for fringes of other directions, which
+    widths along x and y do not bring about.
+    """
     normal, right = np.zeros((2, 2)), np.zeros(2)
+    maps, scatters = [], []
     for found in sets:
         one, other = (_visibility(found, half) for half in (0, 1))
         kept = np.isfinite(one) & np.isfinite(other)
-        products = neighbour_products(_structure(one, kept), _structure(other, kept), kept)
-        white = (products[0] - (4 * products[1] - products[2]) / 3)[kept]
-        error = white.std() / np.sqrt(len(white))
-        of_bias = bias_variance / float(np.median(found.theta[0][found.good])) ** 2
+        one, other = _structure(one, kept), _structure(other, kept)
+        square, error = _of_pixels(one, other, kept)
+        square -= bias_variance / _light(found) ** 2
         # Widths along both axes scatter by themselves; what does not depend on the fringe is free.
-        gain = ((np.array(found.k) ** 2 * width / 12) ** 2).sum()
-        terms = np.array([gain, 1.0])
+        terms = np.array([_gain(found, found, width), 1.0])
         normal += np.outer(terms, terms) / error**2
-        right += terms * (float(white.mean()) - of_bias) / error**2
+        right += terms * square / error**2
+        maps.append((np.where(kept, (one + other) / 2, 0), kept))
+        scatters.append(square)
     covariance = inverse_normal(normal, 1e-15)
-    return float(covariance[0] @ right), float(np.sqrt(covariance[0, 0]))
+    scatter = float(covariance[0] @ right)
+    shared = False
+    for (m, f), (n, g) in combinations(enumerate(sets), 2):
+        if abs(f.k[0] * g.k[1] - f.k[1] * g.k[0]) < CROSSED * np.hypot(*f.k) * np.hypot(*g.k):
+            continue
+        product, error = _of_pixels(maps[m][0], maps[n][0], maps[m][1] & maps[n][1])
+        product -= bias_variance / (_light(f) * _light(g)) + _gain(f, g, width) * max(scatter, 0.0)
+        most = np.sqrt(max(scatters[m], 0.0) * max(scatters[n], 0.0)) / 2
+        shared |= bool(product > max(SIGNIFICANT * error, most))
+    return scatter, float(np.sqrt(covariance[0, 0])), shared
+
+
+def _of_pixels(one: F64, other: F64, kept: Mask) -> tuple[float, float]:
+    """Mean product (and its error) of two maps pixel by pixel, beyond what neighbours share."""
+    products = neighbour_products(one, other, kept)
+    white = (products[0] - (4 * products[1] - products[2]) / 3)[kept]
+    return float(white.mean()), float(white.std() / np.sqrt(len(white)))
+
+
+def _gain(one: FringeEvidence, other: FringeEvidence, width: float) -> float:
+    """Covariance of the visibilities of two sets for widths that scatter by a pixel."""
+    return float((np.square(one.k) * np.square(other.k)).sum() * (width / 12) ** 2)
+
+
+def _light(found: FringeEvidence) -> float:
+    return float(np.median(found.theta[0][found.good]))
 
 
 def _visibility(found: FringeEvidence, half: int) -> F64:
