@@ -256,3 +256,16 @@ def test_shifts_of_any_falloff_are_a_sum_of_those_that_are_fitted(falloff: float
     wanted = boundary_shifts(falloff).ravel()
     shares = np.linalg.lstsq(fitted, wanted, rcond=None)[0]
     np.testing.assert_allclose(fitted @ shares, wanted, atol=1e-6)
+
+
+@pytest.mark.long
+def test_noise_that_would_contradict_another_falloff_does_not_hide_it(
+    acquired: Callable[..., Evidence],
+) -> None:
+    """The falloff is that of the harmonics: a weak effect of a wide one is seen all the same."""
+    on = {"brighter_fatter": {"shift_px_per_e": 5e-8, "falloff_px": 1.2}}
+    found = BrighterFatter.estimate(acquired(None, on))
+    assert found is not None
+    assert found.significance > 5
+    assert isinstance(found.effect, BrighterFatter)
+    assert found.effect.falloff_px == pytest.approx(1.2, rel=0.2)

@@ -5,7 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixcal.estimators.detector.neighbours import SharedCharge, shared_charge
-from pixcal.estimators.detector.response import Boundaries, boundaries_alone, boundaries_beside
+from pixcal.estimators.detector.response import (
+    FALLOFFS_PX,
+    Boundaries,
+    boundaries_alone,
+    boundaries_beside,
+)
 from pixcal.estimators.diagnosis.central_crop import central_crop
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.boundaries import REACH, area_changes, boundary_shifts, moved_charge
@@ -100,9 +105,11 @@ class BrighterFatter(Effect):
         another part of it, no response is taken to be beside it.
         """
         evidence = central_crop(evidence)
-        falloff = cls().falloff_px
-        shifts = boundary_shifts(falloff)
-        noise = shared_charge(evidence, shifts)
+        explaining = _explaining(evidence, cls().falloff_px) if evidence.fringes else None
+        falloff = cls().falloff_px if explaining is None else explaining.falloff_px
+        # Noise is weak evidence, and of another falloff it may seem to contradict the harmonics.
+        falloff = min(FALLOFFS_PX, key=lambda px: abs(np.log(px / falloff)))
+        noise = shared_charge(evidence, boundary_shifts(falloff))
         if noise is None:
             return None
         size, variance = noise.size, noise.variance
@@ -125,7 +132,9 @@ class BrighterFatter(Effect):
         error = float(np.sqrt(variance))
         errors: dict[str, float] = {"shift_px_per_e": error}
         together: tuple[dict[str, float], ...] = ()
-        alone = _alone(evidence, falloff) if significance > _HINTED and evidence.fringes else None
+        alone = None
+        if explaining is not None and significance > _HINTED:
+            alone = _beside_noise(explaining, evidence)
         if alone is not None:
             falloff, size, along_y = alone.falloff_px, alone.shift, alone.along_y
             errors, together = _errors(alone)
@@ -148,17 +157,22 @@ def _by_axis(noise: SharedCharge) -> tuple[float, float, float, float]:
     return size, float(noise.covariance[0, 0]), ratio, sigmas
 
 
-def _alone(evidence: Evidence, falloff: float) -> Boundaries | None:
-    """Boundaries that leave nothing to a bent response, if noise does not speak against them.
+def _explaining(evidence: Evidence, otherwise_px: float) -> Boundaries | None:
+    """Boundaries that leave nothing of the harmonics to a bent response.
 
     A response that is free beside them makes them uncertain, and one uncertain beside the other
     either seems to be needed. What boundaries of another shape would explain as well asks for none.
     """
-    found = boundaries_alone(evidence, LEVEL, POWERS, falloff)
+    found = boundaries_alone(evidence, LEVEL, POWERS, otherwise_px)
     if found.against > _NEEDED:
-        found = boundaries_alone(evidence, LEVEL, POWERS, falloff, by_axis=True)
+        found = boundaries_alone(evidence, LEVEL, POWERS, otherwise_px, by_axis=True)
+    return found if found.against <= max(_NEEDED, found.shapes) else None
+
+
+def _beside_noise(found: Boundaries, evidence: Evidence) -> Boundaries | None:
+    """The same, if the noise of neighbours does not speak against them."""
     noise = shared_charge(evidence, boundary_shifts(found.falloff_px))
-    if noise is None or found.against > max(_NEEDED, found.shapes):
+    if noise is None:
         return None
     apart = abs(found.shift * (1 + found.along_y) / 2 - noise.size)
     return found if apart < _DISAGREE * np.hypot(found.shift_error, noise.variance**0.5) else None
