@@ -141,9 +141,7 @@ def test_it_is_found_with_its_parent(
         assert parent in found.law
     if parent == "crossed":
         # Static fringes alone do nothing to the maps of offsets.
-        moving = [w.forward + w.backward for w in found.effect.waves]
-        error = found.errors["waves[0].forward[0]"]
-        assert np.abs(moving).max() < 1.5 * error
+        assert not any(any(w.forward + w.backward) for w in found.effect.waves)
 
 
 @pytest.mark.quick(1)

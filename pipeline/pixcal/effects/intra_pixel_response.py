@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.frame_series.fringe_motion import CROSSED
 from pixcal.estimators.maps.map_fit import gauge_terms, half_theta, neighbour_products, without
 from pixcal.estimators.maps.structure import without_outliers
 from pixcal.kernels import optics
@@ -19,8 +20,6 @@ from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
 
 REPEAT = 0.002  # to what part the visibility of two pairs of fibres is taken to be the same
-# sine of the angle between fringes from which widths along x and y act on them separately
-CROSSED = 0.5
 SHARED = "the visibility scatters alike in sets of crossed fringes, which widths do not bring about"
 _MIN_PIXELS = 200
 _APART = 1.1

@@ -207,10 +207,8 @@ class _Fit:
 
     def sets_differ(self) -> float:
         """Standard deviations by which sets have steady strengths of their own."""
-        steady, sets = (
-            sum(s.steady for s in self.taken),
-            sum(w.recording is not None for w in self.basis.every),
-        )
+        steady = sum(s.steady for s in self.taken)
+        sets = sum(w.recording is not None for w in self.basis.every)
         if not steady or sets < 2:
             return -np.inf
         together, apart = (
