@@ -71,7 +71,7 @@ def _jitter(s: float, rng: np.random.Generator) -> Plain:
 
 def _ghost(s: float, rng: np.random.Generator) -> Plain:
     beat = _around(rng.uniform(0.15, 1.0), rng)
-    turn, parent = float(rng.uniform(-np.pi, np.pi)), str(rng.choice(PARENTS))
+    turn, parent = float(rng.uniform(-np.pi, np.pi)), str(rng.choice(tuple(PARENTS)))
     return {"share": s, "beat_rad_px": beat, "phase_rad": turn, "parent": parent}
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pixcal.kernels.scene import light_maps
+from pixcal.kernels.scene import fringe_light
 from pixcal.report.colours import BAR, BLUE, INK
 from pixcal.report.drawing import WIDE, finish, new_figure, png, span_scale, symmetric_scale
 from pixcal.report.text import number
@@ -68,9 +68,9 @@ def true_light(scene: Scene) -> tuple[F64, F64, F64]:
     bench = scene.bench
     rows = (0, bench.detector.shape[0])
     (recording,) = (r for r in recordings(bench) if r.kind == "fringes" and r.number == 0)
-    light = light_maps(bench, 0, rows, Camera(bench, rows).maps, recording.electrons)
-    iota, s, c = (m.astype(float) for m in (light.iota, light.alpha_sin, light.alpha_cos))
-    return iota, np.hypot(s, c), np.arctan2(s, c)
+    maps = Camera(bench, rows).maps
+    light = fringe_light(bench, 0, rows, maps, recording.electrons).collected(maps.response)
+    return light.iota.astype(float), np.abs(light.phasor), np.angle(light.phasor)
 
 
 def measure(scene: Scene) -> Estimates:

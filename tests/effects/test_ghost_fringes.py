@@ -67,7 +67,7 @@ def test_waves_of_a_set_are_of_that_set_alone() -> None:
     wave = GhostWave((0.3, -0.2), "vertical", (0.01, 0.0), (0.0, 0.004), (0.003, 0.0))
     ghost = GhostFringes(0.0, waves=(wave,))
     other = ghost.predict(replace(maps, name="horizontal"))
-    np.testing.assert_array_equal(other.theta, maps.theta)
+    np.testing.assert_allclose(other.theta, maps.theta, rtol=1e-15)
     own = ghost.predict(replace(maps, name="vertical"))
     y, x = np.mgrid[:40, :50]
     np.testing.assert_allclose(own.theta[0] / 2e4, 1 + 0.01 * np.cos(0.3 * x - 0.2 * y))
@@ -200,3 +200,29 @@ def test_a_pattern_of_mean_light_and_fringes_alike_in_all_sets_is_the_flats(
     without = GhostFringes.estimate(replace(evidence, stacks=()))
     assert without is not None
     assert without.significance > 5
+
+
+@pytest.mark.parametrize("parent", ["modulated", "fixed", "both", "crossed"])
+def test_a_measured_wave_is_the_ghosts_that_made_it(parent: str) -> None:
+    """Static, forward and backward amplitudes by themselves give the maps of the ghost."""
+    size, turn, beat = 0.01, 0.7, (0.31, -0.2)
+    ghost = GhostFringes(size, beat, turn, parent)
+    a, b = size * np.exp(1j * turn), size * np.exp(-1j * turn)
+    moving = parent in ("modulated", "both"), parent in ("fixed", "both")
+    static = (1 + (parent == "both")) * b
+    wave = GhostWave(
+        beat,
+        static=(static.real, static.imag),
+        forward=(a.real, a.imag) if moving[0] else (0.0, 0.0),
+        backward=(b.real, b.imag) if moving[1] else (0.0, 0.0),
+    )
+    maps = FringeMaps(np.random.default_rng(3).random((3, 19, 23)) + 1, (0.7, 0.1), (5, 40))
+    expected = ghost.predict(maps).theta
+    found = GhostFringes(0.0, beat, waves=(wave,)).predict(maps).theta
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    y, x = np.indices((19, 23))
+    wave_of_mean = 1 + (1 + (parent == "both")) * size * np.cos(
+        beat[0] * (x + 40) + beat[1] * (y + 5) + turn
+    )
+    # But for the ghost's own light.
+    np.testing.assert_allclose(found[0], maps.theta[0] * wave_of_mean, rtol=2 * size**2)

@@ -8,7 +8,7 @@ import pytest
 
 from pixcal.effects.intra_pixel_response import IntraPixelResponse, transfer
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.kernels.scene import detector_maps, light_maps
+from pixcal.kernels.scene import detector_maps, fringe_light
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import FringeMaps
 from pixcal.simulation.recording import recordings
@@ -29,10 +29,10 @@ def test_amplitudes_fall_by_it_and_all_else_stays(make_effect_bench: Callable[..
     for r in recordings(bench):
         if r.kind != "fringes":
             continue
-        plain = light_maps(bench, r.number, rows, maps, 2e4)
-        on = effect.light(plain, r, rows, maps)
+        plain = fringe_light(bench, r.number, rows, maps, 2e4).collected(maps.response)
+        on = effect.pixels(plain, r, rows, maps)
         np.testing.assert_array_equal(on.iota, plain.iota)
-        ratio = (on.alpha_cos + 1j * on.alpha_sin) / (plain.alpha_cos + 1j * plain.alpha_sin)
+        ratio = on.phasor / plain.phasor
         np.testing.assert_allclose(np.angle(ratio), 0, atol=1e-6)
         axis = r.number
         baseline = bench.frames.fringes[axis].baseline_mm[axis]

@@ -9,7 +9,8 @@ import pytest
 from pixcal.effects.hyperbolic_fringes import HyperbolicFringes
 from pixcal.effects.straylight import Straylight
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.kernels.scene import DetectorMaps, LightMaps
+from pixcal.kernels.beams import Light
+from pixcal.kernels.scene import DetectorMaps
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.light_fit import LightStart
 from pixcal.simulation.numbers import field_of, numbers, with_numbers
@@ -30,10 +31,10 @@ def drawn(evidence: Evidence, effect: Effect, seed: int) -> Evidence:
     fringes = {}
     for name, f in evidence.fringes.items():
         psi = f.k[0] * x + f.k[1] * y
-        plain = LightMaps(2e4 * one, 1.8e4 * np.sin(psi), 1.8e4 * np.cos(psi))
+        plain = Light.of_fringes(2e4 * one, 1.8e4 * np.exp(1j * psi))
         recording = set_recordings(evidence)[name]
         seen = effect.light(plain, recording, (0, shape[0]), maps)
-        theta = np.stack([seen.iota, seen.alpha_sin, seen.alpha_cos]).astype(float)
+        theta = np.stack([seen.mean, seen.phasor.imag, seen.phasor.real])
         theta += 2e4 * NOISE * rng.standard_normal(theta.shape)
         fringes[name] = replace(f, theta=theta)
     return replace(evidence, fringes=fringes)

@@ -9,7 +9,7 @@ import pytest
 
 from pixcal.effects.wavelength_drift import WavelengthDrift
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.kernels.scene import detector_maps, light_maps
+from pixcal.kernels.scene import detector_maps, fringe_light
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import states_of
 from pixcal.simulation.recording import recordings
@@ -34,8 +34,7 @@ def test_a_frame_is_as_a_bench_of_the_new_wavelength_makes_it(make_effect_bench:
     other = replace(bench, optics=replace(bench.optics, wavelength_nm=632.8 * (1 + epsilon)))
     phase = []
     for scene in (bench, other):
-        light = light_maps(scene, 0, rows, maps, 1.0)
-        phase.append(light.alpha_cos + 1j * light.alpha_sin)
+        phase.append(fringe_light(scene, 0, rows, maps, 1.0).phasor)
     change = np.angle(phase[1] / phase[0])
     y, x = np.mgrid[: rows[1], : bench.detector.shape[1]]
     turned = (

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pixcal.kernels import scene
+from pixcal.kernels.beams import LightMaps
 from pixcal.model.bench import (
     SCHEMA,
     Bench,
@@ -107,6 +108,11 @@ def test_offsets_are_pixels_upon_stitching_blocks() -> None:
     assert abs((along_x * along_y).mean()) < 2e-3**2 * 4 / np.sqrt(along_x.size)
 
 
+def collected(maps: scene.DetectorMaps, electrons: float, rows: tuple[int, int] = ALL) -> LightMaps:
+    """What pixels collect of the first fringe set."""
+    return scene.fringe_light(BENCH, 0, rows, maps, electrons).collected(maps.response)
+
+
 def test_each_fibre_lights_a_gaussian() -> None:
     a, b = scene.fibre_light(BENCH, 0, ALL)
     y, x = np.mgrid[:211, :307]
@@ -123,7 +129,7 @@ def test_each_fibre_lights_a_gaussian() -> None:
 def test_the_fringes_have_the_visibility_and_the_peak() -> None:
     maps = scene.detector_maps(replace(DETECTOR, prnu_rms=0.0, dead_fraction=0.0), ALL)
     electrons = scene.electrons_per_unit(BENCH, 0)
-    light = scene.light_maps(BENCH, 0, ALL, maps, electrons)
+    light = collected(maps, electrons)
     a, b = scene.fibre_light(BENCH, 0, ALL)
     alpha = np.hypot(light.alpha_sin, light.alpha_cos)
     assert np.allclose(alpha / light.iota, 0.8 * 2 * np.sqrt(a * b) / (a + b), rtol=1e-6)
@@ -133,12 +139,11 @@ def test_the_fringes_have_the_visibility_and_the_peak() -> None:
 def test_response_and_offsets_act_on_the_light() -> None:
     maps = scene.detector_maps(DETECTOR, (64, 100))
     flat = replace(maps, response=np.ones_like(maps.response))
-    light = scene.light_maps(BENCH, 0, (64, 100), maps, 5.0)
-    even = scene.light_maps(BENCH, 0, (64, 100), flat, 5.0)
+    light, even = (collected(own, 5.0, (64, 100)) for own in (maps, flat))
     assert np.allclose(light.iota, even.iota * maps.response, rtol=1e-6)
     psi = np.arctan2(even.alpha_sin, even.alpha_cos)
     here = replace(flat, delta_x=0 * maps.delta_x, delta_y=0 * maps.delta_y)
-    centred = scene.light_maps(BENCH, 0, (64, 100), here, 5.0)
+    centred = collected(here, 5.0, (64, 100))
     shift = np.angle(np.exp(1j * (psi - np.arctan2(centred.alpha_sin, centred.alpha_cos))))
     k = 2 * np.pi / 9.588
     # Fringes along y are insensitive to delta_y, and grow with delta_x.
@@ -152,6 +157,27 @@ def test_the_geometry_is_seen_from_the_window() -> None:
     own = scene.geometry(BENCH, 1)
     assert own.centre_x == pytest.approx((449.5 - 333) * 4.4e-3 + 1.0)
     assert (own.baseline_x, own.baseline_y) == (0.0, -3.0)
+
+
+def test_a_set_may_have_optics_of_its_own() -> None:
+    own = dict(
+        distance_mm=410.0, beam_radius_mm=2.5, pointing_a_mm=(0.4, 0.1), pointing_b_mm=(-0.2, 0.3),
+        power_ratio=1.4, visibility=0.6,
+    )  # fmt: skip
+    frames = replace(FRAMES, fringes=(VERTICAL, replace(VERTICAL, name="own", **own)))
+    bench = replace(BENCH, frames=frames)
+    shared = replace(BENCH, optics=replace(OPTICS, **own))
+    assert bench.optics_of(0) == OPTICS
+    assert bench.optics_of(1) == shared.optics
+    assert scene.geometry(bench, 1) == scene.geometry(shared, 0)
+    for rows in ((0, 40), (100, 211)):
+        found, expected = scene.fibre_light(bench, 1, rows), scene.fibre_light(shared, 0, rows)
+        np.testing.assert_array_equal(found, expected)
+    assert scene.electrons_per_unit(bench, 1) == scene.electrons_per_unit(shared, 0)
+    maps = scene.detector_maps(DETECTOR, ALL)
+    lights = (scene.fringe_light(b, n, ALL, maps, 5.0) for b, n in ((bench, 1), (shared, 0)))
+    one, other = (light.phasor for light in lights)
+    np.testing.assert_array_equal(one, other)
 
 
 def test_frames_are_what_was_asked_for() -> None:

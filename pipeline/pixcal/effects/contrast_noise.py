@@ -67,7 +67,7 @@ class ContrastNoise(Effect):
         time = np.arange(recording.count, dtype=float) * recording.period_s
         name = recording.bench.frames.fringes[recording.number].name
         factor *= np.maximum(1 + at(self.tracks, name, time), 0.0)
-        most = states.level / recording.bench.optics.visibility
+        most = states.level / recording.bench.optics_of(recording.number).visibility
         return replace(states, amplitude=np.minimum(states.amplitude * factor, most))
 
     def replayed(self, evidence: Evidence) -> Self | None:

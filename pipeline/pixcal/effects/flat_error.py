@@ -13,7 +13,8 @@ from pixcal.estimators.maps.map_fit import (
     without,
 )
 from pixcal.estimators.maps.ring_power import Ring, ring_power
-from pixcal.kernels.scene import TILE, DetectorMaps, LightMaps, Rows, chip_map
+from pixcal.kernels.beams import LightMaps
+from pixcal.kernels.scene import TILE, DetectorMaps, Rows, chip_map
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.bench import SimulatedDetector
 from pixcal.model.config import quantity
@@ -77,7 +78,7 @@ class FlatError(Effect):
         ]
         return np.asarray(np.sum(waves, axis=0) * np.sqrt(2 / WAVES))
 
-    def light(
+    def pixels(
         self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
     ) -> LightMaps:
         if recording.kind != "fringes":

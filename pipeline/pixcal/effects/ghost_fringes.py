@@ -8,14 +8,23 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.maps.map_waves import WaveFit, find_waves
-from pixcal.kernels.scene import DetectorMaps, LightMaps, Rows
+from pixcal.kernels.beams import FIXED, MODULATED, Beam, Light
+from pixcal.kernels.scene import DetectorMaps, Rows
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
 from pixcal.model.arrays import C128, F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
 
-PARENTS = ("modulated", "fixed", "both", "crossed")
+Beat = tuple[float, float]
+Parent = tuple[str, bool]  # a fibre, and whether the ghost is crossed with the other one
+_EVERY_PARENT: tuple[Parent, ...] = ((MODULATED, False), (FIXED, False), (MODULATED, True))
+PARENTS: dict[str, tuple[Parent, ...]] = {
+    "modulated": _EVERY_PARENT[:1],
+    "fixed": _EVERY_PARENT[1:2],
+    "both": _EVERY_PARENT[:2],
+    "crossed": _EVERY_PARENT[2:],
+}
 # static, forward and backward fringes by the ghost of one fibre, of one amplitude; laws of the
 # amplitudes
 SINGLE = {
@@ -49,6 +58,12 @@ class GhostWave:
     backward: tuple[float, float] = quantity(
         (0.0, 0.0), low=-0.9, high=0.9, doc="the same of the fringes at fringe vector minus beat"
     )
+
+    @property
+    def of_beams(self) -> tuple[complex, ...]:
+        """Amplitudes of the three ghosts, in the order of `_EVERY_PARENT`, that make this wave."""
+        forward, backward = complex(*self.forward), complex(*self.backward).conjugate()
+        return forward, backward, complex(*self.static).conjugate() - forward - backward
 
     def scaled(self, factor: float) -> Self:
         """The same wave, ``factor`` times as strong."""
@@ -101,53 +116,48 @@ class GhostFringes(Effect):
         high=1e3,
         doc="phase of the beat in the first pixel of the window",
     )
-    parent: str = quantity("modulated", choices=PARENTS, doc="reflected fibre")
+    parent: str = quantity("modulated", choices=tuple(PARENTS), doc="reflected fibre")
     in_flats: bool = quantity(False, doc="whether the flats contain the static pattern too")
     waves: tuple[GhostWave, ...] = quantity((), doc="measured ghosts, in addition to the one above")
 
-    def _waves(self, of: str) -> list[GhostWave]:
-        """All waves of a set."""
-        size, turn = self.share, self.phase_rad
-        one = (size * np.cos(turn), -size * np.sin(turn))
-        other = (size * np.cos(turn), size * np.sin(turn))
-        nothing = (0.0, 0.0)
-        twice = 2 if self.parent == "both" else 1
-        own = GhostWave(
-            self.beat_rad_px,
-            static=(twice * one[0], twice * one[1]),
-            forward=other if self.parent in ("modulated", "both") else nothing,
-            backward=one if self.parent in ("fixed", "both") else nothing,
-        )
-        return [w for w in (own, *self.waves) if w.set in ("", of)]
+    def _ghosts(self, of: str) -> list[tuple[Beat, complex, Parent]]:
+        """Beat, amplitude over the parent's, and parent of all ghosts in a set."""
+        own = self.share * np.exp(1j * self.phase_rad)
+        ghosts = [(self.beat_rad_px, own, parent) for parent in PARENTS[self.parent]]
+        for wave in self.waves:
+            if wave.set in ("", of):
+                each = zip(wave.of_beams, _EVERY_PARENT, strict=True)
+                ghosts += [(wave.beat_rad_px, amplitude, parent) for amplitude, parent in each]
+        return [ghost for ghost in ghosts if ghost[1]]
+
+    def _reflected(self, light: Light, of: str, rows: Rows, columns: Rows) -> Light:
+        """Light with its ghosts, on rows and columns."""
+        y, x = np.arange(*rows)[:, None], np.arange(*columns)
+        ghosts: list[Beam] = []
+        for (qx, qy), amplitude, (fibre, crossed) in self._ghosts(of):
+            phase = qx * x + qy * y + np.angle(amplitude)
+            ghosts += [
+                beam.reflected(abs(amplitude), phase, crossed=crossed)
+                for beam in light.beams
+                if beam.fibre == fibre
+            ]
+        return light.with_beams(ghosts)
 
     def _factors(self, of: str, rows: Rows, columns: Rows) -> tuple[F64, C128]:
         """By what mean light and fringe phasor (y, x) are multiplied on rows and columns."""
-        y, x = np.arange(*rows)[:, None], np.arange(*columns)
-        mean = np.ones((len(y), len(x)))
-        fringe = np.ones(mean.shape, complex)
-        for wave in self._waves(of):
-            e = np.exp(1j * (wave.beat_rad_px[0] * x + wave.beat_rad_px[1] * y))
-            mean += wave.static[0] * e.real + wave.static[1] * e.imag
-            fringe += complex(*wave.forward) * e + complex(*wave.backward) * e.conj()
-        return mean, fringe
+        one = np.ones((rows[1] - rows[0], columns[1] - columns[0]))
+        light = self._reflected(Light.of_fringes(one, one.astype(complex)), of, rows, columns)
+        return light.mean, light.phasor
 
-    def light(
-        self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
-    ) -> LightMaps:
-        columns = (0, light.iota.shape[1])
+    def light(self, light: Light, recording: Recording, rows: Rows, maps: DetectorMaps) -> Light:
+        columns = (0, maps.response.shape[1])
         if recording.kind == "flat" and self.in_flats:
             mean, _ = self._factors("", rows, columns)
-            return replace(light, iota=light.iota * mean.astype(np.float32))
+            return light.masked(mean)
         if recording.kind != "fringes":
             return light
         name = recording.bench.frames.fringes[recording.number].name
-        mean, fringe = self._factors(name, rows, columns)
-        z = (light.alpha_cos + 1j * light.alpha_sin) * fringe
-        return LightMaps(
-            light.iota * mean.astype(np.float32),
-            z.imag.astype(np.float32),
-            z.real.astype(np.float32),
-        )
+        return self._reflected(light, name, rows, columns)
 
     def predict(self, maps: FringeMaps) -> FringeMaps:
         return self._times(maps, 1)

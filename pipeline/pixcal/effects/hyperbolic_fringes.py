@@ -6,8 +6,9 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels import optics
+from pixcal.kernels.beams import MODULATED, Light
 from pixcal.kernels.optics import Geometry
-from pixcal.kernels.scene import DetectorMaps, LightMaps, Rows, geometry
+from pixcal.kernels.scene import DetectorMaps, Rows, geometry
 from pixcal.model.arrays import F64
 from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
@@ -76,21 +77,15 @@ class HyperbolicFringes(Effect):
     )
     pairs: tuple[FibrePair, ...] = quantity((), doc="position of the fibre pair of each set")
 
-    def light(
-        self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
-    ) -> LightMaps:
+    def light(self, light: Light, recording: Recording, rows: Rows, maps: DetectorMaps) -> Light:
         if recording.kind != "fringes":
             return light
         bench = recording.bench
         x = np.arange(bench.detector.shape[1]) + maps.delta_x.astype(float)
         y = np.arange(*rows)[:, None] + maps.delta_y.astype(float)
         turn = self.share * bending(x, y, self.geometry(bench, recording.number))
-        cos, sin = np.cos(turn).astype(np.float32), np.sin(turn).astype(np.float32)
-        return replace(
-            light,
-            alpha_sin=light.alpha_sin * cos + light.alpha_cos * sin,
-            alpha_cos=light.alpha_cos * cos - light.alpha_sin * sin,
-        )
+        beams = (b.delayed(turn) if b.fibre == MODULATED else b for b in light.beams)
+        return replace(light, beams=tuple(beams))
 
     def geometry(self, bench: Bench, number: int) -> Geometry:
         """That of a fringe set, with the foot and the distance given, of the same fringe vector."""

@@ -11,8 +11,9 @@ from pixcal.estimators.frame_series.fringe_motion import CROSSED
 from pixcal.estimators.maps.map_fit import gauge_terms, half_theta, neighbour_products, without
 from pixcal.estimators.maps.structure import without_outliers
 from pixcal.kernels import optics
+from pixcal.kernels.beams import LightMaps
 from pixcal.kernels.normal_matrix import inverse_normal
-from pixcal.kernels.scene import TILE, DetectorMaps, LightMaps, Rows, chip_map, geometry
+from pixcal.kernels.scene import TILE, DetectorMaps, Rows, chip_map, geometry
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.config import quantity
@@ -57,7 +58,7 @@ class IntraPixelResponse(Effect):
         0.005, unit="px", low=0, high=0.5, doc="rms of the width from pixel to pixel, each axis"
     )
 
-    def light(
+    def pixels(
         self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
     ) -> LightMaps:
         if recording.kind != "fringes":

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.polynomial.legendre import leggrid2d
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.kernels.scene import DetectorMaps, LightMaps, Rows
+from pixcal.kernels.beams import Light
+from pixcal.kernels.scene import DetectorMaps, Rows
 from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, FringeMaps, LightStart, Stage
@@ -104,14 +105,12 @@ class Straylight(Effect):
                 share = share + pattern.share(y, x)
         return np.asarray(np.maximum(share, 0.0))
 
-    def light(
-        self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
-    ) -> LightMaps:
+    def light(self, light: Light, recording: Recording, rows: Rows, maps: DetectorMaps) -> Light:
         if recording.kind != "fringes":
             return light
         name = recording.bench.frames.fringes[recording.number].name
-        more = 1 + self.pattern(rows, (0, light.iota.shape[1]), name)
-        return replace(light, iota=light.iota * more.astype(np.float32))
+        share = self.pattern(rows, (0, maps.response.shape[1]), name)
+        return light.with_incoherent(share * light.power)
 
     def predict(self, maps: FringeMaps) -> FringeMaps:
         """As in `Effect.predict`: iota alone changes."""

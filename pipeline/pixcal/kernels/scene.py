@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.kernels import optics
+from pixcal.kernels.beams import MODULATED, Beam, Light
 from pixcal.kernels.synthesis import BLOCK_ROWS, Stream, fill_normal, generator, turns
 from pixcal.model.arrays import F32, F64, U8
 from pixcal.model.bench import Bench, SimulatedDetector
@@ -128,14 +129,13 @@ def _stitches(d: SimulatedDetector, ty: int, tx: int) -> tuple[F32, F32]:
 
 def geometry(bench: Bench, number: int) -> optics.Geometry:
     """True geometry of a fringe set, from the first pixel of the window."""
-    d, o, scan = bench.detector, bench.optics, bench.frames.fringes[number]
+    d, o, scan = bench.detector, bench.optics_of(number), bench.frames.fringes[number]
     pitch = d.pitch_um * 1e-3
-    offset = o.offset_mm if scan.offset_mm is None else scan.offset_mm
     return optics.Geometry(
         wavelength=o.wavelength_nm * 1e-6,
         pitch=pitch,
-        centre_x=d.chip_centre_px[0] * pitch + offset[0],
-        centre_y=d.chip_centre_px[1] * pitch + offset[1],
+        centre_x=d.chip_centre_px[0] * pitch + o.offset_mm[0],
+        centre_y=d.chip_centre_px[1] * pitch + o.offset_mm[1],
         distance=o.distance_mm,
         baseline_x=scan.baseline_mm[0],
         baseline_y=scan.baseline_mm[1],
@@ -145,7 +145,7 @@ def geometry(bench: Bench, number: int) -> optics.Geometry:
 
 def fibre_light(bench: Bench, number: int, rows: Rows) -> tuple[F64, F64]:
     """Gaussian beams A and B alone (y, x), at centres of a perfect grid, over the peak of A."""
-    g, o = geometry(bench, number), bench.optics
+    g, o = geometry(bench, number), bench.optics_of(number)
     x = np.arange(bench.detector.shape[1])
     y = np.arange(*rows)[:, None]
     light = []
@@ -160,57 +160,28 @@ def fibre_light(bench: Bench, number: int, rows: Rows) -> tuple[F64, F64]:
 
 def electrons_per_unit(bench: Bench, number: int) -> float:
     """Electrons for one unit of `fibre_light`: makes the brightest fringe of the window peak_e."""
-    ny = bench.detector.shape[0]
+    ny, visibility = bench.detector.shape[0], bench.optics_of(number).visibility
     brightest = 0.0
     for row in range(0, ny, BLOCK_ROWS):
         a, b = fibre_light(bench, number, (row, min(row + BLOCK_ROWS, ny)))
-        bright = a + b + 2 * bench.optics.visibility * np.sqrt(a * b)
+        bright = a + b + 2 * visibility * np.sqrt(a * b)
         brightest = max(brightest, float(bright.max()))
     return bench.frames.fringes[number].peak_e / brightest
 
 
-@dataclass(frozen=True)
-class LightMaps:
-    """Response to the fringes of rows of the window, as `synthesis.illuminate` takes it; e-."""
-
-    iota: F32
-    alpha_sin: F32
-    alpha_cos: F32
-
-
-def with_margin(light: LightMaps, margin: int) -> LightMaps:
-    """The light with a margin of pixels like those at the edge, in which the fringes go on.
-
-    By the step of the phase along each row, and from row to row at the edge: a piece of the window
-    has the same margin as the whole where both end.
-    """
-    z = light.alpha_cos + 1j * light.alpha_sin
-    beyond = np.arange(1, margin + 1)
-    step = np.angle(np.sum(z[:, 1:] * z[:, :-1].conj(), axis=1))[:, None]
-    left, right = np.exp(-1j * step * beyond[::-1]), np.exp(1j * step * beyond)
-    z = np.hstack([z[:, :1] * left, z, z[:, -1:] * right])
-    up, down = (np.angle(np.sum(b * a.conj())) for a, b in ((z[:2][-1], z[0]), (z[-2:][0], z[-1])))
-    above, below = np.exp(1j * up * beyond[::-1, None]), np.exp(1j * down * beyond[:, None])
-    z = np.vstack([z[:1] * above, z, z[-1:] * below])
-    iota = np.pad(light.iota, margin, "edge")
-    return LightMaps(iota, z.imag.astype(np.float32), z.real.astype(np.float32))
-
-
-def light_maps(
+def fringe_light(
     bench: Bench, number: int, rows: Rows, maps: DetectorMaps, electrons: float
-) -> LightMaps:
-    """Mean and amplitude of straight fringes, through the pixels' response and at their offsets.
+) -> Light:
+    """The two fibres' beams at the pixels' true places, with straight fringes.
 
     On rows of the window with their maps; ``electrons`` is from `electrons_per_unit`.
     """
-    a, b = fibre_light(bench, number, rows)
+    a, b = (np.sqrt(electrons * light) for light in fibre_light(bench, number, rows))
     x = np.arange(bench.detector.shape[1]) + maps.delta_x.astype(np.float64)
     y = np.arange(*rows)[:, None] + maps.delta_y.astype(np.float64)
     psi = optics.paraxial_phase(x, y, geometry(bench, number))
-    iota = electrons * maps.response * (a + b)
-    alpha = electrons * maps.response * 2 * bench.optics.visibility * np.sqrt(a * b)
-    parts = (iota, alpha * np.sin(psi), alpha * np.cos(psi))
-    return LightMaps(*(part.astype(np.float32) for part in parts))
+    beams = Beam(a, psi, MODULATED), Beam(b, 0.0)
+    return Light(beams, bench.optics_of(number).visibility)
 
 
 @dataclass(frozen=True)

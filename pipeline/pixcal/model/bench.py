@@ -1,6 +1,6 @@
 """A bench to simulate: everything ``pixcal simulate`` needs to know, schema ``pixcal/bench/1``."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, ClassVar
@@ -193,6 +193,24 @@ class SimulatedSet:
     offset_mm: tuple[float, float] | None = quantity(
         None, unit="mm", low=-1e5, high=1e5, doc="centre of this pair; default: that in optics"
     )
+    distance_mm: float | None = quantity(
+        None, unit="mm", low=0.1, high=1e7, doc="of this pair, true; default: that in optics"
+    )
+    beam_radius_mm: float | None = quantity(
+        None, unit="mm", low=1e-3, high=1e7, doc="of this pair's light; default: that in optics"
+    )
+    pointing_a_mm: tuple[float, float] | None = quantity(
+        None, unit="mm", low=-1e5, high=1e5, doc="of this pair's fibre A; default: that in optics"
+    )
+    pointing_b_mm: tuple[float, float] | None = quantity(
+        None, unit="mm", low=-1e5, high=1e5, doc="of this pair's fibre B; default: that in optics"
+    )
+    power_ratio: float | None = quantity(
+        None, low=1e-3, high=1e3, doc="of this pair, B over A; default: that in optics"
+    )
+    visibility: float | None = quantity(
+        None, above=0, high=1, doc="of this pair; default: that in optics"
+    )
     phase_law: str = quantity(
         "random", choices=("random", "ramp"), doc="random: uniform over 2π; ramp: equal steps"
     )
@@ -300,6 +318,13 @@ class Bench:
         hash=False,
         metadata={"doc": "effects to add: their names and parameters"},
     )
+
+    def optics_of(self, number: int) -> SimulatedOptics:
+        """Optics of a fringe set, by its number: what the set says goes before ``optics``."""
+        scan = self.frames.fringes[number]
+        shared = {f.name for f in fields(SimulatedOptics)} & {f.name for f in fields(scan)}
+        given = {name: getattr(scan, name) for name in shared}
+        return replace(self.optics, **{n: v for n, v in given.items() if v is not None})
 
 
 def load_bench(path: Path) -> Bench:

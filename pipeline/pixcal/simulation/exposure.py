@@ -14,16 +14,9 @@ from typing import TypeVar
 import numpy as np
 
 from pixcal.kernels import synthesis
+from pixcal.kernels.beams import Beam, Light, LightMaps, with_margin
 from pixcal.kernels.normals import Key, pixel_normals
-from pixcal.kernels.scene import (
-    FrameStates,
-    LightMaps,
-    Rows,
-    detector_maps,
-    frame_states,
-    light_maps,
-    with_margin,
-)
+from pixcal.kernels.scene import FrameStates, Rows, detector_maps, frame_states, fringe_light
 from pixcal.kernels.synthesis import BLOCK_ROWS
 from pixcal.model.arrays import F32, U16
 from pixcal.model.bench import Bench
@@ -190,13 +183,15 @@ class _Chain:
     def light(self) -> LightMaps:
         r, maps, rows = self.recording, self.camera.maps, self.camera.rows
         if r.kind == "fringes":
-            light = light_maps(r.bench, r.number, rows, maps, r.electrons)
+            light = fringe_light(r.bench, r.number, rows, maps, r.electrons)
         else:
-            nothing = np.zeros_like(maps.response)
-            light = LightMaps(maps.response * np.float32(r.electrons), nothing, nothing)
+            light = Light((Beam(np.full((1, 1), np.sqrt(r.electrons)), 0.0),))
         for effect in self.effects:
             light = effect.light(light, r, rows, maps)
-        return light
+        collected = light.collected(maps.response)
+        for effect in self.effects:
+            collected = effect.pixels(collected, r, rows, maps)
+        return collected
 
     def mean(self, frame: int, upto: int) -> F32:
         """Mean electrons, by the first ``upto`` effects."""

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, ClassVar, Self
 
-from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
+from pixcal.kernels.beams import Light, LightMaps
+from pixcal.kernels.scene import DetectorMaps, FrameStates, Rows
 from pixcal.model.arrays import F32
 from pixcal.model.bench import Bench
 from pixcal.simulation.recording import Recording
@@ -111,10 +112,14 @@ class ForwardModel:
         """The detector's maps on some rows of the window (first, one after the last)."""
         return maps
 
-    def light(
+    def light(self, light: Light, recording: Recording, rows: Rows, maps: DetectorMaps) -> Light:
+        """Beams and other light of a recording on some rows, before the pixels."""
+        return light
+
+    def pixels(
         self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
     ) -> LightMaps:
-        """Mean and fringe amplitude on some rows (e-); of flats only the mean."""
+        """What pixels collect of the light on some rows: mean and fringe amplitude, e-."""
         return light
 
     def photons(self, mean: F32, shot: Shot) -> F32:

@@ -208,5 +208,5 @@ def unit_of(model: ForwardModel, name: str) -> str:
 
 def acts_on_frames_alone(kind: type[ForwardModel]) -> bool:
     """Whether a model changes the states of frames, and nothing else."""
-    steps = ("states", "detector", "light", "photons", "charge", "signal", "readout")
+    steps = ("states", "detector", "light", "pixels", "photons", "charge", "signal", "readout")
     return [s for s in steps if getattr(kind, s) is not getattr(ForwardModel, s)] == ["states"]

@@ -20,9 +20,10 @@ from pixcal.estimators.maps.map_fit import (
     phase_map,
     polynomial,
 )
+from pixcal.kernels.beams import Light
 from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.robust import median
-from pixcal.kernels.scene import DetectorMaps, LightMaps
+from pixcal.kernels.scene import DetectorMaps
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import C128, F64, Mask
 from pixcal.simulation.forward import ForwardModel
@@ -111,7 +112,7 @@ class _Lit:
     data: F64 = field(repr=False)
     shared: float  # share of the visibility that is taken off the light
     gauge: F64 = field(repr=False)  # (4, y, x) fringe modes that the fit leaves open
-    light: LightMaps = field(repr=False)  # of all columns up to the part's last
+    light: Light = field(repr=False)  # of all columns up to the part's last
     maps: DetectorMaps = field(repr=False)
 
     @classmethod
@@ -126,6 +127,7 @@ class _Lit:
         shared = _shared(data[0], data[1], good)
         data[0] -= shared * data[1]
         plain = filled(np.where(good, found.theta, np.nan), found.k)
+        iota_all, sine, cosine = (np.pad(m, ((0, 0), (x0, 0)), "edge") for m in plain)
         nothing = np.zeros((ny, x0 + nx), np.float32)
         one = np.ones_like(nothing)
         bench, window = recording.bench, (found.window[0], x0 + nx)
@@ -138,7 +140,7 @@ class _Lit:
             data,
             shared,
             gauge_terms(found),
-            LightMaps(*(np.pad(m, ((0, 0), (x0, 0)), "edge").astype(np.float32) for m in plain)),
+            Light.of_fringes(iota_all, cosine + 1j * sine),
             DetectorMaps(
                 nothing, nothing, one, nothing, nothing, nothing, one, nothing.astype(np.uint8)
             ),
@@ -147,12 +149,11 @@ class _Lit:
     def change(self, model: ForwardModel) -> F64:
         """What a model does to the maps (3, y, x)."""
         own, light = model.light(self.light, self.recording, self.rows, self.maps), self.light
-        found = np.zeros((3, *light.iota.shape))
-        if own.iota is not light.iota:
-            found[0] = np.log(np.maximum(own.iota / light.iota.astype(float), 1e-9))
+        found = np.zeros((3, *light.mean.shape))
+        found[0] = np.log(np.maximum(own.mean / light.mean, 1e-9))
         found[1] = -found[0]
-        if own.alpha_cos is not light.alpha_cos:
-            ratio = _phasor(own) / _phasor(light)
+        if own.beams is not light.beams:
+            ratio = own.phasor / np.where(light.phasor == 0, 1e-9, light.phasor)
             found[1] += np.log(np.maximum(np.abs(ratio), 1e-9))
             found[2] = _bent(ratio)
         found[0] -= self.shared * found[1]
@@ -166,11 +167,6 @@ def _shared(light: F64, visibility: F64, good: Mask) -> float:
     kept = np.all([abs(own) < CLIP * np.median(abs(own)) for own in steps], axis=0)
     of_light, other = (own[kept] for own in steps)
     return float(of_light @ other) / max(float(other @ other), 1e-300)
-
-
-def _phasor(light: LightMaps) -> C128:
-    found = light.alpha_cos.astype(float) + 1j * light.alpha_sin
-    return np.where(found == 0, 1e-9, found)
 
 
 def _bent(turn: C128) -> F64:

@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
+from pixcal.kernels.beams import Light
 from pixcal.kernels.crosstalk import filled
-from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
+from pixcal.kernels.scene import DetectorMaps, FrameStates, Rows
 from pixcal.model.arrays import F32, F64, Indices
 from pixcal.model.bench import (
     SCHEMA,
@@ -43,7 +44,7 @@ class Fitted(ForwardModel):
     sources = ()
 
     maps: DetectorMaps
-    theta: tuple[F64, ...]  # maps of each fringe set, e-, through the pixels' response
+    theta: tuple[F64, ...]  # maps of each fringe set, e-, for unit response
     k: tuple[tuple[float, float], ...]  # fringe vector of each, rad/px
     frames: tuple[FrameStates, ...]  # of each set, from the first frame of its recording on
 
@@ -56,20 +57,14 @@ class Fitted(ForwardModel):
         """As in `ForwardModel.detector`."""
         return self.maps
 
-    def light(
-        self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
-    ) -> LightMaps:
-        """As in `ForwardModel.light`; offsets and response that were changed change it."""
+    def light(self, light: Light, recording: Recording, rows: Rows, maps: DetectorMaps) -> Light:
+        """As in `ForwardModel.light`; offsets that were changed change it."""
         if recording.kind != "fringes":
             return light
         iota, of_sine, of_cosine = self.theta[recording.number]
-        if maps is not self.maps:
-            kx, ky = self.k[recording.number]
-            turn = kx * (maps.delta_x - self.maps.delta_x) + ky * (maps.delta_y - self.maps.delta_y)
-            more = maps.response / np.where(self.maps.response > 0, self.maps.response, 1)
-            phasor = (of_cosine + 1j * of_sine) * np.exp(1j * turn) * more
-            iota, of_sine, of_cosine = iota * more, phasor.imag, phasor.real
-        return LightMaps(*(v.astype(np.float32) for v in (iota, of_sine, of_cosine)))
+        kx, ky = self.k[recording.number]
+        turn = kx * (maps.delta_x - self.maps.delta_x) + ky * (maps.delta_y - self.maps.delta_y)
+        return Light.of_fringes(iota, (of_cosine + 1j * of_sine) * np.exp(1j * turn))
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         """As in `ForwardModel.states`."""
@@ -146,7 +141,7 @@ def _fitted(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Fitted:
         np.full(shape, 1 / evidence.gain, np.float32),
         np.where(evidence.good, 0, 1).astype(np.uint8),
     )  # fmt: skip
-    theta = tuple(filled(np.where(s.good, s.theta, np.nan), s.k) * response for s in sets)
+    theta = tuple(filled(np.where(s.good, s.theta, np.nan), s.k) for s in sets)
     return Fitted(maps, theta, tuple(s.k for s in sets), tuple(_states(s) for s in sets))
 
 

@@ -4,7 +4,8 @@ from typing import Protocol
 
 import numpy as np
 
-from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
+from pixcal.kernels.beams import LightMaps
+from pixcal.kernels.scene import DetectorMaps, FrameStates, Rows
 from pixcal.model.arrays import F32
 from pixcal.model.bench import Bench
 from pixcal.simulation.recording import Recording

@@ -75,7 +75,7 @@ class SetBound:
     @classmethod
     def of(cls, bench: Bench, number: int, contrast: float = 1.0) -> "SetBound":
         """For a set of a bench, by its number, with ``contrast`` times the bench's visibility."""
-        scan, optics = bench.frames.fringes[number], bench.optics
+        scan, optics = bench.frames.fringes[number], bench.optics_of(number)
         x, y = grid(bench.detector.shape)
         a, b = (
             np.concatenate([fibre_light(bench, number, (row, row + 1))[fibre][:, x] for row in y])

@@ -63,7 +63,7 @@ Change = tuple[str, Bench, list[float] | None, str]
 
 def _changes(bench: Bench, now: JoinedBound) -> list[Change]:
     """(name, bench, contrast of each set, note) of every change that is one."""
-    d, o, f = bench.detector, bench.optics, bench.frames
+    d, f = bench.detector, bench.frames
     changes = _finer_fringes(bench, now)
 
     def add(name: str, note: str = "", **parts: Any) -> None:
@@ -82,10 +82,11 @@ def _changes(bench: Bench, now: JoinedBound) -> list[Change]:
     if d.read_noise_e > 0:
         quiet = replace(d, read_noise_e=d.read_noise_e / 2)
         add(f"read noise {quiet.read_noise_e:.3g} e-", detector=quiet)
-    if o.visibility < 0.995:
-        add("visibility 1", optics=replace(o, visibility=1.0))
-    if abs(np.log(o.power_ratio)) > 0.02:
-        add("fibres of equal power", optics=replace(o, power_ratio=1.0))
+    each = [bench.optics_of(n) for n in range(len(f.fringes))]
+    if min(one.visibility for one in each) < 0.995:
+        add("visibility 1", frames=with_sets(visibility=lambda _: 1.0))
+    if max(abs(np.log(one.power_ratio)) for one in each) > 0.02:
+        add("fibres of equal power", frames=with_sets(power_ratio=lambda _: 1.0))
     if any(s.loss[0] > 1.01 for s in now.sets):
         add("phases over the whole period", frames=with_sets(phase_law=lambda _: "random"))
     if f.period_s > 1.05 * f.exptime_s:

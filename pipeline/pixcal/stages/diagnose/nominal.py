@@ -17,7 +17,8 @@ import numpy as np
 
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.fringe_fit.fringes import grid
-from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
+from pixcal.kernels.beams import Light
+from pixcal.kernels.scene import DetectorMaps, FrameStates, Rows
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F32, F64, Indices
 from pixcal.model.bench import Bench
@@ -83,21 +84,14 @@ class Measured(Effect):
             m.read_noise[own], m.adu_per_e[own], m.mask[own],
         )  # fmt: skip
 
-    def light(
-        self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
-    ) -> LightMaps:
+    def light(self, light: Light, recording: Recording, rows: Rows, maps: DetectorMaps) -> Light:
         """As in `Effect.light`."""
         if recording.kind != "fringes":
             return light
         own, cut = self.sets[recording.number], slice(*rows)
         psi = own.phase(self.maps.delta_x, self.maps.delta_y)[cut]
-        iota = maps.response * own.light[cut]
-        alpha = own.contrast[cut] * iota
-        return LightMaps(
-            iota,
-            (alpha * np.sin(psi)).astype(np.float32),
-            (alpha * np.cos(psi)).astype(np.float32),
-        )
+        iota = own.light[cut].astype(float)
+        return Light.of_fringes(iota, own.contrast[cut] * iota * np.exp(1j * psi))
 
     def photons(self, mean: F32, shot: Shot) -> F32:
         """As in `Effect.photons`."""
@@ -204,11 +198,7 @@ class NominalBench:
         for recording in self.recordings:
             if recording.kind == "fringes":
                 own = replace(recording, bench=bench)
-                one, other = (
-                    light.alpha_cos + 1j * light.alpha_sin
-                    for light in (before.light(own), after.light(own))
-                )
-                turn = other * one.conj()
+                turn = after.light(own).phasor * before.light(own).phasor.conj()
                 y, x = grid(turn.shape)
                 dky = np.angle(np.sum(turn[1:] * turn[:-1].conj()))
                 dkx = np.angle(np.sum(turn[:, 1:] * turn[:, :-1].conj()))
