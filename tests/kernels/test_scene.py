@@ -1,6 +1,7 @@
 """The bench as arrays: one chip for every window, Gaussian light, visibility, frames."""
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -160,10 +161,14 @@ def test_the_geometry_is_seen_from_the_window() -> None:
 
 
 def test_a_set_may_have_optics_of_its_own() -> None:
-    own = dict(
-        distance_mm=410.0, beam_radius_mm=2.5, pointing_a_mm=(0.4, 0.1), pointing_b_mm=(-0.2, 0.3),
-        power_ratio=1.4, visibility=0.6,
-    )  # fmt: skip
+    own: dict[str, Any] = {
+        "distance_mm": 410.0,
+        "beam_radius_mm": 2.5,
+        "pointing_a_mm": (0.4, 0.1),
+        "pointing_b_mm": (-0.2, 0.3),
+        "power_ratio": 1.4,
+        "visibility": 0.6,
+    }
     frames = replace(FRAMES, fringes=(VERTICAL, replace(VERTICAL, name="own", **own)))
     bench = replace(BENCH, frames=frames)
     shared = replace(BENCH, optics=replace(OPTICS, **own))
