@@ -188,6 +188,27 @@ def test_ghosts_of_both_fibres_need_not_be_in_phase(acquired: Callable[..., Evid
         np.testing.assert_allclose(one.forward, other.forward, atol=1e-3)
 
 
+def test_a_ghost_may_have_the_vector_of_the_fringes_of_another_set(
+    acquired: Callable[..., Evidence],
+) -> None:
+    """Of these it is no harmonic."""
+    beat = (0.03, 0.53)
+    wave = {"beat_rad_px": list(beat), "set": "vertical", "static": [0.01, 0.0]}
+    # A period of 11.5 px: those of up to 8 may be the electronics'.
+    changes = {"frames.fringes.1.baseline_mm": [0.0, 5.0]}
+    evidence = acquired(changes, {"ghost_fringes": {"share": 0.0, "waves": [wave]}})
+    of_other = next(f.k for f in evidence.fringes.values() if f.name == "horizontal")
+    assert np.hypot(*np.subtract(of_other, beat)) < 2 * np.pi / max(evidence.good.shape)
+    found = GhostFringes.estimate(evidence)
+    assert found is not None
+    assert found.significance > 20
+    n, own = next((n, w) for n, w in enumerate(found.effect.waves) if w.set == "vertical")
+    sign = np.sign(own.beat_rad_px[1])
+    for axis in (0, 1):
+        error = found.errors[f"waves[{n}].beat_rad_px[{axis}]"]
+        assert abs(sign * own.beat_rad_px[axis] - beat[axis]) < 4 * error
+
+
 @pytest.mark.long
 def test_a_pattern_of_mean_light_and_fringes_alike_in_all_sets_is_the_flats(
     acquired: Callable[..., Evidence],

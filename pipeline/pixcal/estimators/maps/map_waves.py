@@ -102,13 +102,14 @@ def find_waves(evidence: Evidence, most: int = MOST) -> Waves | None:
     """The strongest waves in the maps of all sets, so many of each; None without enough pixels.
 
     The chance is that of the best of all waves that the window can tell apart; those near the
-    fringes' harmonics, near no wave at all, and of rows or columns that repeat are left out.
+    harmonics of a set's own fringes, near no wave at all, and of rows or columns that repeat are
+    left out.
     """
     sets = [f for f in evidence.fringes.values() if np.count_nonzero(f.good) > _MIN_PIXELS]
     if not sets:
         return None
     ways = {still: {f.name: _maps(f, evidence, still) for f in sets} for still in (False, True)}
-    allowed = _allowed(sets)
+    allowed = {f.name: _allowed(f) for f in sets}
     light, flats = (_gains(ways[still], allowed) for still in (False, True))
     # A pattern of the light that flats share is in flats and visibility, not in light over flat.
     in_flats = all(own > other + APART for own, other in zip(flats, light, strict=True))
@@ -141,12 +142,12 @@ def _maps(fringes: FringeEvidence, evidence: Evidence, in_flats: bool) -> list[_
     ]
 
 
-def _gains(maps: Maps, allowed: Mask) -> tuple[float, float]:
+def _gains(maps: Maps, allowed: Mapping[str, Mask]) -> tuple[float, float]:
     """Chi-square of the wave that is strongest in all maps.
 
     In light or flats, and in the map that shows it second best.
     """
-    q = _vector(sum((_power(own, allowed) for own in maps.values()), np.zeros(allowed.shape)))
+    q = _vector(_common({name: _power(own, allowed[name]) for name, own in maps.items()}))
     gains: dict[str, float] = {}
     for own in maps.values():
         for m in own:
@@ -154,18 +155,18 @@ def _gains(maps: Maps, allowed: Mask) -> tuple[float, float]:
     return next(iter(gains.values())), sorted(gains.values())[-2]
 
 
-def _strongest(maps: Maps, allowed: Mask, in_flats: bool) -> Waves:
+def _strongest(maps: Maps, allowed: Mapping[str, Mask], in_flats: bool) -> Waves:
     """The strongest wave of each set, of a vector common to all where that fits as well."""
-    power = {name: _power(own, allowed) for name, own in maps.items()}
-    common = sum(power.values(), np.zeros(allowed.shape))
-    apart = sum(float(p.max()) for p in power.values()) - float(common.max())
+    power = {name: _power(own, allowed[name]) for name, own in maps.items()}
+    apart = sum(float(p.max()) for p in power.values()) - float(_common(power).max())
     groups = [[name] for name in maps] if apart > APART and len(maps) > 1 else [list(maps)]
-    trials = 3 * np.count_nonzero(allowed) / 4
+    trials = 0.0
     waves: list[WaveFit] = []
     gains: dict[str, float] = {}
     dof = 2 * len(maps)
     for names in groups:
-        start = _vector(sum((power[n] for n in names), np.zeros(allowed.shape)))
+        together = _common({n: power[n] for n in names})
+        start, trials = _vector(together), trials + 3 * np.count_nonzero(together) / 4
         own = [(n, m) for n in names for m in maps[n]]
         fitted, q = _fitted(own, names, start)
         waves += fitted
@@ -173,7 +174,7 @@ def _strongest(maps: Maps, allowed: Mask, in_flats: bool) -> Waves:
             gains[m.kind] = gains.get(m.kind, 0.0) + _plain_gain(m, q)
     by_map = {kind: sigmas_of_chi2(gain, dof) for kind, gain in gains.items()}
     order = sorted(by_map, key=lambda kind: -by_map[kind])
-    first = _best_of(gains[order[0]], trials * len(groups), dof)
+    first = _best_of(gains[order[0]], trials, dof)
     significance = float(min(first, by_map[order[1]]))
     if order[0] == LIGHT:
         # Ghosts of both fibres alike move neither visibility nor phase.
@@ -209,17 +210,21 @@ def _power(maps: Sequence[_Map], allowed: Mask) -> F64:
     return np.where(allowed, total, 0.0)
 
 
-def _allowed(sets: Sequence[FringeEvidence]) -> Mask:
-    """Frequencies of a grid twice as fine as the window's where a wave is looked for."""
-    shape = sets[0].good.shape
+def _common(power: Mapping[str, F64]) -> F64:
+    """Chi-square of a wave of one vector in all of these sets, zero where one leaves it out."""
+    maps = np.stack(list(power.values()))
+    return np.asarray(np.where((maps > 0).all(axis=0), maps.sum(axis=0), 0.0))
+
+
+def _allowed(f: FringeEvidence) -> Mask:
+    """Frequencies of a grid twice as fine as the window's where a wave of a set is looked for."""
+    shape = f.good.shape
     fy, fx = np.meshgrid(*(np.fft.fftfreq(2 * n) for n in shape), indexing="ij")
     allowed = ~_of_lines(fx, fy, shape) & ((fy > 0) | ((fy == 0) & (fx > 0)))
-    for f in sets:
-        for n in range(HARMONICS + 1):
-            for sign in (1, -1):
-                dx, dy = fx - sign * n * f.k[0] / 2 / np.pi, fy - sign * n * f.k[1] / 2 / np.pi
-                far = np.hypot((dx - np.rint(dx)) * shape[1], (dy - np.rint(dy)) * shape[0])
-                allowed &= far > NEAR
+    for n in range(-HARMONICS, HARMONICS + 1):
+        dx, dy = fx - n * f.k[0] / 2 / np.pi, fy - n * f.k[1] / 2 / np.pi
+        far = np.hypot((dx - np.rint(dx)) * shape[1], (dy - np.rint(dy)) * shape[0])
+        allowed &= far > NEAR
     return np.asarray(allowed)
 
 
@@ -295,6 +300,6 @@ def _plain_gain(m: _Map, q: F64) -> float:
 
 def _best_of(gain: float, trials: float, dof: int) -> float:
     """Standard deviations as rare as the best chi-square of so many waves."""
-    log_rate = np.log(trials) + np.log(dof / 2) - gain / 2
+    log_rate = np.log(max(trials, 1.0)) + np.log(dof / 2) - gain / 2
     log_chance = log_rate if log_rate < -20 else np.log(-np.expm1(-np.exp(log_rate)))
     return -float(ndtri_exp(min(float(log_chance), -1e-300)))
