@@ -70,7 +70,7 @@ def test_waves_of_a_set_are_of_that_set_alone() -> None:
     np.testing.assert_allclose(other.theta, maps.theta, rtol=1e-15)
     own = ghost.predict(replace(maps, name="vertical"))
     y, x = np.mgrid[:40, :50]
-    # The light of the ghosts themselves: 0.007 of the modulated fibre's field, 0.003 of the other's.
+    # The ghosts' own light: 0.007 of the modulated fibre's field, 0.003 of the other's.
     itself = (0.007**2 + 0.003**2) / 2
     np.testing.assert_allclose(own.theta[0] / 2e4, 1 + itself + 0.01 * np.cos(0.3 * x - 0.2 * y))
     assert not ghost.is_null
