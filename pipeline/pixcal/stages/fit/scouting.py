@@ -24,6 +24,9 @@ CACHE_BYTES = 384 << 20
 PRIME_BYTES = 48 << 20  # memory for the codes of the scout's first look
 # chunks along time that the first look takes frames from: one may hold little of a slow scan
 LOOKS = 16
+# frames that the first look needs: the noise of its pixels then adds 2 % to the variance of the
+# frames' parameters, and its time grows with the square of them
+LOOK_FRAMES = 128
 
 
 @dataclass(frozen=True)
@@ -128,6 +131,7 @@ def _first_look(source: ReducedSet, blocks: int) -> list[tuple[int, Indices]]:
     """Blocks spread over the run and frames of each, as many in all as in ``blocks`` whole ones."""
     wanted = min(source.n_blocks, max(blocks, LOOKS))
     each = max(1, source.block * max(1, min(blocks, wanted)) // wanted)
+    each = min(each, -(-LOOK_FRAMES // wanted))
     # At random: frames at even steps may have the same phase again and again.
     rng = np.random.default_rng(0)
     looks = []
