@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 from scipy.special import erf
 
-from pixcal.effects.cosmic_hits import CosmicHits
+from pixcal.effects.cosmic_hits import CosmicHits, _rates
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.tracks import GRAZING, add_tracks, draw_tracks
 from pixcal.model.bench import Bench
@@ -80,6 +80,32 @@ def test_charge_stops_at_the_full_well(make_effect_bench: Callable[..., Bench]) 
     frames = frames_of(bench, dark, [CosmicHits(3e5)]).astype(float)
     assert np.sort((frames - frames.min(axis=0)).ravel())[-1] <= 905
     assert np.count_nonzero(frames > 1380) > 20
+
+
+@pytest.mark.parametrize("readout", [0.0, 40.0])
+@pytest.mark.parametrize("rate", [0.0, 12.0])
+def test_hits_while_frames_are_read_out_are_told_from_those_of_the_exposure(
+    rate: float, readout: float
+) -> None:
+    seconds, area = np.array([0.0, 1.0, 5.0]), np.array([3.0, 2.0, 2.0])
+    exposures, chances = np.stack([area * seconds, area]), np.full(3, 0.01)
+    pulls = []
+    for _ in range(40):
+        counts = RNG.poisson(rate * exposures[0] + readout * exposures[1]).astype(float)
+        values, errors = _rates(counts, exposures, chances)
+        assert len(values) == 1 + (readout > 0)
+        pulls += [(v - t) / e for v, t, e in zip(values, (rate, readout), errors, strict=False)]
+    assert np.abs(pulls).max() < 4.5
+    assert rate == 0 or 0.6 < np.std(pulls) < 1.4
+
+
+def test_frames_are_hit_while_they_are_read_out(make_effect_bench: Callable[..., Bench]) -> None:
+    bench = make_effect_bench({"detector.shape": [64, 61]})
+    bias = next(r for r in recordings(bench) if r.kind == "bias")
+    added = frames_of(bench, bias, [CosmicHits(0.0, 3e4)]).astype(float) - frames_of(bench, bias)
+    expected = 3e4 * 64 * 61 * (4.4e-4) ** 2 * bias.count
+    mean = 70 * 2 * 8.0 * (1 - GRAZING / 2) * (1 + 0.15 * stats.moyal.mean())
+    assert added.sum() / mean == pytest.approx(expected, abs=5 * 1.7 * np.sqrt(expected))
 
 
 @pytest.mark.long

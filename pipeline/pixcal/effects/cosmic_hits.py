@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.kernels.significance import sigmas_of_count
+from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_count
 from pixcal.kernels.tracks import add_tracks, draw_tracks
 from pixcal.model.arrays import F32, F64, Indices, Mask
 from pixcal.model.config import quantity
@@ -31,11 +31,15 @@ _RARE = 0.01
 _BRIGHTEST = 4
 # outliers of the noise itself over those of a Gaussian: shot noise of faint light is skewed
 _SKEW = 5.0
+_STEPS = 300  # of the maximisation
+_FEWEST = 1e-6
 
 
 @dataclass(frozen=True)
 class CosmicHits(Effect):
     """Straight tracks of particles through the sensitive layer, in proportion to the exposure time.
+
+    While a frame waits to be read out it is hit as well: bias frames of a large, slow detector are.
 
     A track leaves charge in proportion to its length, with the fluctuations of thin layers, and the
     charge spreads before it is collected. Nothing of it is constant in time, so maps of the fit
@@ -47,7 +51,7 @@ class CosmicHits(Effect):
     acts_at = Stage.CHARGE
     order = 2
     domains = ("noise",)
-    strengths = ("rate_cm2_s",)
+    strengths = ("rate_cm2_s", "readout_cm2")
     left_because = "few samples are hit, and most of them are masked"
     frames_needed = ("dark",)
     sources = (
@@ -62,6 +66,10 @@ class CosmicHits(Effect):
     rate_cm2_s: float = quantity(
         0.03, unit="/(cm² s)", low=0, high=1e7, doc="flux of particles through the detector"
     )
+    readout_cm2: float = quantity(
+        0.0, unit="/cm²", low=0, high=1e7, doc="hits in each frame beside the exposure, while it "
+        "is read out"
+    )  # fmt: skip
     electrons_per_um: float = quantity(
         70.0, unit="e-/um", above=0, high=1e4, doc="most probable charge per length of track"
     )
@@ -80,7 +88,7 @@ class CosmicHits(Effect):
         rng = recording.pixel_rng(self.name, shot.frame)
         # Where no exposure time is known, frames with light last as long as they are apart.
         seconds = recording.exptime_s or (recording.period_s if recording.kind != "bias" else 0.0)
-        count = int(rng.poisson(self.rate_cm2_s * area * seconds))
+        count = int(rng.poisson((self.rate_cm2_s * seconds + self.readout_cm2) * area))
         if not count:
             return charge
         found = charge.copy()
@@ -99,45 +107,72 @@ class CosmicHits(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Outliers upwards in single frames, less those downwards, in darks and fringe frames.
+        """Outliers upwards in single frames, less those downwards, beside all light.
 
         A pixel that does it again is not hit but noisy, and does not count. Tracks are drawn to
-        know how many stay below the noise.
+        know how many stay below the noise. Frames of several exposure times, bias frames among
+        them, tell hits while they are read out.
         """
-        searches = [s for s in _searches(evidence) if s.exposure > 0]
-        if not searches:
+        searches = list(_searches(evidence))
+        if not any(s.seconds > 0 for s in searches):
             return None
         drawn = _Drawn(cls(), evidence.pitch_um)
         # Where the noise differs from pixel to pixel a track is not found by its brightest one.
         even = [s for s in searches if s.even] or searches
         scale, scale_error = _scale(even, drawn)
-        seen = sum(
-            float(s.exposure * np.mean([drawn.seen(scale, sigma, s.limit) for sigma in s.sigmas]))
+        seen = [
+            s.area * float(np.mean([drawn.seen(scale, sigma, s.limit) for sigma in s.sigmas]))
             for s in searches
-        )
-        if seen <= 0:
+        ]
+        exposures = np.array([(a * s.seconds, a) for a, s in zip(seen, searches, strict=True)]).T
+        if not exposures[0].sum() > 0:
             return None
-        chance = _SKEW * sum(s.samples for s in searches) * float(ndtr(-THRESHOLD))
-        chance = max(chance, float(sum(s.downwards for s in searches)))
-        count = sum(len(s.peaks) for s in searches)
-        default = cls().electrons_per_um
-        errors = {"rate_cm2_s": float(np.sqrt(max(count, 1)) / seen)}
+        chances = np.array([
+            max(_SKEW * s.samples * float(ndtr(-THRESHOLD)), s.downwards) for s in searches
+        ])  # fmt: skip
+        counts = np.array([float(len(s.peaks)) for s in searches])
+        values, spread = _rates(counts, exposures, chances)
+        errors = dict(zip(cls.strengths, spread, strict=False))
         if scale_error is not None:
-            errors["electrons_per_um"] = default * scale_error
+            errors["electrons_per_um"] = cls().electrons_per_um * scale_error
+        count, chance = int(counts.sum()), float(chances.sum())
         return Estimate(
-            cls(max(count - chance, 0.0) / seen, default * scale),
+            cls(*values, electrons_per_um=cls().electrons_per_um * scale),
             errors,
             sigmas_of_count(count, chance),
             "samples in single frames far above the pixel's other frames",
-            {"hits": count, "expected_by_chance": chance, "seen_cm2_s": seen},
+            {"hits": count, "expected_by_chance": chance, "seen_cm2_s": float(exposures[0].sum())},
         )
+
+
+def _rates(counts: F64, exposures: F64, chances: F64) -> tuple[list[float], list[float]]:
+    """Hits an exposure, and errors: of the first kind, and of the second if it is significant.
+
+    ``counts, chances``: (n,) hits, and how many of them are none; ``exposures``: (2, n).
+    """
+    found: list[tuple[F64, F64]] = []
+    for own in (exposures[:1], exposures):
+        # Maximum of the likelihood of Poisson counts, by expectation and maximisation.
+        total = own.sum(axis=1)
+        rates = counts.sum() / total / len(own)
+        for _ in range(_STEPS):
+            rates = rates * (own @ (counts / np.maximum(rates @ own + chances, _FEWEST))) / total
+        found.append((rates, np.maximum(rates @ own + chances, _FEWEST)))
+    (_, one), (_, both) = found
+    gain = 2 * float((counts * np.log(both / one) - both + one).sum())
+    used = 1 + (gain > SIGNIFICANT**2)
+    rates, expected = found[used - 1]
+    # One hit at least: none leaves the rate unknown too.
+    normal = exposures[:used] @ (exposures[:used] / np.maximum(expected, 1 / len(counts))).T
+    return rates.tolist(), np.sqrt(np.diag(np.linalg.inv(normal))).tolist()
 
 
 @dataclass(frozen=True)
 class _Search:
     """Outliers of a sequence of frames."""
 
-    exposure: float  # area times time, cm² s
+    seconds: float  # exposure time, s
+    area: float  # of all samples, cm²
     samples: int
     limit: float  # from how many sigmas on a sample is an outlier
     peaks: F64  # peaks, noise: (hit,) brightest sample of each hit upwards, and sigma there; e-
@@ -153,14 +188,14 @@ def _searches(evidence: Evidence) -> Iterator[_Search]:
         # As in `CosmicHits.charge`.
         seconds = f.exptime_s if f.exptime_s > 0 else float(np.median(np.diff(f.time_s)))
         residual = np.where(f.good, f.residual, np.nan)
-        yield _search(residual, np.sqrt(f.variance), area * seconds)
-    for stack in evidence.of_kind("dark"):
+        yield _search(residual, np.sqrt(f.variance), seconds, area)
+    for stack in (*evidence.of_kind("bias"), *evidence.of_kind("dark")):
         if len(stack.adu) >= _MIN_FRAMES:
-            yield _search(*evidence.dark_noise(stack), area * np.nan_to_num(stack.exptime_s))
+            yield _search(*evidence.dark_noise(stack), np.nan_to_num(stack.exptime_s), area)
 
 
-def _search(residual: F32, sigma: F32, exposure: float) -> _Search:
-    """Outliers of residuals (t, y, x) with some sigma; ``exposure`` is that of a sample, cm² s."""
+def _search(residual: F32, sigma: F32, seconds: float, area: float) -> _Search:
+    """Outliers of residuals (t, y, x) with some sigma; ``area`` of a pixel, cm²."""
     ratio = residual / sigma
     usable = np.isfinite(ratio)
     # Of every seventh sample: what the noise is beyond what was predicted.
@@ -175,7 +210,8 @@ def _search(residual: F32, sigma: F32, exposure: float) -> _Search:
     n = int(np.count_nonzero(usable))
     sigmas = np.quantile(sigma[usable][::97], np.linspace(0.02, 0.98, 25)) if n else np.ones(1)
     return _Search(
-        exposure * n,
+        seconds,
+        area * n,
         n,
         float(limit),
         np.array([residual[hit].max() for hit in hits]),
