@@ -93,7 +93,7 @@ def test_hits_while_frames_are_read_out_are_told_from_those_of_the_exposure(
     for _ in range(40):
         counts = RNG.poisson(rate * exposures[0] + readout * exposures[1]).astype(float)
         values, errors = _rates(counts, exposures, chances)
-        assert len(values) == 1 + (readout > 0)
+        assert len(errors) == 1 + (readout > 0)
         pulls += [(v - t) / e for v, t, e in zip(values, (rate, readout), errors, strict=False)]
     assert np.abs(pulls).max() < 4.5
     assert rate == 0 or 0.6 < np.std(pulls) < 1.4

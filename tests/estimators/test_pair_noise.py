@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.detector.pair_noise import LineNoise, dark_pair_sums, flat_pair_sums
+from pixcal.estimators.detector.pair_noise import (
+    LineNoise,
+    dark_pair_sums,
+    flat_pair_sums,
+    shared_by_blocks,
+)
 from pixcal.model.arrays import F32
 
 GAIN, READ, ROWS = 2.0, 6.0, 5.0
@@ -44,6 +49,38 @@ def test_without_noise_of_lines_nothing_is_taken() -> None:
     noise.add(dark, sums, READ, 0.0)
     assert not noise.lines
     assert np.array_equal(noise.put_back(sums.copy()), sums)
+
+
+@pytest.mark.parametrize(
+    ("shape", "scale"), [((64, 1), 1), ((1, 96), 1), ((1, 4), 24), ((8, 1), 8)]
+)
+def test_noise_within_blocks_and_that_of_blocks_are_the_whole(
+    shape: tuple[int, int], scale: int
+) -> None:
+    """Of rows, columns, outputs side by side, and bands; but for the level of whole frames."""
+    rng = np.random.default_rng(7)
+    axis = int(shape[0] == 1)
+    dark = READ * rng.standard_normal((DARKS, *SHAPE))
+    shared = ROWS * rng.standard_normal((DARKS, *shape)).repeat(scale, axis=1 + axis)
+    frames = (dark + shared).astype(np.float32)
+    sums = dark_pair_sums(frames, READ, 0.0).sum(axis=0)
+    of_blocks = [
+        shared_by_blocks(a - b, 0.0) for a, b in zip(frames[::2], frames[1::2], strict=True)
+    ]
+    lines = max(shape)
+    expected = READ**2 + ROWS**2 * (1 - 1 / lines)
+    error = ROWS**2 * np.sqrt(4 / (DARKS * lines))
+    found = sums[2] / sums[0] + np.mean(of_blocks)
+    assert found == pytest.approx(expected, abs=4 * error)
+
+
+def test_blocks_of_white_noise_and_hits_share_nothing() -> None:
+    rng = np.random.default_rng(8)
+    difference = np.rint(rng.normal(0, 1.2, (256, 384))).astype(np.float32)
+    difference[40:43, 50:60] += 900
+    difference[rng.random(difference.shape) < 1e-3] = np.nan
+    blocks = difference.size / 256
+    assert abs(shared_by_blocks(difference, 1.0)) < 4 * 1.2**2 / 512 * np.sqrt(2 / blocks)
 
 
 def test_a_saturated_level_beside_row_noise_adds_nothing() -> None:

@@ -132,12 +132,13 @@ class CosmicHits(Effect):
         ])  # fmt: skip
         counts = np.array([float(len(s.peaks)) for s in searches])
         values, spread = _rates(counts, exposures, chances)
+        default = cls().electrons_per_um
         errors = dict(zip(cls.strengths, spread, strict=False))
         if scale_error is not None:
-            errors["electrons_per_um"] = cls().electrons_per_um * scale_error
+            errors["electrons_per_um"] = default * scale_error
         count, chance = int(counts.sum()), float(chances.sum())
         return Estimate(
-            cls(*values, electrons_per_um=cls().electrons_per_um * scale),
+            cls(values[0], values[1], default * scale),
             errors,
             sigmas_of_count(count, chance),
             "samples in single frames far above the pixel's other frames",
@@ -146,7 +147,7 @@ class CosmicHits(Effect):
 
 
 def _rates(counts: F64, exposures: F64, chances: F64) -> tuple[list[float], list[float]]:
-    """Hits an exposure, and errors: of the first kind, and of the second if it is significant.
+    """Hits per exposure of both kinds, and errors; the second is zero unless it is significant.
 
     ``counts, chances``: (n,) hits, and how many of them are none; ``exposures``: (2, n).
     """
@@ -164,7 +165,8 @@ def _rates(counts: F64, exposures: F64, chances: F64) -> tuple[list[float], list
     rates, expected = found[used - 1]
     # One hit at least: none leaves the rate unknown too.
     normal = exposures[:used] @ (exposures[:used] / np.maximum(expected, 1 / len(counts))).T
-    return rates.tolist(), np.sqrt(np.diag(np.linalg.inv(normal))).tolist()
+    errors = np.sqrt(np.diag(np.linalg.inv(normal)))
+    return [*rates.tolist(), 0.0][:2], errors.tolist()
 
 
 @dataclass(frozen=True)

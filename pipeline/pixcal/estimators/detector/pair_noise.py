@@ -17,12 +17,13 @@ from pixcal.kernels.photon_transfer import (
     bin_pairs,
     pair_statistics,
 )
-from pixcal.kernels.robust import lit, median_of_columns
+from pixcal.kernels.robust import lit, median_and_sigma, median_of_columns
 from pixcal.model.arrays import F32, F64
 
 LINES = {"row": ((0, 1), (0, 2)), "column": ((1, 0), (2, 0))}  # lags along a line
 
 _SHARED = 5.0  # errors of the noise that a row shares from which it is there
+_OUT = 5.0  # standard deviations of samples that stand out
 _PAIR_LAMP_CHANGE = 0.05
 _NEARLY = 5.0  # noise below saturation from which samples of a pixel are cut off
 # Of n normal numbers less their median, n times by how much the variance is less, and by how much
@@ -50,9 +51,20 @@ def shared_by_lines(dark: F64) -> dict[str, Measure]:
     return found
 
 
-def lost_in_blocks(dark: F64) -> float:
-    """Variance (ADU²) of what lines share that is lost with the means of the blocks."""
-    return sum(shared for shared, _ in shared_by_lines(dark).values()) / (BLOCK + 1)
+def shared_by_blocks(difference: F32, quantum: float) -> float:
+    """Variance (ADU²) of a sample that the pixels of a block share beyond chance.
+
+    Of lines, outputs, and what changes slowly from place to place; the level of the whole frame is
+    not in it. `pair_statistics` takes it off with the means of its blocks. ``difference``: (y, x)
+    of two frames without light, of full blocks; samples that stand out do not count.
+    """
+    tiles = difference.reshape(len(difference) // BLOCK, BLOCK, -1, BLOCK)
+    blocks = tiles.swapaxes(1, 2).reshape(-1, BLOCK**2).astype(float)
+    middle, sigma = median_and_sigma(blocks)
+    blocks -= middle
+    blocks[~(np.abs(blocks) <= _OUT * max(sigma, quantum))] = 0
+    own = float(blocks.var(axis=1, ddof=1).mean()) / BLOCK**2
+    return float(blocks.mean(axis=1).var(ddof=1) - own) / 2
 
 
 def lines_with_noise(dark: F64) -> tuple[str, ...]:

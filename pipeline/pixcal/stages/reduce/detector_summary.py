@@ -9,7 +9,6 @@ import numpy as np
 from pixcal.estimators.detector.calibration import Linearity, linearity
 from pixcal.estimators.detector.emva import Measure, full_level, saturation, transfer_points
 from pixcal.estimators.detector.missing_codes import missing_codes, step_noise
-from pixcal.estimators.detector.pair_noise import lost_in_blocks
 from pixcal.kernels.gain_fit import LADDER, GainFit, fit_gain
 from pixcal.kernels.photon_transfer import add_neighbours
 from pixcal.kernels.rounding import SHEPPARD, UNTOLD
@@ -24,6 +23,7 @@ from pixcal.stages.reduce.read_noise import (
     code_counts,
     dark_charge,
     is_cut_off,
+    lost_in_blocks,
     of_variance,
     read_noise,
 )
@@ -127,12 +127,12 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     if job.flats_timed and job.flat and _one_lamp(times[usable], levels[usable]):
         straight = linearity(times, levels, usable)
     charge = dark_charge(folder, job)
-    gain, wander = None, bias_wander(job)
+    gain, wander, lost = None, bias_wander(job), lost_in_blocks(job)
     # The shot noise of the dark signal is no read noise; how large it is the gain tells.
     for _ in range(2 if charge else 1):
         shot = charge / (job.gain if gain is None else gain.gain)
-        noise, own = read_noise(sums[0], shot, folder, job)
-        gain = _gain(sums, own, wander, top, job)
+        noise, own = read_noise(sums[0], lost, shot, folder, job)
+        gain = _gain(sums, own, lost[0], wander, top, job)
     if gain is not None and is_cut_off(job):
         noise, own = of_variance(gain.read_variance, job.quantum)
     return Summary(
@@ -152,19 +152,23 @@ def pair_sums(folder: Place, job: Measuring) -> F64:
 
 
 def _gain(
-    sums: F64, read_noise: Measure | None, wander: float, top: float, job: Measuring
+    sums: F64,
+    read_noise: Measure | None,
+    lost: float,
+    wander: float,
+    top: float,
+    job: Measuring,
 ) -> GainFit | None:
     """Photon transfer below the level ``top`` (ADU above bias) of saturation, neighbours added.
 
-    The bias wanders by so much (ADU). None where the level above bias is unknown, or the error is
-    too large.
+    Blocks lose so much of the variance without light (ADU²), the bias wanders by so much (ADU).
+    None where the level above bias is unknown, or the error is too large.
     """
     if not (job.dark and job.flat):
         return None
     noise, error = read_noise or (job.read_noise, _GUESS_ERROR * job.read_noise)
     # With light there is noise enough that rounding adds no more and no less than this.
     dark, lit = sums
-    lost = lost_in_blocks(dark)
     steps, uneven = _steps(job)
     variance = noise**2 + steps - lost
     highest = _LINEAR_SHARE * top

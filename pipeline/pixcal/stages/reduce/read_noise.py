@@ -8,10 +8,11 @@ import numpy as np
 from pixcal.estimators.detector.code_density import step_of
 from pixcal.estimators.detector.emva import Measure
 from pixcal.estimators.detector.missing_codes import missing_codes, noise_before_missing_codes
-from pixcal.estimators.detector.pair_noise import lost_in_blocks
+from pixcal.estimators.detector.pair_noise import shared_by_blocks
+from pixcal.kernels.photon_transfer import BLOCK
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.kernels.rounding import SHEPPARD, noise_before_rounding
-from pixcal.model.arrays import F64
+from pixcal.model.arrays import F32, F64
 from pixcal.stages.reduce.calibration import on_grid
 from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.flat_survey import middle_rows
@@ -22,14 +23,36 @@ from pixcal.storage.place import Place
 # the noise. So far off it is at most where pixels differ by 10 % rms and are taken for alike.
 _CUT_OFF, _COARSE_CUT_OFF = 0.006, 0.004
 _LEAST = 0.05  # steps of noise that are told from none
+_PAIRS, _SAMPLES = 16, 1 << 20  # of frames, and of each, that tell noise of whole blocks
 
 
-def _read_variance(dark: F64) -> tuple[float, float] | None:
+def _read_variance(dark: F64, lost: Measure) -> Measure | None:
     """Variance of a sample without light and its error (ADU²)."""
     dof, _, square = dark[:, :3].sum(axis=0)
     if not dof > 0:
         return None
-    return square / dof + lost_in_blocks(dark), square / dof * math.sqrt(2 / dof)
+    return square / dof + lost[0], math.hypot(square / dof * math.sqrt(2 / dof), lost[1])
+
+
+def lost_in_blocks(job: Measuring) -> Measure:
+    """Variance (ADU²) that `pair_statistics` loses with the means of its blocks; its error."""
+    series = job.read_series
+    ny, nx = (n // BLOCK * BLOCK for n in job.shape)
+    if series is None or min(ny, nx) < 2 * BLOCK:
+        return 0.0, 0.0
+    reader = job.frames[series.array]
+    apart = BLOCK * max(ny * nx // _SAMPLES, 1)
+
+    def sample(frame: int) -> F32:
+        parts = [
+            reader.read((frame, frame + 1), (y, y + BLOCK), (0, nx)) for y in range(0, ny, apart)
+        ]
+        return np.asarray(np.concatenate(parts, axis=1)[0], np.float32)
+
+    pairs = list(zip(series.frames[::2], series.frames[1::2], strict=False))[:_PAIRS]
+    found = [shared_by_blocks(sample(a) - sample(b), job.quantum) for a, b in pairs]
+    mean = max(float(np.mean(found)), 0.0)
+    return mean, float(np.std(found, ddof=1)) / math.sqrt(len(found)) if len(found) > 1 else mean
 
 
 def dark_charge(folder: Place, job: Measuring) -> float:
@@ -44,10 +67,13 @@ def dark_charge(folder: Place, job: Measuring) -> float:
 
 
 def read_noise(
-    dark: F64, shot: float, folder: Place, job: Measuring
+    dark: F64, lost: Measure, shot: float, folder: Place, job: Measuring
 ) -> tuple[Measure | None, Measure | None]:
-    """Noise without light (ADU), less a shot variance (ADU²), with and without rounding."""
-    whole = _read_variance(dark)
+    """Noise without light (ADU), less a shot variance (ADU²), with and without rounding.
+
+    ``lost``: see `lost_in_blocks`.
+    """
+    whole = _read_variance(dark, lost)
     if whole is None:
         return None, None
     variance = max(whole[0] - shot, SHEPPARD * job.quantum**2), whole[1]
