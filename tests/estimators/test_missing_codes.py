@@ -20,7 +20,9 @@ def samples(rng: np.random.Generator, sigma: float, missing: list[int], side: in
     """Codes (t, pixel) of levels about 100.3, of a converter that leaves codes out."""
     level = 100.3 + 0.6 * rng.standard_normal(PIXELS)
     codes = np.rint(level + sigma * rng.standard_normal((FRAMES, PIXELS))).astype(int)
-    return np.where(np.isin(codes, missing), codes + side, codes)
+    for _ in missing:
+        codes = np.where(np.isin(codes, missing), codes + side, codes)
+    return codes
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -39,6 +41,15 @@ def test_the_noise_before_missing_codes_is_found_within_a_per_cent(
     noise = noise_before_missing_codes(variance, error, found.mean(axis=0), FRAMES, counts)
     assert noise is not None
     assert noise[0] == pytest.approx(sigma, rel=0.01)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("sigma", [1.2, 2.0])
+def test_so_it_is_where_hardly_a_code_is_left(sigma: float, side: int) -> None:
+    """Up to four codes apart; noise of less than a quarter of that is not told as well."""
+    test_the_noise_before_missing_codes_is_found_within_a_per_cent(
+        sigma, [98, 100, 101, 102, 104], side
+    )
 
 
 def test_a_whole_converter_of_two_amplifiers_misses_nothing() -> None:

@@ -2,7 +2,8 @@
 
 A sample whose code is missing gets the next one there is. Noise of a few codes then depends on
 where the level lies; it is found from what a converter with these codes makes of it, pixel by
-pixel. Which neighbour stands in for a missing code the counts of all samples tell. All in codes.
+pixel. Noise of less than a quarter of the widest gap is not told well. Which neighbour stands in
+for a missing code the counts of all samples tell. All in codes.
 """
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from pixcal.estimators.detector.cut_off import variance_at
+from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.arrays import F64, I64
 
 POPULATED = 20.0  # counts on both sides from which a code without any is missing
@@ -18,6 +20,7 @@ _BLOCK = 32  # codes whose shifts are added up
 _NEAR = 4  # codes on either side that are looked at
 _FINE = 16  # levels a code
 _REACH = 8.0  # of the noise
+_USUAL = 5.0  # spreads of the means of usual pixels
 _LEAST = 0.5  # noise: below it a wide code is all there is
 _MOST = 500  # range of levels that is looked at
 _STANDS_IN = (0.5, -0.5, 0.0)  # the next code, the one before, either: thresholds off the middle
@@ -67,7 +70,8 @@ def noise_before_missing_codes(
     counts : (code,) how often each code came up
     step : of the converter, if all of its codes were multiplied by that
     """
-    low, high = np.quantile(means, [0.005, 0.995])
+    middle, spread = median_and_sigma(means)
+    low, high = middle + np.array([-1, 1]) * max(_USUAL * spread, 1.0)
     margin = _REACH * np.sqrt(variance) + 2
     if high - low + 2 * margin > _MOST:
         return None
@@ -91,7 +95,8 @@ def noise_before_missing_codes(
             return mean, first**2 + chance @ np.diff(codes**2.0) - mean**2
 
         def excess(sigma: float) -> float:
-            seen = variance_at(means, np.full(means.shape, variance / frames), *moments(sigma))
+            table = moments(sigma)
+            seen = variance_at(means, np.interp(means, *table) / frames, *table)
             return float(seen.mean()) - variance
 
         least, most = _LEAST, float(np.sqrt(variance)) + 1
