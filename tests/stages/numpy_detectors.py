@@ -41,6 +41,7 @@ class Detector:
     dark: float = 5.0
     rate: float = 2e4
     prnu: float = 0.01
+    unlit: int = 0  # columns that see no light
     flats: Sequence[tuple[float, int, float]] = ((0.1, 10, 1), (0.3, 10, 1), (0.6, 10, 1))
     response: Callable[[F64], F64] = lambda electrons: electrons
     real: bool = False  # real numbers, negative ones too, instead of codes
@@ -50,6 +51,7 @@ class Detector:
         rng = np.random.default_rng(seed)
         offset = self.bias + self.scatter * rng.standard_normal(self.shape)
         pixels = 1 + self.prnu * rng.standard_normal(self.shape)
+        pixels[:, : self.unlit] = 0
 
         def frame(seconds: float, light: float) -> NDArray[Any]:
             charge = rng.poisson((self.dark + light * self.rate * pixels) * seconds).astype(float)

@@ -37,6 +37,12 @@ def test_frames_without_light_get_none() -> None:
     assert frames.mean() == pytest.approx(detector.bias, abs=0.1)
 
 
+def test_pixels_that_see_no_light_see_none_in_simulations() -> None:
+    found = held_against_nominal(Detector(unlit=40), 7)
+    assert not found.evidence.good[:, :40].any()
+    assert flagged(found.differences) == set()
+
+
 def test_eight_bits_may_saturate() -> None:
     """A level of saturation below any usual bias leaves a bench to simulate."""
     detector = Detector(gain=32.0, noise=22.0, bias=28.3, top=255, rate=9000.0)

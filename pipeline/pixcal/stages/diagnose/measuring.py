@@ -30,6 +30,7 @@ from pixcal.stages.diagnose.nominal import (
     SetTruth,
 )
 from pixcal.stages.diagnose.parts import Half, Table
+from pixcal.stages.reduce.calibration import FLAT_FLOOR
 
 NO_TEST = 10.0  # reduced chi-square of the photon transfer beyond which its gain is not believed
 CORE = 5.0  # robust standard deviations within which the scatter of the dark signal may be noise
@@ -67,7 +68,8 @@ def nominal_bench(
     maps = DetectorMaps(
         delta_x=np.zeros(good.shape, np.float32),
         delta_y=np.zeros(good.shape, np.float32),
-        response=flat,
+        # Unlit pixels stay so: with the least of the map simulations would not mask them all.
+        response=np.where(good | (flat > FLAT_FLOOR), flat, 0).astype(np.float32),
         bias=_bias_before_rounding(evidence, dtypes),
         dark_rate=_dark_rate(evidence, halves),
         read_noise=np.full(good.shape, one.amplifier_noise, np.float32),

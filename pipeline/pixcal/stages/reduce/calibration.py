@@ -32,7 +32,7 @@ from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_g
 from pixcal.storage.place import Place
 
 _SAMPLES = 1 << 20
-_FLAT_FLOOR = 0.05
+FLAT_FLOOR = 0.05  # least relative response in the map: pixels that see no light have it
 # weight of the detector's read variance beside a pixel's own, in degrees of freedom: that of pixels
 # whose read noise differs by 13 % rms. Few frames alone would give good pixels false weights, and
 # at low light a chi-square that flags them.
@@ -175,7 +175,7 @@ def _maps(job: Finishing, index: Index, block: F32) -> dict[str, NDArray[Any]]:
     return {
         "bias": np.nan_to_num(found["bias"]),
         "dark_rate": job.gain * np.nan_to_num(found["dark_rate"]),
-        "flat": np.where(np.isfinite(flat), np.maximum(flat, _FLAT_FLOOR), 1.0),
+        "flat": np.where(np.isfinite(flat), np.maximum(flat, FLAT_FLOOR), 1.0),
         "read_noise": read,
         "mask": mask,
     }
@@ -198,7 +198,7 @@ def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> U
     expected = np.full_like(flat, max(medians.dark_variance, least))
     if job.has_flat:
         mask[~np.isfinite(flat)] |= np.uint8(PixelFlag.NO_DATA)
-        where = dead(flat, error, limits.dead, limits.bright, _FLAT_FLOOR)
+        where = dead(flat, error, limits.dead, limits.bright, FLAT_FLOOR)
         mask[where] |= np.uint8(PixelFlag.DEAD)
     if job.has_rate:
         where = hot(
