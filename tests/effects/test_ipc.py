@@ -363,6 +363,26 @@ def test_a_share_that_falls_with_the_signal_is_noticed(acquired: Acquired) -> No
     assert np.abs(pulls(found, Ipc(couplings))).max() < 5
 
 
+@pytest.mark.long
+def test_noise_of_neighbours_tells_shares_that_fall_from_a_bent_response(
+    acquired: Acquired,
+) -> None:
+    """Without darks: the covariance falls with the signal, in one case as the variance does."""
+    share = Ipc.nearest(0.015)
+    falling = tuple(dataclasses.replace(c, per_ke=-0.01) for c in share.couplings)
+    found = Ipc.estimate(acquired(NO_DARKS, {"ipc": to_plain(Ipc(falling))}))
+    assert found is not None
+    assert isinstance(found.effect, Ipc)
+    (per_ke,) = {c.per_ke for c in found.effect.couplings}
+    assert abs(per_ke + 0.01) < 4 * found.errors["couplings[0].per_ke"] < 0.01
+    assert np.abs(pulls(found, Ipc(falling))).max() < 5
+    bent = {"quadratic": -0.08, "cubic": 0.0}
+    found = Ipc.estimate(acquired(NO_DARKS, {"ipc": to_plain(share), "nonlinearity": bent}))
+    assert found is not None
+    assert isinstance(found.effect, Ipc)
+    assert {c.per_ke for c in found.effect.couplings} == {0.0}
+
+
 LOOK_ALIKES = ("row_noise", "brighter_fatter", "nonlinearity", "lag", "rolling_shutter")
 
 

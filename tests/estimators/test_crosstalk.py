@@ -84,7 +84,9 @@ def noise_shared(steps, alike):
     right = np.zeros((len(steps), TERMS, *shape))
     for n, step in enumerate(steps):
         right[n, :2] = 1e2 if step in alike else 0.0
-    return MeasuredLinks(Products(right, normal, 1.0, 1e-3, 0.02), None, steps, shape, (0, 0))
+    return MeasuredLinks(
+        Products(right, normal, 1.0, 1e-3, 0.0, 1e-3, 0.02), None, steps, shape, (0, 0)
+    )
 
 
 def test_noise_that_far_pixels_share_is_refused_at_once():

@@ -56,6 +56,9 @@ class Products:
     # right gain
     shot: float
     shot_error: float
+    # curve, curve_error: relative change of that variance with the charge, 1/(10⁴ e-)
+    curve: float
+    curve_error: float
     read: float  # variance of a pixel without light
 
 
@@ -84,8 +87,10 @@ def products(
     if brightest < min(MIN_CHARGE, ABOVE_READ * evidence.read_noise**2 / UNIT):
         return None
     covariance = np.linalg.pinv(line, rcond=1e-12, hermitian=True)
-    shot, error = float((covariance @ line_right)[0]), float(np.sqrt(2 * covariance[0, 0]))
-    return Products(right, normal, shot, error, evidence.read_noise**2 / UNIT)
+    shot, _, curved = (float(v) for v in covariance @ line_right)
+    error, _, curved_error = (float(v) for v in np.sqrt(2 * np.diag(covariance)))
+    read = evidence.read_noise**2 / UNIT
+    return Products(right, normal, shot, error, curved / shot, curved_error / shot, read)
 
 
 def _add_changing(parts: Sequence[Residuals], steps: Indices, right: F32, normal: F32) -> None:

@@ -170,14 +170,24 @@ def _sum(found: Sequence[Products | None]) -> Products | None:
     some = [one for one in found if one is not None]
     if len(some) < 2:
         return some[0] if some else None
-    weight = np.array([one.shot_error**-2 for one in some])
+    shot, shot_error = _mean([(one.shot, one.shot_error) for one in some])
+    curve, curve_error = _mean([(one.curve, one.curve_error) for one in some])
     return replace(
         some[0],
         right=np.sum([one.right for one in some], axis=0),
         normal=np.sum([one.normal for one in some], axis=0),
-        shot=float(weight @ [one.shot for one in some] / weight.sum()),
-        shot_error=float(weight.sum() ** -0.5),
+        shot=shot,
+        shot_error=shot_error,
+        curve=curve,
+        curve_error=curve_error,
     )
+
+
+def _mean(found: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Mean of values by their errors, and its error."""
+    values, errors = np.array(found).T
+    weight = errors**-2
+    return float(weight @ values / weight.sum()), float(weight.sum() ** -0.5)
 
 
 def _shares_of(every: Sequence[Coupling], known: Sequence[Coupling]) -> F64:

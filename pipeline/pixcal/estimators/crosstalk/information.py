@@ -13,6 +13,8 @@ from pixcal.estimators.crosstalk.covariance import NORMAL, TERMS, Products
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels
 from pixcal.estimators.crosstalk.links import PixelClasses, Place, class_sums, sums_of
 from pixcal.estimators.crosstalk.residuals import UNIT
+from pixcal.estimators.crosstalk.second_order import level_dependence
+from pixcal.kernels.crosstalk import Coupling
 from pixcal.model.arrays import F32, F64, Mask
 
 # how large the covariance of neighbours over the square of their charge may well be, 1/e-
@@ -66,6 +68,18 @@ class MeasuredLinks:
         if hot is not None:
             hot = replace(hot, value=hot.value[:, at], sigma=hot.sigma[:, at])
         return replace(self, products=products, hot=hot, links=tuple(self.links[n] for n in at))
+
+    def level_dependence(self, couplings: Sequence[Coupling]) -> tuple[float, float]:
+        """Relative change of the shares with the signal beside theirs, 1/ke-, and its error."""
+        found = []
+        if self.hot is not None:
+            found.append(self.hot.level_dependence(couplings, self.links, self.first))
+        if self.products is not None:
+            found.append(level_dependence(self.products, couplings, self.links))
+        values, errors = np.array(found).T
+        weight = errors**-2
+        total = float(weight.sum())
+        return (float(weight @ values) / total, total**-0.5) if total else (0.0, np.inf)
 
     @property
     def _sums(self) -> tuple[F32, F32]:

@@ -33,8 +33,8 @@ class Kernel:
     covariance: F64  # (n, n) of their shares
     significance: float  # of the strongest, in sigmas, corrected for all that was tried
     by: tuple[str, ...]  # ways of measuring
-    # per_ke, per_ke_error: relative change of the shares with the source's signal as hot pixels
-    # show it, 1/ke-, where they fall; the error infinite where they cannot tell
+    # per_ke, per_ke_error: relative change of the shares with the source's signal, 1/ke-, where
+    # they fall; the error infinite where nothing tells
     per_ke: float
     per_ke_error: float
     whole: tuple[Coupling, ...] = ()  # all that were measured, significant or not
@@ -70,36 +70,34 @@ def measure(evidence: Evidence) -> Kernel | None:
             raise InputError(
                 "not decided: a kernel of that period has more couplings than can be measured"
             )
-        if not known:
-            per_ke, error = _level(own, dense, found)
-            dense = own.kernel(found.classes, dense.couplings, per_ke) if per_ke else dense
+        dense, per_ke, error = _level(own, dense, found, per_ke)
         known = tuple(c for c in dense.couplings) if dense else ()
     assert dense is not None
     return _told(dense, replace(none, per_ke=per_ke, per_ke_error=error))
 
 
-def _level(frames: CouplingFrames, dense: Dense, found: Choice) -> tuple[float, float]:
-    """By how much (1/ke-) shares fall with the signal, zero if they may not, and its error."""
+def _level(
+    frames: CouplingFrames, dense: Dense, found: Choice, per_ke: float
+) -> tuple[Dense, float, float]:
+    """By how much (1/ke-) shares fall with the signal, zero if they may not, and its error.
+
+    First the kernel with that; ``dense`` is the one with ``per_ke``, from which it starts.
+    """
     # Shares that rise may be brighter-fatter; those that fall cannot.
-    per_ke, error = 0.0, np.inf
-    if frames.hot is None:
-        return per_ke, error
-    now: Dense | None = dense
+    error = np.inf
     for _ in range(LEVEL_STEPS):
+        there = np.abs(dense.shares) > THERE * np.sqrt(np.diag(dense.covariance))
+        known = [c for c, sure in zip(dense.couplings, there, strict=True) if sure]
+        more, error = frames.measured(dense.couplings, per_ke).level_dependence(known)
+        falls = per_ke + more < -CERTAIN * error
+        if abs(more) < 0.1 * error or (not falls and per_ke == 0):
+            break
+        per_ke = per_ke + more if falls else 0.0
+        now = frames.kernel(found.classes, dense.couplings, per_ke)
         if now is None:
             break
-        there = np.abs(now.shares) > THERE * np.sqrt(np.diag(now.covariance))
-        known = [c for c, sure in zip(now.couplings, there, strict=True) if sure]
-        hot = frames.measured(now.couplings, per_ke).hot
-        assert hot is not None
-        more, error = hot.level_dependence(known, frames.steps, frames.evidence.origin)
-        if per_ke + more > -CERTAIN * error:
-            return 0.0, error
-        if abs(more) < 0.1 * error:
-            break
-        per_ke += more
-        now = frames.kernel(found.classes, now.couplings, per_ke)
-    return per_ke, error
+        dense = now
+    return dense, per_ke, error
 
 
 def _told(dense: Dense, about: Kernel) -> Kernel:
