@@ -22,14 +22,17 @@ def jumping(
     frames_of_series: Sequence[int] = (30, 20),
     n: int = 16_000,
     differ: float = 0.0,
+    tail: float = 0.0,
 ) -> list[Series]:
     """Series of the same pixels, of noise one and jumps with amplitudes about ``amplitude``.
 
-    ``differ``: standard deviation of the logarithm of the pixels' own noise.
+    ``differ``: standard deviation of the logarithm of the pixels' own noise. ``tail``: the same of
+    the amplitudes, if they are not exponential.
     """
     own = rng.lognormal(0, differ, n) if differ else 1.0
     times = switching_s * 10 ** (decades * (rng.random(n) - 0.5)) if decades else switching_s
-    jumps = np.where(rng.random(n) < share, amplitude * rng.standard_exponential(n), 0.0)
+    sizes = rng.lognormal(0, tail, n) if tail else rng.standard_exponential(n)
+    jumps = np.where(rng.random(n) < share, amplitude * sizes, 0.0)
     series = []
     for frames in frames_of_series:
         anew = rng.random((frames, n)) < 1 - np.exp(-2 * PERIOD_S / times)
@@ -67,6 +70,15 @@ def test_pixels_of_different_noise_do_not_hide_the_population(differ: float, see
     assert abs(found.share - 0.02) < 4 * found.share_error < 0.04
     assert abs(found.amplitude - 6) < 4 * found.amplitude_error < 6
     assert abs(found.switching_s - 0.5) < 4 * found.switching_error < 0.5
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(2))
+def test_a_few_pixels_that_jump_far_do_not_hide_how_long_the_others_stay(seed: int) -> None:
+    series = jumping(np.random.default_rng(seed), 0.02, 7.0, 0.4, 0.0, (40,), 6_400, tail=1.5)
+    found = find_telegraph(series)
+    assert found is not None
+    assert abs(found.switching_s - 0.4) < 4 * found.switching_error < 0.4
 
 
 @pytest.mark.long

@@ -85,8 +85,10 @@ def level_dependence(
     # The slope of the variance of a pixel that loses less at high charge, beside what others give.
     own = 4 * _per_unit(couplings) * (got - lost * (1 - lost)) / ((1 - lost) ** 2 + got)
     per_ke = 1 / (2 * UNIT * 1e-3)
-    error = np.hypot(weight**-0.5, found.curve_error * per_ke)
-    return right / weight - (found.curve - own) * per_ke, float(error)
+    more = right / weight - (found.curve - own) * per_ke
+    # Terms of higher order, with the square of the level dependence, are of this size.
+    beyond = lost * (couplings[0].per_ke + more)
+    return more, float(np.linalg.norm([weight**-0.5, found.curve_error * per_ke, beyond]))
 
 
 def _per_unit(couplings: Sequence[Coupling]) -> float:

@@ -28,8 +28,9 @@ from pixcal.model.arrays import F64, Indices
 # logarithm of the shape: what is usual, and the most that is tried
 _USUAL, _MAX_LOG_SHAPE = 1.5, 4.0
 _CLEAR = 8.0  # by which another shape than the exponential's must be likelier
-# chance of telegraph noise from which a pixel's frames are looked at for how long it stays
+# chance of telegraph noise from which a pixel's frames are looked at for how long it stays,
 LIKELY = 0.1
+_MOST = 0.95  # and the share of these whose variance says how much one may count for at most
 
 
 @dataclass(frozen=True)
@@ -118,8 +119,8 @@ def find_switching(
     if not len(few):
         return 0.0, period
 
-    def rest(log_time: float) -> tuple[float, float]:
-        return _rest(parts, population, Stays(float(np.exp(log_time)), decades), 0)
+    def rest(log_time: float, most: float) -> tuple[float, float]:
+        return _rest(parts, population, Stays(float(np.exp(log_time)), decades), 0, most)
 
     # Of longer stays the frames do not tell how long.
     longest = max(m.period_s * m.frames for m in parts)
@@ -127,27 +128,31 @@ def find_switching(
 
     def solved(more: float) -> float:
         """Logarithm of the time for which so much more than was measured is expected."""
-        if rest(high)[0] + more >= 0:
+        if rest(high, most)[0] + more >= 0:
             return float(high)
-        return float(brentq(lambda v: rest(v)[0] + more, low, high, xtol=3e-3))
+        return float(brentq(lambda v: rest(v, most)[0] + more, low, high, xtol=3e-3))
 
-    none, error = rest(low)
-    if none <= 3 * error:
+    # All pixels count alike where a few hide what the others show.
+    for most in (_MOST, 0.0):
+        none, error = rest(low, most)
+        if none > 3 * error:
+            break
+    else:
         at_most = float(np.exp(solved(error))) if none + error > 0 else 0.0
         return 0.0, max(at_most, period)
     found = solved(0.0)
-    slope = abs(rest(found + 0.05)[0] - rest(found - 0.05)[0]) / 0.1
-    return float(np.exp(found)), float(np.exp(found) * rest(found)[1] / max(slope, 1e-12))
+    slope = abs(rest(found + 0.05, most)[0] - rest(found - 0.05, most)[0]) / 0.1
+    return float(np.exp(found)), float(np.exp(found) * rest(found, most)[1] / max(slope, 1e-12))
 
 
 def off_later(parts: Sequence[Moments], population: Population, stays: Stays) -> float:
     """Products of frames further apart than neighbours beyond those for some stays, in errors."""
-    total, error = _rest(parts, population, stays, 1)
+    total, error = _rest(parts, population, stays, 1, _MOST)
     return total / error if error > 0 else 0.0
 
 
 def _rest(
-    parts: Sequence[Moments], population: Population, stays: Stays, lag: int
+    parts: Sequence[Moments], population: Population, stays: Stays, lag: int, most: float
 ) -> tuple[float, float]:
     """Products of frames, of one of the lags, beyond those for some stays, and their error."""
     few = population.pixels[population.chance > LIKELY]
@@ -165,7 +170,8 @@ def _rest(
         at = np.searchsorted(few, m.pixel)
         of_pixel = np.einsum("nk,nk->n", of_class[at], products)
         left = chance[at] * (m.products[lag] + 1 / m.count - chance[at] * of_pixel)
-        left *= m.stands_for
+        # The products of a few pixels that jump far would outweigh those of all others.
+        left *= m.stands_for * np.minimum(np.quantile(m.variance, most) / m.variance, 1)
         total += float(left.sum())
         square += float(left @ left)
     return total, square**0.5
