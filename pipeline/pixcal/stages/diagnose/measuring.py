@@ -34,6 +34,7 @@ from pixcal.stages.reduce.calibration import FLAT_FLOOR
 
 NO_TEST = 10.0  # reduced chi-square of the photon transfer beyond which its gain is not believed
 CORE = 5.0  # robust standard deviations within which the scatter of the dark signal may be noise
+_MOST_UNLIT = 0.5  # share of pixels without light up to which the others tell the light of flats
 
 
 def nominal_bench(
@@ -68,8 +69,7 @@ def nominal_bench(
     maps = DetectorMaps(
         delta_x=np.zeros(good.shape, np.float32),
         delta_y=np.zeros(good.shape, np.float32),
-        # Unlit pixels stay so: with the least of the map simulations would not mask them all.
-        response=np.where(good | (flat > FLAT_FLOOR), flat, 0).astype(np.float32),
+        response=_unlit_stay_so(flat, good),
         bias=_bias_before_rounding(evidence, dtypes),
         dark_rate=_dark_rate(evidence, halves),
         read_noise=np.full(good.shape, one.amplifier_noise, np.float32),
@@ -111,6 +111,15 @@ def parted(name: str, halves: Sequence[Half]) -> bool:
     """Whether the parts hold different frames of an array."""
     first, *others = (set(h.get(name, ())) for h in halves)
     return not any(first & other for other in others)
+
+
+def _unlit_stay_so(flat: F32, good: Mask) -> F32:
+    """Response without what the map has at least: simulations would not mask all unlit pixels.
+
+    Where most pixels are unlit, flats would seem to hold no light, and it is left as it is.
+    """
+    unlit = ~good & (flat <= FLAT_FLOOR)
+    return np.where(unlit, np.float32(0), flat) if unlit.mean() < _MOST_UNLIT else flat
 
 
 def _mean(maps: Sequence[F64]) -> F32:
