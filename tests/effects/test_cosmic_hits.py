@@ -109,12 +109,16 @@ def test_frames_are_hit_while_they_are_read_out(make_effect_bench: Callable[...,
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("rate", "charge"), [(2_000.0, 70.0), (20_000.0, 120.0)])
+@pytest.mark.parametrize(
+    ("rate", "charge", "darks"),
+    [(2_000.0, 70.0, True), (20_000.0, 120.0, True), (30_000.0, 160.0, False)],
+)
 def test_rate_and_charge_are_found(
-    acquired: Callable[..., Evidence], rate: float, charge: float
+    acquired: Callable[..., Evidence], rate: float, charge: float, darks: bool
 ) -> None:
+    """In darks by the brightest pixel of each; without any, in the fringe frames."""
     effects = {"cosmic_hits": {"rate_cm2_s": rate, "electrons_per_um": charge}}
-    found = CosmicHits.estimate(acquired(None, effects))
+    found = CosmicHits.estimate(acquired(None if darks else {"frames.darks": []}, effects))
     assert found is not None
     assert isinstance(found.effect, CosmicHits)
     assert abs(found.effect.rate_cm2_s - rate) < 4 * found.errors["rate_cm2_s"]

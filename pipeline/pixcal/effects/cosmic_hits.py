@@ -22,13 +22,13 @@ JOINED = 3.0  # standard deviations from which samples join outliers that lie ne
 Samples = tuple[Indices, Indices, Indices]
 
 _STRAGGLING = 0.15
-_DRAWN = 1500
+_DRAWN = 4000
 _TILE = 32
 _MIN_FRAMES = 5
 _MIN_HITS = 5
 _OFTEN = 2
 _RARE = 0.01
-_BRIGHTEST = 4
+_BRIGHTEST = 16
 # outliers of the noise itself over those of a Gaussian: shot noise of faint light is skewed
 _SKEW = 5.0
 _STEPS = 300  # of the maximisation
@@ -117,12 +117,11 @@ class CosmicHits(Effect):
         if not any(s.seconds > 0 for s in searches):
             return None
         drawn = _Drawn(cls(), evidence.pitch_um)
-        # Where the noise differs from pixel to pixel a track is not found by its brightest one.
-        even = [s for s in searches if s.even] or searches
-        scale, scale_error = _scale(even, drawn)
+        places = [drawn.noise_at(s.sigma) for s in searches]
+        scale, scale_error = _scale(searches, places, drawn)
         seen = [
-            s.area * float(np.mean([drawn.seen(scale, sigma, s.limit) for sigma in s.sigmas]))
-            for s in searches
+            s.area * len(drawn.peaks(scale, own, s.limit)) / _DRAWN
+            for s, own in zip(searches, places, strict=True)
         ]
         exposures = np.array([(a * s.seconds, a) for a, s in zip(seen, searches, strict=True)]).T
         if not exposures[0].sum() > 0:
@@ -177,11 +176,9 @@ class _Search:
     area: float  # of all samples, cm²
     samples: int
     limit: float  # from how many sigmas on a sample is an outlier
-    peaks: F64  # peaks, noise: (hit,) brightest sample of each hit upwards, and sigma there; e-
-    noise: F64
+    peaks: F64  # (hit,) brightest outlier of each hit upwards, e-
     downwards: int  # hits downwards
-    sigmas: F64  # (q,) quantiles of sigma, e-
-    even: bool  # whether sigma is about the same in all pixels
+    sigma: F32  # (t, y, x) noise of the samples, e-; NaN where they do not count
 
 
 def _searches(evidence: Evidence) -> Iterator[_Search]:
@@ -210,17 +207,14 @@ def _search(residual: F32, sigma: F32, seconds: float, area: float) -> _Search:
     down &= ~often
     hits = _hits(up, ratio > JOINED)
     n = int(np.count_nonzero(usable))
-    sigmas = np.quantile(sigma[usable][::97], np.linspace(0.02, 0.98, 25)) if n else np.ones(1)
     return _Search(
         seconds,
-        area * n,
+        area * ratio.size,
         n,
         float(limit),
         np.array([residual[hit].max() for hit in hits]),
-        np.array([sigma[hit].mean() for hit in hits]),
         len(_hits(down, ratio < -JOINED)),
-        sigmas,
-        bool(sigmas[-1] < 1.5 * sigmas[0]),
+        np.where(usable, sigma, np.float32(np.nan)),
     )
 
 
@@ -242,47 +236,56 @@ def _hits(outliers: Mask, joined: Mask) -> list[Samples]:
 
 
 class _Drawn:
-    """The brightest pixels of tracks, for hits of any charge in noise of any size."""
+    """The brightest pixels of tracks, which may lie anywhere in frames of any noise."""
 
     def __init__(self, effect: CosmicHits, pitch_um: float) -> None:
-        rng = np.random.default_rng(0)
-        tracks = effect.tracks(rng, _DRAWN, pitch_um, (1, 1), 0)
+        self._rng = np.random.default_rng(0)
+        tracks = effect.tracks(self._rng, _DRAWN, pitch_um, (1, 1), 0)
         tracks[:, :2] += _TILE // 2
         self._charges = np.empty((_DRAWN, _BRIGHTEST))
+        self._pixels = np.empty((_DRAWN, _BRIGHTEST), int)
         for n in range(_DRAWN):
             tile = np.zeros((_TILE, _TILE), np.float32)
             add_tracks(tile, tracks[n : n + 1], effect.diffusion_um / pitch_um, 0)
-            self._charges[n] = np.partition(tile.ravel(), -_BRIGHTEST)[-_BRIGHTEST:]
-        self._noise = rng.standard_normal(self._charges.shape)
+            self._pixels[n] = np.argpartition(tile.ravel(), -_BRIGHTEST)[-_BRIGHTEST:]
+            self._charges[n] = tile.ravel()[self._pixels[n]]
+        self._noise = self._rng.standard_normal(self._charges.shape)
 
-    def peaks(self, scale: float, sigma: float) -> F64:
-        """Brightest sample (e-) of each track, for a charge ``scale`` times as large."""
-        return np.asarray((scale * self._charges + sigma * self._noise).max(axis=1))
+    def noise_at(self, sigma: F32) -> F64:
+        """Noise (track, pixel) where tracks at random places of frames (t, y, x) lie; e-.
 
-    def seen(self, scale: float, sigma: float, limit: float) -> float:
-        """Share of the tracks that are found."""
-        return float(np.mean(self.peaks(scale, sigma) > limit * sigma))
+        Infinite in samples that do not count.
+        """
+        t, y, x = (self._rng.integers(0, n, (_DRAWN, 1)) for n in sigma.shape)
+        dy, dx = np.divmod(self._pixels, _TILE)
+        # A track that leaves the window comes in on the other side, as others do from beyond it.
+        own = sigma[t, (y + dy) % sigma.shape[1], (x + dx) % sigma.shape[2]]
+        return np.where(np.isfinite(own), own, np.inf)
+
+    def peaks(self, scale: float, noise: F64, limit: float) -> F64:
+        """Brightest outlier (e-) of each track that has one, for ``scale`` times the charge."""
+        counts = np.isfinite(noise)
+        sigma = np.where(counts, noise, 1.0)
+        samples = scale * self._charges + sigma * self._noise
+        peaks = np.where(counts & (samples > limit * sigma), samples, 0.0).max(axis=1)
+        return np.asarray(peaks[peaks > 0])
 
 
-def _scale(searches: list[_Search], drawn: _Drawn) -> tuple[float, float | None]:
+def _scale(searches: list[_Search], places: list[F64], drawn: _Drawn) -> tuple[float, float | None]:
     """Charge of the hits over that of the tracks drawn, and its error (None: too few hits)."""
-    hits = [(p, n, s.limit) for s in searches for p, n in zip(s.peaks, s.noise, strict=True)]
-    if len(hits) < _MIN_HITS:
+    hits = sum(len(s.peaks) for s in searches)
+    if hits < _MIN_HITS:
         return 1.0, None
 
     def rank(log_scale: float) -> float:
-        """Mean rank of the hits among the drawn tracks above the limit, less one half."""
-        found = {}
-        ranks = []
-        for peak, noise, limit in hits:
-            # Tracks are drawn for noise in steps of 10 %.
-            step = round(np.log(noise) * 10)
-            if step not in found:
-                found[step] = np.sort(drawn.peaks(np.exp(log_scale), np.exp(step / 10)))
-            below, above = np.searchsorted(found[step], (peak, limit * noise)) / _DRAWN
-            # Where hardly a drawn track is seen, the hit is brighter than they can explain.
-            ranks.append(1.0 if 1 - above < _RARE else (below - above) / (1 - above))
-        return float(np.mean(ranks)) - 0.5
+        """Mean rank of the hits among the drawn tracks that are found, less one half."""
+        total = 0.0
+        for s, noise in zip(searches, places, strict=True):
+            found = np.sort(drawn.peaks(np.exp(log_scale), noise, s.limit))
+            # Where hardly a drawn track is found, a hit is brighter than they can explain.
+            rare = len(found) < _RARE * _DRAWN
+            total += len(s.peaks) if rare else np.searchsorted(found, s.peaks).sum() / len(found)
+        return total / hits - 0.5
 
     low, high = np.log(0.05), np.log(20.0)
     if rank(low) * rank(high) >= 0:
@@ -290,4 +293,4 @@ def _scale(searches: list[_Search], drawn: _Drawn) -> tuple[float, float | None]
     found = float(brentq(rank, low, high, xtol=1e-3))
     slope = abs(rank(found + 0.2) - rank(found - 0.2)) / 0.4
     scale = float(np.exp(found))
-    return scale, scale / (max(slope, 0.05) * np.sqrt(12 * len(hits)))
+    return scale, scale / (max(slope, 0.05) * np.sqrt(12 * hits))
