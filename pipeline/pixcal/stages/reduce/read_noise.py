@@ -111,14 +111,15 @@ def _before_rounding(
     in_steps = variance[0] / step**2, variance[1] / step**2
     levels, counts = means[np.isfinite(means)] / step, code_counts([job.read_series], job)
     reader = job.frames[job.read_series.array]
-    found = noise_before_rounding(*in_steps, levels, frames)
-    if len(missing_codes(counts)):
+    if not len(missing_codes(counts)):
+        found = noise_before_rounding(*in_steps, levels, frames)
+    else:
         # Few frames without light do not tell whether there is a pattern in what is missing.
         multiple = step_of(code_counts([job.read_series, *job.flat], job))[0]
         # Where codes are missing, means of darks lie on no line over exposure time.
         own = np.mean([middle_rows(reader, n, n + 1) for n in job.read_series.frames], axis=0)
         levels = own.ravel() / step
-        found = noise_before_missing_codes(*in_steps, levels, frames, counts, multiple) or found
+        found = noise_before_missing_codes(*in_steps, levels, frames, counts, multiple)
     return found and (step * found[0], step * found[1])
 
 
