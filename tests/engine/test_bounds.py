@@ -5,6 +5,7 @@ import time
 
 import numpy as np
 import pytest
+from numba.core import event
 
 from pixcal.engine.bounds import Bound, Exceeded
 
@@ -41,6 +42,25 @@ def test_waiting_is_no_work() -> None:
     with Bound(0.3, ALL).kept():
         time.sleep(0.6)
     other.join()
+
+
+def test_compiling_is_no_work() -> None:
+    """A kernel within a kernel counts once; work after it counts."""
+    begin = time.thread_time()
+    with Bound(0.4, ALL).kept(), event.trigger_event("numba:compile"):
+        busy(0.5)
+        with event.trigger_event("numba:compile"):
+            busy(0.5)
+    assert time.thread_time() - begin > 1.0
+
+    def go_on() -> None:
+        with event.trigger_event("numba:compile"):
+            busy(0.5)
+        busy(20.0)
+
+    with pytest.raises(Exceeded), Bound(0.4, ALL).kept():
+        go_on()
+    assert time.thread_time() - begin < 5.0
 
 
 def test_work_that_fills_the_memory_is_ended() -> None:

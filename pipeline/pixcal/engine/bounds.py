@@ -10,6 +10,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from numba.core import event
+
 LOOK_S = 0.2  # from one look at what is used to the next
 
 
@@ -17,11 +19,40 @@ class Exceeded(BaseException):
     """More was used than planned; no `Exception`, lest who tries several ways goes on."""
 
 
+class _Compiling(event.Listener):  # type: ignore[misc]
+    """Processor time (s) that each thread has spent on compiling kernels."""
+
+    def __init__(self) -> None:
+        self._spent: dict[int, float] = {}
+        self._began: dict[int, list[float]] = {}  # kernels may be compiled within others
+
+    def on_start(self, event: event.Event) -> None:
+        """Note when."""
+        self._began.setdefault(threading.get_ident(), []).append(time.thread_time())
+
+    def on_end(self, event: event.Event) -> None:
+        """Add it up."""
+        thread = threading.get_ident()
+        began = self._began[thread].pop()
+        if not self._began[thread]:
+            self._spent[thread] = self._spent.get(thread, 0.0) + time.thread_time() - began
+
+    def of(self, thread: int, now: float) -> float:
+        """Of a thread, by a time of its clock."""
+        begun = self._began.get(thread)
+        return self._spent.get(thread, 0.0) + (now - begun[0] if begun else 0.0)
+
+
+_COMPILING = _Compiling()
+event.register("numba:compile", _COMPILING)
+
+
 @dataclass(frozen=True)
 class Bound:
     """What work may use."""
 
-    # processor time of its own thread: what others do on the machine makes no difference
+    # processor time of its own thread, but for compiling: neither what others do on the machine
+    # nor a first use makes a difference
     seconds: float
     memory: int = sys.maxsize  # bytes of this process
 
@@ -31,11 +62,16 @@ class Bound:
         # That shows between two steps of the interpreter: a compiled kernel still comes to its end.
         thread, done, lock = threading.get_ident(), threading.Event(), threading.Lock()
         clock = time.pthread_getcpuclockid(thread)
-        last = time.clock_gettime(clock) + self.seconds
+
+        def used() -> float:
+            now = time.clock_gettime(clock)
+            return now - _COMPILING.of(thread, now)
+
+        last = used() + self.seconds
 
         def watch() -> None:
             while not done.wait(LOOK_S):
-                if time.clock_gettime(clock) > last or _beyond(self.memory):
+                if used() > last or _beyond(self.memory):
                     with lock:
                         if not done.is_set():
                             raised = ctypes.pythonapi.PyThreadState_SetAsyncExc
