@@ -24,8 +24,8 @@ CACHE_BYTES = 384 << 20
 PRIME_BYTES = 48 << 20  # memory for the codes of the scout's first look
 # chunks along time that the first look takes frames from: one may hold little of a slow scan
 LOOKS = 16
-# frames that the first look needs: the noise of its pixels then adds 2 % to the variance of the
-# frames' parameters, and its time grows with the square of them
+# frames that the first look takes at most: pixels of three unknowns each add three parts in so many
+# to the variance of the frames' parameters; the time of the rank-three search grows with the square
 LOOK_FRAMES = 128
 
 
