@@ -128,6 +128,42 @@ def test_rate_and_charge_are_found(
     assert found.significance > 10
 
 
+@pytest.mark.long
+def test_tracks_of_another_law_are_described(acquired: Callable[..., Evidence]) -> None:
+    """Of any length and charge, each even along its way: their charge is found, and its spread."""
+    evidence = acquired({"frames.darks": []})
+    (name, fringes), *_ = evidence.fringes.items()
+    rng, electrons = np.random.default_rng(8), fringes.electrons.copy()
+    charge = np.zeros_like(electrons[0])
+    brightest = []
+    for frame in electrons:
+        for _ in range(rng.poisson(1.5)):
+            length, turn = 2 + rng.exponential(6), 2 * np.pi * rng.random()
+            per_px = 300 + rng.exponential(600)
+            y, x = rng.random(2) * frame.shape
+            charge[:] = 0
+            track = [y, x, length * np.sin(turn), length * np.cos(turn), per_px * length]
+            add_tracks(charge, np.array([track]), 0.15, 0)
+            frame += charge
+            brightest.append(charge.max())
+    hit = replace(fringes, electrons=electrons)
+    found = CosmicHits.estimate(replace(evidence, fringes={name: hit}, stacks=()))
+    assert found is not None
+    assert isinstance(found.effect, CosmicHits)
+    assert found.effect.spread > 0
+    pitch, shape = evidence.pitch_um, charge.shape
+    drawn = []
+    for track in found.effect.tracks(rng, 2000, pitch, shape, 0):
+        charge[:] = 0
+        add_tracks(charge, track[None], found.effect.diffusion_um / pitch, 0)
+        drawn.append(charge.max())
+    bright = [np.sort(np.array(peaks))[::-1] for peaks in (brightest, drawn)]
+    per_frame = found.effect.rate_cm2_s * hit.exptime_s * np.prod(shape) * (pitch * 1e-4) ** 2
+    for least in (600, 1000, 1500):
+        true, own = (np.mean(b > least) for b in bright)
+        assert own * per_frame == pytest.approx(true * 1.5, rel=0.25)
+
+
 def test_one_hit_is_no_claim_and_two_are(acquired: Callable[..., Evidence]) -> None:
     evidence = acquired()
     (dark,) = evidence.of_kind("dark")

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from pixcal.effects.brighter_fatter import BrighterFatter
+from pixcal.effects.cosmic_hits import CosmicHits
 from pixcal.effects.gain_error import GainError
 from pixcal.effects.ipc import Coupling, Ipc
 from pixcal.effects.lag import Lag
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.recording import recordings
@@ -28,7 +30,8 @@ def change(bench: Bench, *effects: Effect) -> float:
     [
         (Ipc(SIDES), KERNEL),
         (Lag(0.02, 0.0, 0.0), 1.0),
-        (Lag(0.02, 0.0, 0.0, quiet=1.0), 1 - 0.02),
+        # Of two successive frames the later has a share of the former's noise too.
+        (Lag(0.02, 0.0, 0.0, quiet=1.0), (1 - 0.02) ** 2),
         (GainError(0.05), 1.0),
     ],
     ids=["crosstalk", "lag by single electrons", "lag without noise", "of the gain itself"],
@@ -36,7 +39,7 @@ def change(bench: Bench, *effects: Effect) -> float:
 def test_the_noise_of_flats_changes_as_the_kernel_says(
     make_effect_bench: Callable[..., Bench], effect: Effect, variance: float
 ) -> None:
-    bench = make_effect_bench({"detector.shape": [61, 67]})
+    bench = make_effect_bench({"detector.shape": [121, 127]})
     assert change(bench, effect) == pytest.approx(variance, abs=4e-3)
 
 
@@ -47,6 +50,22 @@ def test_brighter_fatter_takes_noise_in_proportion_to_the_level(
     weak, strong = (1 - change(bench, BrighterFatter(s)) for s in (2e-7, 4e-7))
     assert weak > 0.005
     assert strong == pytest.approx(2 * weak, rel=0.15)
+
+
+@pytest.mark.long
+def test_hits_change_the_gain_as_much_as_reduce_measures_it(
+    make_effect_bench: Callable[..., Bench], acquired: Callable[..., Evidence]
+) -> None:
+    """Their brightest samples are left out there, and noise that neighbours share counts."""
+    hits = {"rate_cm2_s": 3e4, "electrons_per_um": 90.0, "thickness_um": 24.0, "spread": 0.6}
+    found = acquired({"detector.shape": [121, 127]}, {"cosmic_hits": hits})
+    gain, error, _ = found.photon_transfer
+    bench = make_effect_bench({"detector.shape": [121, 127]})
+    expected = photon_transfer_change(
+        bench, Lag(0.0), [CosmicHits(**hits)], recordings(bench), found.neighbours
+    )
+    assert expected > 1.02
+    assert found.gain / gain == pytest.approx(expected, abs=4 * error / gain)
 
 
 def test_a_gain_lies_between_what_was_declared_and_measured() -> None:

@@ -1,7 +1,7 @@
 """Particles that leave their charge in one frame: muons, and electrons of radioactive decay."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -11,7 +11,7 @@ from scipy.special import ndtr
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_count
 from pixcal.kernels.tracks import add_tracks, draw_tracks
-from pixcal.model.arrays import F32, F64, Indices, Mask
+from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
@@ -19,11 +19,23 @@ from pixcal.simulation.shot import Shot
 MARGIN_PX = 16  # how far beside the window tracks may begin
 THRESHOLD = 6.5  # standard deviations of the noise from which a sample is an outlier
 JOINED = 3.0  # standard deviations from which samples join outliers that lie near each other
-Samples = tuple[Indices, Indices, Indices]
 
 _STRAGGLING = 0.15
+# laws of the tracks that are tried
+_LAWS = {
+    "thickness_um": (2.0, 4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 64.0),
+    "spread": (0.0, 0.3, 0.6, 0.9, 1.2),
+    "diffusion_um": (0.5, 1.0, 1.5, 2.5, 4.0),
+}
+_LAW_GAIN = 5.0  # rise of the log-likelihood from which another law than the default is believed
+_SHAPED = 30  # hits that tell a law
+# classes of hits: samples that stand out, in all and next to the brightest, and its brightness over
+# the least that stands out
+_SIZES = (1.5, 2.5, 4.5, 8.5)
+_NEAR = (1.5, 2.5, 3.5, 5.5)
+_BRIGHTNESS = (1.25, 1.6, 2.0, 2.8, 4.0, 8.0)
 _DRAWN = 4000
-_TILE = 32
+_TILE = 48
 _MIN_FRAMES = 5
 _MIN_HITS = 5
 _OFTEN = 2
@@ -79,6 +91,10 @@ class CosmicHits(Effect):
     diffusion_um: float = quantity(
         1.5, unit="um", above=0, high=100, doc="rms width of the charge cloud at collection"
     )
+    spread: float = quantity(
+        0.0, low=0, high=3, doc="standard deviation of the logarithm of the charge per length, "
+        "from particle to particle"
+    )  # fmt: skip
 
     def charge(self, charge: F32, shot: Shot) -> F32:
         detector = shot.bench.detector
@@ -86,8 +102,9 @@ class CosmicHits(Effect):
         area = np.prod([(n + 2 * MARGIN_PX) * pitch * 1e-4 for n in detector.shape])
         recording = shot.recording
         rng = recording.pixel_rng(self.name, shot.frame)
-        # Where no exposure time is known, frames with light last as long as they are apart.
-        seconds = recording.exptime_s or (recording.period_s if recording.kind != "bias" else 0.0)
+        # A bias frame is not exposed, whatever its header says. Where no exposure time is known,
+        # frames with light last as long as they are apart.
+        seconds = 0.0 if recording.kind == "bias" else recording.exptime_s or recording.period_s
         count = int(rng.poisson((self.rate_cm2_s * seconds + self.readout_cm2) * area))
         if not count:
             return charge
@@ -103,7 +120,10 @@ class CosmicHits(Effect):
     ) -> F64:  # fmt: skip
         """Draw tracks as `pixcal.kernels.tracks.draw_tracks` does, for pixels of some pitch."""
         depth, electrons_per_px = self.thickness_um / pitch_um, self.electrons_per_um * pitch_um
-        return draw_tracks(rng, count, shape, margin_px, depth, electrons_per_px, _STRAGGLING)
+        tracks = draw_tracks(rng, count, shape, margin_px, depth, electrons_per_px, _STRAGGLING)
+        if self.spread:
+            tracks[:, 4] *= np.exp(self.spread * rng.standard_normal(count))
+        return tracks
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
@@ -114,35 +134,48 @@ class CosmicHits(Effect):
         them, tell hits while they are read out.
         """
         searches = list(_searches(evidence))
-        if not any(s.seconds > 0 for s in searches):
+        if not searches:
             return None
-        drawn = _Drawn(cls(), evidence.pitch_um)
+        law = _law(cls(), searches, evidence.pitch_um)
+        drawn = _Drawn(law, evidence.pitch_um)
         places = [drawn.noise_at(s.sigma) for s in searches]
         scale, scale_error = _scale(searches, places, drawn)
         seen = [
-            s.area * len(drawn.peaks(scale, own, s.limit)) / _DRAWN
+            s.area * len(drawn.hits(scale, own, s.limit).peaks) / _DRAWN
             for s, own in zip(searches, places, strict=True)
         ]
         exposures = np.array([(a * s.seconds, a) for a, s in zip(seen, searches, strict=True)]).T
-        if not exposures[0].sum() > 0:
+        if not exposures.sum() > 0:
             return None
-        chances = np.array([
-            max(_SKEW * s.samples * float(ndtr(-THRESHOLD)), s.downwards) for s in searches
-        ])  # fmt: skip
-        counts = np.array([float(len(s.peaks)) for s in searches])
-        values, spread = _rates(counts, exposures, chances)
+        counts, chances = _counts(searches)
+        exposed = np.flatnonzero(exposures.any(axis=1))
+        values, spread = _rates(counts, exposures[exposed], chances)
+        of = [cls.strengths[n] for n in exposed]
         default = cls().electrons_per_um
-        errors = dict(zip(cls.strengths, spread, strict=False))
+        errors = dict(zip(of, spread, strict=False))
         if scale_error is not None:
             errors["electrons_per_um"] = default * scale_error
         count, chance = int(counts.sum()), float(chances.sum())
         return Estimate(
-            cls(values[0], values[1], default * scale),
+            replace(
+                law,
+                electrons_per_um=default * scale,
+                **dict.fromkeys(cls.strengths, 0.0) | dict(zip(of, values, strict=True)),
+            ),
             errors,
             sigmas_of_count(count, chance),
             "samples in single frames far above the pixel's other frames",
             {"hits": count, "expected_by_chance": chance, "seen_cm2_s": float(exposures[0].sum())},
         )
+
+    @classmethod
+    def detect(cls, evidence: Evidence) -> float | None:
+        """Significance of the hits, whatever tracks they are of."""
+        searches = list(_searches(evidence))
+        if not searches:
+            return None
+        counts, chances = _counts(searches)
+        return sigmas_of_count(int(counts.sum()), float(chances.sum()))
 
 
 def _rates(counts: F64, exposures: F64, chances: F64) -> tuple[list[float], list[float]]:
@@ -160,12 +193,31 @@ def _rates(counts: F64, exposures: F64, chances: F64) -> tuple[list[float], list
         found.append((rates, np.maximum(rates @ own + chances, _FEWEST)))
     (_, one), (_, both) = found
     gain = 2 * float((counts * np.log(both / one) - both + one).sum())
-    used = 1 + (gain > SIGNIFICANT**2)
+    used = 1 + (gain > SIGNIFICANT**2) if len(exposures) > 1 else 1
     rates, expected = found[used - 1]
     # One hit at least: none leaves the rate unknown too.
     normal = exposures[:used] @ (exposures[:used] / np.maximum(expected, 1 / len(counts))).T
     errors = np.sqrt(np.diag(np.linalg.inv(normal)))
-    return [*rates.tolist(), 0.0][:2], errors.tolist()
+    return [*rates.tolist(), 0.0][: len(exposures)], errors.tolist()
+
+
+@dataclass(frozen=True)
+class _Hits:
+    """Hits (n,) that are found."""
+
+    peaks: F64  # brightest sample, e-
+    sizes: F64  # samples that stand out, and how many of them are no more than a pixel from that
+    near: F64
+
+    def classes(self, faintest: float) -> tuple[F64, F64]:
+        """Number of hits of each size and brightness, and of each size and width."""
+        size = np.digitize(self.sizes, _SIZES)
+        found = []
+        for other, edges in ((self.peaks / faintest, _BRIGHTNESS), (self.near, _NEAR)):
+            kinds = len(edges) + 1
+            number = size * kinds + np.digitize(other, edges)
+            found.append(np.bincount(number, minlength=(len(_SIZES) + 1) * kinds).astype(float))
+        return found[0], found[1]
 
 
 @dataclass(frozen=True)
@@ -176,9 +228,10 @@ class _Search:
     area: float  # of all samples, cm²
     samples: int
     limit: float  # from how many sigmas on a sample is an outlier
-    peaks: F64  # (hit,) brightest outlier of each hit upwards, e-
-    downwards: int  # hits downwards
+    hits: _Hits  # upwards
+    downwards: int  # number of those downwards
     sigma: F32  # (t, y, x) noise of the samples, e-; NaN where they do not count
+    faintest: float  # usual charge from which a sample is an outlier, e-
 
 
 def _searches(evidence: Evidence) -> Iterator[_Search]:
@@ -186,11 +239,13 @@ def _searches(evidence: Evidence) -> Iterator[_Search]:
     for f in evidence.fringes.values():
         # As in `CosmicHits.charge`.
         seconds = f.exptime_s if f.exptime_s > 0 else float(np.median(np.diff(f.time_s)))
-        residual = np.where(f.good, f.residual, np.nan)
+        # A pixel that fits badly may have been hit: those that were hit hardest have.
+        residual = np.where(evidence.good & np.isfinite(f.theta).all(axis=0), f.residual, np.nan)
         yield _search(residual, np.sqrt(f.variance), seconds, area)
     for stack in (*evidence.of_kind("bias"), *evidence.of_kind("dark")):
         if len(stack.adu) >= _MIN_FRAMES:
-            yield _search(*evidence.dark_noise(stack), np.nan_to_num(stack.exptime_s), area)
+            seconds = 0.0 if stack.kind == "bias" else np.nan_to_num(stack.exptime_s)
+            yield _search(*evidence.dark_noise(stack), seconds, area)
 
 
 def _search(residual: F32, sigma: F32, seconds: float, area: float) -> _Search:
@@ -205,34 +260,44 @@ def _search(residual: F32, sigma: F32, seconds: float, area: float) -> _Search:
     often = np.count_nonzero(up | down, axis=0) > _OFTEN
     up &= ~often
     down &= ~often
-    hits = _hits(up, ratio > JOINED)
+    least = limit * np.float32(JOINED / THRESHOLD)
     n = int(np.count_nonzero(usable))
     return _Search(
         seconds,
         area * ratio.size,
         n,
         float(limit),
-        np.array([residual[hit].max() for hit in hits]),
-        len(_hits(down, ratio < -JOINED)),
+        _hits(up, ratio > least, residual),
+        len(_hits(down, ratio < -least, -residual).peaks),
         np.where(usable, sigma, np.float32(np.nan)),
+        float(limit * np.median(sigma)),
     )
 
 
-def _hits(outliers: Mask, joined: Mask) -> list[Samples]:
-    """The samples (frame, row, column) of each group of outliers that lie together in a frame.
+def _counts(searches: Sequence[_Search]) -> tuple[F64, F64]:
+    """Hits of each search, and how many are expected by chance."""
+    by_chance = [max(_SKEW * s.samples * float(ndtr(-THRESHOLD)), s.downwards) for s in searches]
+    return np.array([float(len(s.hits.peaks)) for s in searches]), np.array(by_chance)
+
+
+def _hits(outliers: Mask, joined: Mask, residual: F32) -> _Hits:
+    """Each group of outliers that lie together in a frame.
 
     Fainter samples join what noise tears apart of a long track.
     """
     found = []
     for frame in np.flatnonzero(outliers.any(axis=(1, 2))):
-        together = ndimage.binary_dilation(joined[frame] | outliers[frame], np.ones((3, 3)))
-        labels, _ = ndimage.label(together, np.ones((3, 3)))
-        rows, columns = np.nonzero(outliers[frame])
+        bright = joined[frame] | outliers[frame]
+        labels, _ = ndimage.label(ndimage.binary_dilation(bright, np.ones((3, 3))), np.ones((3, 3)))
+        rows, columns = np.nonzero(bright)
         groups = labels[rows, columns]
-        for group in np.unique(groups):
-            own = groups == group
-            found.append((np.full(own.sum(), frame), rows[own], columns[own]))
-    return found
+        for group in np.unique(labels[outliers[frame]]):
+            y, x = rows[groups == group], columns[groups == group]
+            charge = residual[frame, y, x]
+            at = int(charge.argmax())
+            near = (abs(y - y[at]) <= 1) & (abs(x - x[at]) <= 1)
+            found.append((float(charge[at]), len(y), np.count_nonzero(near)))
+    return _Hits(*np.array(found, float).reshape(-1, 3).T)
 
 
 class _Drawn:
@@ -241,14 +306,18 @@ class _Drawn:
     def __init__(self, effect: CosmicHits, pitch_um: float) -> None:
         self._rng = np.random.default_rng(0)
         tracks = effect.tracks(self._rng, _DRAWN, pitch_um, (1, 1), 0)
-        tracks[:, :2] += _TILE // 2
-        self._charges = np.empty((_DRAWN, _BRIGHTEST))
-        self._pixels = np.empty((_DRAWN, _BRIGHTEST), int)
+        # In the middle of a tile; of what is longer than that, a part.
+        tracks[:, :2] += (_TILE - tracks[:, 2:4]) / 2
+        self._charges = np.zeros((_DRAWN, _BRIGHTEST))
+        self._pixels = np.zeros((_DRAWN, _BRIGHTEST), int)
         for n in range(_DRAWN):
             tile = np.zeros((_TILE, _TILE), np.float32)
             add_tracks(tile, tracks[n : n + 1], effect.diffusion_um / pitch_um, 0)
-            self._pixels[n] = np.argpartition(tile.ravel(), -_BRIGHTEST)[-_BRIGHTEST:]
-            self._charges[n] = tile.ravel()[self._pixels[n]]
+            lit = np.flatnonzero(tile)
+            if len(lit) > _BRIGHTEST:
+                lit = lit[np.argpartition(tile.flat[lit], -_BRIGHTEST)[-_BRIGHTEST:]]
+            self._pixels[n, : len(lit)] = lit
+            self._charges[n, : len(lit)] = tile.flat[lit]
         self._noise = self._rng.standard_normal(self._charges.shape)
 
     def noise_at(self, sigma: F32) -> F64:
@@ -262,18 +331,62 @@ class _Drawn:
         own = sigma[t, (y + dy) % sigma.shape[1], (x + dx) % sigma.shape[2]]
         return np.where(np.isfinite(own), own, np.inf)
 
-    def peaks(self, scale: float, noise: F64, limit: float) -> F64:
-        """Brightest outlier (e-) of each track that has one, for ``scale`` times the charge."""
+    def hits(self, scale: float, noise: F64, limit: float) -> _Hits:
+        """Those of the tracks that are found, as of `_Search`, for ``scale`` times the charge."""
         counts = np.isfinite(noise)
         sigma = np.where(counts, noise, 1.0)
-        samples = scale * self._charges + sigma * self._noise
-        peaks = np.where(counts & (samples > limit * sigma), samples, 0.0).max(axis=1)
-        return np.asarray(peaks[peaks > 0])
+        samples = np.where(counts, scale * self._charges + sigma * self._noise, 0.0)
+        found = (samples > limit * sigma).any(axis=1)
+        samples, pixels = samples[found], self._pixels[found]
+        bright = samples > limit * JOINED / THRESHOLD * sigma[found]
+        at = samples.argmax(axis=1)[:, None]
+        (y, x), (y0, x0) = (
+            np.divmod(p, _TILE) for p in (pixels, np.take_along_axis(pixels, at, 1))
+        )
+        near = bright & (abs(y - y0) <= 1) & (abs(x - x0) <= 1)
+        sizes = (np.count_nonzero(one, axis=1).astype(float) for one in (bright, near))
+        return _Hits(samples.max(axis=1, initial=0), *sizes)
+
+
+def _law(start: CosmicHits, searches: list[_Search], pitch_um: float) -> CosmicHits:
+    """Length, width and straggling of tracks whose hits are like those found."""
+    if sum(len(s.hits.peaks) for s in searches) < _SHAPED:
+        return start
+    tried: dict[CosmicHits, float] = {}
+
+    def likelihood(law: CosmicHits) -> float:
+        if law not in tried:
+            drawn = _Drawn(law, pitch_um)
+            places = [drawn.noise_at(s.sigma) for s in searches]
+            scale, _ = _scale(searches, places, drawn)
+            tried[law] = sum(
+                _log_likelihood(s, drawn.hits(scale, own, s.limit))
+                for s, own in zip(searches, places, strict=True)
+            )
+        return tried[law]
+
+    best, before = start, -np.inf
+    while likelihood(best) > before:
+        before = likelihood(best)
+        for name, values in _LAWS.items():
+            best = max((replace(best, **{name: v}) for v in values), key=likelihood)
+    return best if likelihood(best) > likelihood(start) + _LAW_GAIN else start
+
+
+def _log_likelihood(search: _Search, drawn: _Hits) -> float:
+    """Of the classes of the hits found, where tracks are drawn that have these ones."""
+    total = 0.0
+    seen, likely = (hits.classes(search.faintest) for hits in (search.hits, drawn))
+    for hits, expected in zip(seen, likely, strict=True):
+        # Half a track in a class that none is of.
+        expected += 0.5
+        total += float(hits @ np.log(expected / expected.sum()))
+    return total
 
 
 def _scale(searches: list[_Search], places: list[F64], drawn: _Drawn) -> tuple[float, float | None]:
     """Charge of the hits over that of the tracks drawn, and its error (None: too few hits)."""
-    hits = sum(len(s.peaks) for s in searches)
+    hits = sum(len(s.hits.peaks) for s in searches)
     if hits < _MIN_HITS:
         return 1.0, None
 
@@ -281,10 +394,11 @@ def _scale(searches: list[_Search], places: list[F64], drawn: _Drawn) -> tuple[f
         """Mean rank of the hits among the drawn tracks that are found, less one half."""
         total = 0.0
         for s, noise in zip(searches, places, strict=True):
-            found = np.sort(drawn.peaks(np.exp(log_scale), noise, s.limit))
+            found = np.sort(drawn.hits(np.exp(log_scale), noise, s.limit).peaks)
             # Where hardly a drawn track is found, a hit is brighter than they can explain.
             rare = len(found) < _RARE * _DRAWN
-            total += len(s.peaks) if rare else np.searchsorted(found, s.peaks).sum() / len(found)
+            ranks = np.searchsorted(found, s.hits.peaks)
+            total += len(ranks) if rare else ranks.sum() / len(found)
         return total / hits - 0.5
 
     low, high = np.log(0.05), np.log(20.0)

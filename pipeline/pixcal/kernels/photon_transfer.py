@@ -13,7 +13,6 @@ measured as far as `REACH` and added as far as they are likely.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
@@ -158,22 +157,6 @@ def bin_pairs(blocks: F64) -> F64:
     sums = (np.bincount(bins, w, N_BINS) for w in (dof, *(dof * v for v in blocks.T[1:])))
     # Of no blocks numpy counts in whole numbers.
     return np.stack(list(sums), axis=1).astype(float)
-
-
-def neighbour_noise(frames: F32, lags: Sequence[tuple[int, int]]) -> float:
-    """Variance of good pixels (t, y, x) in time with that which neighbours share; NaN is not used.
-
-    Mean square about each pixel's mean, plus twice the covariance at each lag (rows, columns),
-    which has each pair once.
-    """
-    noise = frames - frames.mean(axis=0)
-    total = float(np.nanmean(noise**2))
-    ny, nx = noise.shape[1:]
-    for dy, dx in lags:
-        left, right = max(0, -dx), nx - max(0, dx)
-        here = noise[:, : ny - dy, left:right]
-        total += 2 * float(np.nanmean(here * noise[:, dy:, left + dx : right + dx]))
-    return total * len(frames) / (len(frames) - 1)
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,12 @@ blurs the track by a Gaussian.
 """
 
 import math
+from typing import Any
 
 import numpy as np
-from scipy.special import erf
+from numba import njit
 
+from pixcal.kernels import inner
 from pixcal.model.arrays import F32, F64
 
 STEPS_PER_PX = 4  # points of a track that stand for a pixel of its length
@@ -16,6 +18,7 @@ GRAZING = 0.02  # least cosine to the layer's normal: no track is longer than 50
 _RANGE = 4.0
 
 
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def add_tracks(charge: F32, tracks: F64, sigma: float, first_row: int) -> None:
     """Add the charge of tracks to a frame (y, x), e-; what falls beside it is lost.
 
@@ -27,21 +30,28 @@ def add_tracks(charge: F32, tracks: F64, sigma: float, first_row: int) -> None:
     first_row : of the frame, among those that the tracks are counted in
     """
     reach = math.ceil(_RANGE * sigma)
-    edges = np.arange(2 * reach + 3) - 0.5
-    for *start, dy, dx, electrons in tracks:
+    along_y, along_x = np.empty(2 * reach + 2), np.empty(2 * reach + 2)
+    for y0, x0, dy, dx, electrons in tracks:
         points = math.ceil(STEPS_PER_PX * math.hypot(dy, dx)) + 1
-        at = start + np.outer((np.arange(points) + 0.5) / points, [dy, dx])
-        first = np.floor(at).astype(int) - reach
-        # Shares of a Gaussian in the rows, and in the columns, from the first on.
-        away = first[:, :, None] + edges - at[:, :, None]
-        along_y, along_x = np.diff(erf(away / (math.sqrt(2.0) * sigma)) / 2).swapaxes(0, 1)
-        rows, columns = (first[:, n, None] + np.arange(2 * reach + 2) for n in (0, 1))
-        rows -= first_row
-        along_y[(rows < 0) | (rows >= charge.shape[0])] = 0
-        along_x[(columns < 0) | (columns >= charge.shape[1])] = 0
-        where = np.clip(rows, 0, len(charge) - 1)[:, :, None]
-        there = where, np.clip(columns, 0, charge.shape[1] - 1)[:, None, :]
-        np.add.at(charge, there, electrons / points * along_y[:, :, None] * along_x[:, None, :])
+        for n in range(points):
+            y, x = y0 + (n + 0.5) / points * dy, x0 + (n + 0.5) / points * dx
+            row, column = math.floor(y) - reach - first_row, math.floor(x) - reach
+            _shares(along_y, row + first_row - y, sigma)
+            _shares(along_x, column - x, sigma)
+            for i in range(max(-row, 0), min(len(along_y), charge.shape[0] - row)):
+                for j in range(max(-column, 0), min(len(along_x), charge.shape[1] - column)):
+                    share = electrons / points * along_y[i] * along_x[j]
+                    charge[row + i, column + j] += share
+
+
+@inner()
+def _shares(shares: Any, away: float, sigma: float) -> None:
+    """Shares of a Gaussian in successive pixels, the first of them ``away`` from its centre."""
+    below = math.erf((away - 0.5) / (math.sqrt(2.0) * sigma))
+    for n in range(len(shares)):
+        upto = math.erf((away + n + 0.5) / (math.sqrt(2.0) * sigma))
+        shares[n] = (upto - below) / 2
+        below = upto
 
 
 def draw_tracks(

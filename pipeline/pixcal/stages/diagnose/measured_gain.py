@@ -6,15 +6,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixcal.kernels.gain_fit import LADDER
-from pixcal.kernels.photon_transfer import neighbour_noise
-from pixcal.model.arrays import F32, F64, Mask
+from pixcal.kernels.photon_transfer import LAGS, pair_statistics
+from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import Recording
 
 DECLARED_ERROR = 0.01  # least relative error of a declared gain
-FRAMES = 8  # flats that are simulated with and without effects, from the same random numbers
+# flats that are simulated with and without effects, from the same random numbers, at a time: as
+# many as tell the change of their noise to this, or as there are
+FRAMES = 8
+CHANGE_ERROR = 0.003
 # shot noise over read noise, as variances, of a flat that tells what effects do to the former
 LIT = 4.0
 # steps whose effects change the noise of flats otherwise than a gain does
@@ -71,32 +74,54 @@ def photon_transfer_change(
         # Of a ladder the gain is that at level zero: the dimmest flat with little read noise.
         lit = [r for r in flats if r.electrons > LIT * detector.read_noise_e**2] or flats
         flat = min(lit, key=lambda r: r.electrons)
-    dark = [r for r in recordings if r.kind == "bias"][:1]
+    flat = replace(flat, bench=bench)
+    dark = [replace(r, bench=bench) for r in recordings if r.kind == "bias" and r.count > 1][:1]
     rows = (0, detector.shape[0])
-    ratios = []
-    for acting in ([measured], [measured, *effects]):
-        camera = Camera(bench, rows, acting)
-        good = camera.maps.mask == 0
-        moments = [
-            _moments(camera, replace(r, bench=bench), good, neighbours) for r in (flat, *dark)
-        ]
-        (mean, variance), *none = moments
-        for offset, noise in none:
-            mean, variance = mean - offset, variance - noise
-        ratios.append(variance / mean)
-    return float(np.clip(ratios[1] / ratios[0], 0.1, 10)) if min(ratios) > 0 else 1.0
+    cameras = [Camera(bench, rows, acting) for acting in ([measured], [measured, *effects])]
+    offsets = []
+    for camera in cameras:
+        some = [_pairs(camera, r, range(min(FRAMES, r.count)), 0.0, neighbours) for r in dark]
+        offsets.append(some[0].mean(axis=1) if some else np.zeros(2))
+    found: list[list[F64]] = [[], []]
+    for first in range(0, flat.count - 1, FRAMES):
+        frames = range(first, min(first + FRAMES, flat.count))
+        for camera, (offset, noise), ratios in zip(cameras, offsets, found, strict=True):
+            means, variances = _pairs(camera, flat, frames, offset, neighbours)
+            ratios.append((variances - noise) / means)
+        before, after = (np.concatenate(ratios) for ratios in found)
+        if min(before.mean(), after.mean()) <= 0:
+            return 1.0
+        error = (after - before).std(ddof=1) / np.sqrt(len(before)) if len(before) > 1 else 0.0
+        if error < CHANGE_ERROR * before.mean():
+            break
+    return float(np.clip(after.mean() / before.mean(), 0.1, 10))
 
 
-def _moments(
+def _pairs(
     camera: Camera,
     recording: Recording,
-    good: Mask,
+    frames: range,
+    offset: float,
     neighbours: Sequence[tuple[int, int]],
-) -> tuple[float, float]:
-    """Mean and variance in time of good pixels, ADU; common changes of frames taken off."""
-    frames = range(min(FRAMES, recording.count))
+) -> F64:
+    """Mean above an offset and variance (2, pair) of good pixels, ADU, as `reduce` measures them.
+
+    Of pairs of successive frames, made equally bright; outliers are left out.
+    """
     samples = np.stack([s.astype(np.float32) for _, s in camera.expose(recording, frames)])
-    samples[:, ~good] = np.nan
-    of_frames = np.nanmean(samples, axis=(1, 2))
-    samples -= of_frames[:, None, None]
-    return float(of_frames.mean()), neighbour_noise(samples, neighbours)
+    samples[:, camera.maps.mask != 0] = np.nan
+    detector = recording.bench.detector
+    gain, lags = detector.gain_e_per_adu, [tuple(lag) for lag in LAGS.tolist()]
+    shared = [3 + lags.index(lag) for lag in neighbours]
+    found = []
+    for n in range(0, len(samples) - 1, 2):
+        pair = samples[n : n + 2]
+        levels = np.nanmean(pair, axis=(1, 2), keepdims=True)
+        level = float(levels.mean()) - offset
+        blocks = pair_statistics(
+            *(pair - levels + np.float32(level)),
+            gain=gain, read_noise=detector.read_noise_e / gain, quantum=1.0,
+        )  # fmt: skip
+        noise = blocks[:, 2] + 2 * blocks[:, shared].sum(axis=1)
+        found.append((level, np.average(noise, weights=blocks[:, 0])))
+    return np.array(found).T
