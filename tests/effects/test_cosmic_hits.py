@@ -92,7 +92,7 @@ def test_hits_while_frames_are_read_out_are_told_from_those_of_the_exposure(
     pulls = []
     for _ in range(40):
         counts = RNG.poisson(rate * exposures[0] + readout * exposures[1]).astype(float)
-        values, errors = _rates(counts, exposures, chances)
+        values, errors = _rates(counts, chances, exposures)
         assert len(errors) == 1 + (readout > 0)
         pulls += [(v - t) / e for v, t, e in zip(values, (rate, readout), errors, strict=False)]
     assert np.abs(pulls).max() < 4.5

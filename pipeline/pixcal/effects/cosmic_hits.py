@@ -14,6 +14,7 @@ from pixcal.kernels.tracks import add_tracks, draw_tracks
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.numbers import numbers
 from pixcal.simulation.shot import Shot
 
 MARGIN_PX = 16  # how far beside the window tracks may begin
@@ -28,6 +29,7 @@ _LAWS = {
     "diffusion_um": (0.5, 1.0, 1.5, 2.5, 4.0),
 }
 _LAW_GAIN = 5.0  # rise of the log-likelihood from which another law than the default is believed
+_AS_LIKELY = 3.0  # errors by which other laws may be less likely that tell what the rate may be
 _SHAPED = 30  # hits that tell a law
 # classes of hits: samples that stand out, in all and next to the brightest, and its brightness over
 # the least that stands out
@@ -136,36 +138,25 @@ class CosmicHits(Effect):
         searches = list(_searches(evidence))
         if not searches:
             return None
-        law = _law(cls(), searches, evidence.pitch_um)
-        drawn = _Drawn(law, evidence.pitch_um)
-        places = [drawn.noise_at(s.sigma) for s in searches]
-        scale, scale_error = _scale(searches, places, drawn)
-        seen = [
-            s.area * len(drawn.hits(scale, own, s.limit).peaks) / _DRAWN
-            for s, own in zip(searches, places, strict=True)
-        ]
-        exposures = np.array([(a * s.seconds, a) for a, s in zip(seen, searches, strict=True)]).T
-        if not exposures.sum() > 0:
+        (law, _), *others = _laws(cls(), searches, evidence.pitch_um)
+        found = _fitted(law, searches, evidence.pitch_um)
+        if found is None:
             return None
+        effect, errors, seen = found
+        step: dict[str, float] = {}
+        for other, apart in others:
+            if (as_likely := _fitted(other, searches, evidence.pitch_um)) is not None:
+                steps = _steps(effect, as_likely[0], max(apart, 1.0))
+                step = max(step, steps, key=lambda one: abs(one.get("rate_cm2_s", 0.0)))
         counts, chances = _counts(searches)
-        exposed = np.flatnonzero(exposures.any(axis=1))
-        values, spread = _rates(counts, exposures[exposed], chances)
-        of = [cls.strengths[n] for n in exposed]
-        default = cls().electrons_per_um
-        errors = dict(zip(of, spread, strict=False))
-        if scale_error is not None:
-            errors["electrons_per_um"] = default * scale_error
         count, chance = int(counts.sum()), float(chances.sum())
         return Estimate(
-            replace(
-                law,
-                electrons_per_um=default * scale,
-                **dict.fromkeys(cls.strengths, 0.0) | dict(zip(of, values, strict=True)),
-            ),
-            errors,
+            effect,
+            {n: float(np.hypot(errors.get(n, 0.0), step.get(n, 0.0))) for n in {**errors, **step}},
             sigmas_of_count(count, chance),
             "samples in single frames far above the pixel's other frames",
-            {"hits": count, "expected_by_chance": chance, "seen_cm2_s": float(exposures[0].sum())},
+            {"hits": count, "expected_by_chance": chance, "seen_cm2_s": seen},
+            (*({n: error} for n, error in errors.items()), step) if step else (),
         )
 
     @classmethod
@@ -178,10 +169,10 @@ class CosmicHits(Effect):
         return sigmas_of_count(int(counts.sum()), float(chances.sum()))
 
 
-def _rates(counts: F64, exposures: F64, chances: F64) -> tuple[list[float], list[float]]:
+def _rates(counts: F64, chances: F64, exposures: F64) -> tuple[list[float], list[float]]:
     """Hits per exposure of both kinds, and errors; the second is zero unless it is significant.
 
-    ``counts, chances``: (n,) hits, and how many of them are none; ``exposures``: (2, n).
+    ``counts, chances``: (n,) hits, and how many of them are none; ``exposures``: (1 or 2, n).
     """
     found: list[tuple[F64, F64]] = []
     for own in (exposures[:1], exposures):
@@ -348,10 +339,16 @@ class _Drawn:
         return _Hits(samples.max(axis=1, initial=0), *sizes)
 
 
-def _law(start: CosmicHits, searches: list[_Search], pitch_um: float) -> CosmicHits:
-    """Length, width and straggling of tracks whose hits are like those found."""
+def _laws(
+    start: CosmicHits, searches: list[_Search], pitch_um: float
+) -> list[tuple[CosmicHits, float]]:
+    """Length, width and spread of charge of tracks whose hits are like those found.
+
+    The likeliest first; then others, and by how many errors they are less likely, up to
+    `_AS_LIKELY`. As no law is quite right, an error is as large as the likeliest is wrong.
+    """
     if sum(len(s.hits.peaks) for s in searches) < _SHAPED:
-        return start
+        return [(start, 0.0)]
     tried: dict[CosmicHits, float] = {}
 
     def likelihood(law: CosmicHits) -> float:
@@ -370,7 +367,48 @@ def _law(start: CosmicHits, searches: list[_Search], pitch_um: float) -> CosmicH
         before = likelihood(best)
         for name, values in _LAWS.items():
             best = max((replace(best, **{name: v}) for v in values), key=likelihood)
-    return best if likelihood(best) > likelihood(start) + _LAW_GAIN else start
+    if before <= likelihood(start) + _LAW_GAIN:
+        return [(start, 0.0)]
+    seen = [h[h > 0] for s in searches for h in s.hits.classes(s.faintest)]
+    exact = sum(float(h @ np.log(h / h.sum())) for h in seen)
+    chance = max(2 * (exact - before) / sum(map(len, seen)), 1.0)
+    apart = {law: np.sqrt(2 * (before - likely) / chance) for law, likely in tried.items()}
+    return sorted(((n, a) for n, a in apart.items() if a < _AS_LIKELY), key=lambda one: one[1])
+
+
+def _fitted(
+    law: CosmicHits, searches: list[_Search], pitch_um: float
+) -> tuple[CosmicHits, dict[str, float], float] | None:
+    """A law with the rates and the charge that fit best, their errors, and cm² s looked at.
+
+    None if it says that nothing is seen.
+    """
+    drawn = _Drawn(law, pitch_um)
+    places = [drawn.noise_at(s.sigma) for s in searches]
+    scale, scale_error = _scale(searches, places, drawn)
+    seen = [
+        s.area * len(drawn.hits(scale, own, s.limit).peaks) / _DRAWN
+        for s, own in zip(searches, places, strict=True)
+    ]
+    exposures = np.array([(a * s.seconds, a) for a, s in zip(seen, searches, strict=True)]).T
+    if not exposures.sum() > 0:
+        return None
+    exposed = np.flatnonzero(exposures.any(axis=1))
+    values, spread = _rates(*_counts(searches), exposures[exposed])
+    of = [law.strengths[n] for n in exposed]
+    charge = "electrons_per_um"
+    errors = dict(zip(of, spread, strict=False))
+    if scale_error is not None:
+        errors[charge] = law.electrons_per_um * scale_error
+    rates = dict.fromkeys(law.strengths, 0.0) | dict(zip(of, values, strict=True))
+    fitted = replace(law, **rates | {charge: law.electrons_per_um * scale})
+    return fitted, errors, float(exposures[0].sum())
+
+
+def _steps(effect: CosmicHits, other: CosmicHits, errors: float) -> dict[str, float]:
+    """Change of each number by one error, where another law is so many errors away."""
+    own, others = numbers(effect), numbers(other)
+    return {n: (others[n] - own[n]) / errors for n in own if others[n] != own[n]}
 
 
 def _log_likelihood(search: _Search, drawn: _Hits) -> float:
