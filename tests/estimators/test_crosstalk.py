@@ -2,6 +2,7 @@
 
 import itertools
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from pixcal.estimators.maps.corrected import (
     phase_sums,
     straight_modes,
 )
+from pixcal.kernels import crosstalk
+from pixcal.kernels.crosstalk import Coupling, couple, couple_fringes
 from pixcal.model.errors import InputError
 
 
@@ -216,3 +219,24 @@ def test_offsets_of_pieces_are_those_of_the_whole():
     for p in pieces:
         part = offsets(modes[:, p], coefficients, delta[p], change[p], 0.7)
         np.testing.assert_allclose(part, whole[p], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_small_arrays_that_take_a_distance_at_once_are_no_other(
+    monkeypatch: pytest.MonkeyPatch, kind: type[np.floating[Any]]
+) -> None:
+    rng = np.random.default_rng(4)
+    couplings = [
+        Coupling(dy, dx, rng.normal(0, 0.01), 3, row, 2, column)
+        for dy, dx in ((0, 1), (-1, 0), (2, -2))
+        for row in range(3)
+        for column in range(2)
+    ]
+    couplings += [Coupling(0, 1, 0.003), Coupling(1, 1, 0.002, per_ke=1e-3)]
+    signal, theta = rng.uniform(0, 3e4, (2, 3, 23, 31)).astype(kind)
+    one = couple(signal, couplings, (5, 2)), couple_fringes(theta, couplings, (5, 2))
+    monkeypatch.setattr(crosstalk, "MAP_PIXELS", 0)
+    crosstalk._steps.cache_clear()
+    each = couple(signal, couplings, (5, 2)), couple_fringes(theta, couplings, (5, 2))
+    crosstalk._steps.cache_clear()
+    assert all(np.array_equal(a, b) for a, b in zip(one, each, strict=True))

@@ -10,6 +10,7 @@ row to row leaves rows in a flat.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,8 @@ Place = tuple[slice, slice]
 # most steps of the inverse; each gains a factor of one over the shares that leave a pixel
 STEPS = 60
 CONVERGED = 1e-13
+# arrays up to this size have maps of shares: one step then is that of all sources of a distance
+MAP_PIXELS = 1 << 17
 FILL_PX = 2.0  # radius of the neighbourhood that stands in for a pixel without data, px,
 FILL_REACH = 16  # and how far it goes
 
@@ -84,8 +87,39 @@ def _spans(size: int, first: int, every: int, at: int, step: int) -> tuple[slice
     return slice(begin, high, every), slice(begin + step, high + step, every)
 
 
-def _acts(coupling: Coupling) -> bool:
-    return coupling.share != 0
+@dataclass(frozen=True)
+class _Step:
+    """What sources give to the pixels so many rows and columns away."""
+
+    # sources, receivers, and the share of all of these, or of each (y, x), of the samples' type
+    parts: tuple[tuple[Place, Place, Any], ...]
+    per_ke: float
+
+
+@lru_cache(maxsize=32)
+def _steps(
+    couplings: tuple[Coupling, ...], shape: tuple[int, int], first: tuple[int, int],
+    kind: np.dtype[Any],
+) -> tuple[_Step, ...]:  # fmt: skip
+    """Couplings in the order of their distances; on small arrays those of one are one part."""
+    alike: dict[tuple[int, int, float], list[Coupling]] = {}
+    for c in couplings:
+        if c.share != 0:
+            alike.setdefault((c.dy, c.dx, c.per_ke), []).append(c)
+    found: list[_Step] = []
+    for (dy, dx, per_ke), own in alike.items():
+        parts = [(*c.places(shape, first), kind.type(c.share)) for c in own]
+        if len(own) > 1 and shape[0] * shape[1] <= MAP_PIXELS:
+            share, times = np.zeros(shape, kind), np.zeros(shape, int)
+            for here, _, value in parts:
+                share[here] = value
+                times[here] += 1
+            # A pixel gives each of several shares by itself.
+            if times.max() == 1:
+                here, there = Coupling(dy, dx, 0.0).places(shape, first)
+                parts = [(here, there, share[here])]
+        found.append(_Step(tuple(parts), per_ke))
+    return tuple(found)
 
 
 def couple(
@@ -97,15 +131,24 @@ def couple(
     first row and column in the window.
     """
     out = signal.copy()
-    for c in filter(_acts, couplings):
-        here, there = c.places((signal.shape[-2], signal.shape[-1]), first)
-        source = signal[(..., *here)]
-        moved = source * signal.dtype.type(c.share)
-        if c.per_ke:
-            moved *= 1 + source * signal.dtype.type(c.per_ke * 1e-3)
-        out[(..., *here)] -= moved
-        out[(..., *there)] += moved
+    shape = signal.shape[-2], signal.shape[-1]
+    for step in _steps(tuple(couplings), shape, first, signal.dtype):
+        moved = []
+        for here, _, share in step.parts:
+            source = signal[(..., *here)]
+            moved.append(source * share)
+            if step.per_ke:
+                moved[-1] *= 1 + source * signal.dtype.type(step.per_ke * 1e-3)
+        _move(out, step, moved)
     return out
+
+
+def _move(out: NDArray[Any], step: _Step, moved: Sequence[NDArray[Any]]) -> None:
+    # All that is given first, then all that is got: so the last bits are the same for any parts.
+    for (here, _, _), own in zip(step.parts, moved, strict=True):
+        out[(..., *here)] -= own
+    for (_, there, _), own in zip(step.parts, moved, strict=True):
+        out[(..., *there)] += own
 
 
 def couple_fringes(
@@ -118,16 +161,17 @@ def couple_fringes(
     alpha² / 2``, the fringe its slope, ``2 iota alpha``; the second harmonic is not in the maps.
     """
     out = theta.copy()
-    for c in filter(_acts, couplings):
-        here, there = c.places((theta.shape[1], theta.shape[2]), first)
-        source = theta[(slice(None), *here)]
-        moved = c.share * source
-        if c.per_ke:
-            iota, square = source[0], source[1] ** 2 + source[2] ** 2
-            moved[0] += c.share * c.per_ke * 1e-3 * (iota**2 + square / 2)
-            moved[1:] *= 1 + 2e-3 * c.per_ke * iota
-        out[(slice(None), *here)] -= moved
-        out[(slice(None), *there)] += moved
+    shape = theta.shape[1], theta.shape[2]
+    for step in _steps(tuple(couplings), shape, first, theta.dtype):
+        moved = []
+        for here, _, share in step.parts:
+            source = theta[(slice(None), *here)]
+            moved.append(share * source)
+            if step.per_ke:
+                iota, square = source[0], source[1] ** 2 + source[2] ** 2
+                moved[-1][0] += share * step.per_ke * 1e-3 * (iota**2 + square / 2)
+                moved[-1][1:] *= 1 + 2e-3 * step.per_ke * iota
+        _move(out, step, moved)
     return out
 
 

@@ -26,6 +26,7 @@ MAX_SAMPLES = 6_000_000
 MIN_FRAMES = 16  # fewest frames of a fringe set that leave residuals
 # every so many frames the modes are kept; they change little, and only their products count
 STRIDE = 16
+LEVELS = 128  # of the response, which all pixels have in common
 MIN_NOISE_SHARE = 0.1  # least share of a sample's noise that is left, of those that count
 
 
@@ -103,12 +104,33 @@ def _of_fringes(found: FringeEvidence, known: Sequence[Coupling], kept: F32) -> 
     y, x = grid((flat.shape[0], flat.shape[1]))
     places = np.concatenate([theta, x * theta, y * theta]).reshape(9, -1) / np.abs(theta).max()
     scale = np.where(found.good, flat / UNIT**0.5, np.nan).astype(np.float32)
-    rest = found.residual[at] * scale
+    rest = _without_response(found.residual[at] * scale, charge)
     read = (found.read_variance * flat**2 / UNIT).astype(np.float32)
     turn = np.exp(1j * np.outer([1, 2, 3], found.phi[at]))
     own = np.concatenate([np.ones((1, len(at))), turn.real, turn.imag])
     of_time = np.ascontiguousarray(np.linalg.qr(own.T)[0].T, np.float32)
     return _noise(rest, charge, read, kept, of_time, places.astype(np.float32))
+
+
+def _without_response(rest: F32, charge: F32) -> F32:
+    """Residuals (t, y, x) less their mean at each level: what a curved response does to all pixels.
+
+    A bend makes more harmonics than pixels are free to have here. Changed in place.
+    """
+    # Frame by frame: of all at once the places among the levels would need more memory than they.
+    step = float(charge.max()) / LEVELS or 1.0
+    count, total = np.zeros((2, LEVELS))
+    for noise, level in zip(rest, charge, strict=True):
+        used = np.isfinite(noise)
+        at = np.minimum((level[used] / step).astype(int), LEVELS - 1)
+        count += np.bincount(at, minlength=LEVELS)
+        total += np.bincount(at, noise[used], LEVELS)
+    some = np.flatnonzero(count)
+    if len(some):
+        mean = total[some] / count[some]
+        for noise, level in zip(rest, charge, strict=True):
+            noise -= np.interp(level / step - 0.5, some, mean).astype(np.float32)
+    return rest
 
 
 def _model(theta: F64, g: F64, dk: F64) -> F32:
