@@ -96,7 +96,7 @@ class _Step:
     per_ke: float
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=6)  # some megabytes each
 def _steps(
     couplings: tuple[Coupling, ...], shape: tuple[int, int], first: tuple[int, int],
     kind: np.dtype[Any],

@@ -311,6 +311,11 @@ class Again:
         """Of the effect."""
         return self.effect.domains
 
+    @property
+    def quick(self) -> bool:
+        """Of the effect."""
+        return self.effect.quick
+
     def detect(self, evidence: Evidence) -> float | None:
         """Its significance."""
         return self.ask(evidence)
