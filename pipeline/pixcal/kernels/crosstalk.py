@@ -115,7 +115,7 @@ def _steps(
                 share[here] = value
                 times[here] += 1
             # A pixel gives each of several shares by itself.
-            if times.max() == 1:
+            if times.max(initial=0) == 1:
                 here, there = Coupling(dy, dx, 0.0).places(shape, first)
                 parts = [(here, there, share[here])]
         found.append(_Step(tuple(parts), per_ke))

@@ -122,6 +122,6 @@ def _pairs(
             *(pair - levels + np.float32(level)),
             gain=gain, read_noise=detector.read_noise_e / gain, quantum=1.0,
         )  # fmt: skip
-        noise = blocks[:, 2] + 2 * blocks[:, shared].sum(axis=1)
-        found.append((level, np.average(noise, weights=blocks[:, 0])))
+        dof, noise = blocks[:, 0], blocks[:, 2] + 2 * blocks[:, shared].sum(axis=1)
+        found.append((level, dof @ noise / max(dof.sum(), 1.0)))
     return np.array(found).T
