@@ -29,7 +29,7 @@ _LAWS = {
     "diffusion_um": (0.5, 1.0, 1.5, 2.5, 4.0),
 }
 _LAW_GAIN = 5.0  # rise of the log-likelihood from which another law than the default is believed
-_AS_LIKELY = 3.0  # errors by which other laws may be less likely that tell what the rate may be
+_AS_LIKELY = 3.0  # other laws within so many errors of the likeliest widen the error of the rate
 _SHAPED = 30  # hits that tell a law
 # classes of hits: samples that stand out, in all and next to the brightest, and its brightness over
 # the least that stands out
@@ -345,7 +345,7 @@ def _laws(
     """Length, width and spread of charge of tracks whose hits are like those found.
 
     The likeliest first; then others, and by how many errors they are less likely, up to
-    `_AS_LIKELY`. As no law is quite right, an error is as large as the likeliest is wrong.
+    `_AS_LIKELY`. No law is exact: the misfit of the likeliest sets the size of an error.
     """
     if sum(len(s.hits.peaks) for s in searches) < _SHAPED:
         return [(start, 0.0)]

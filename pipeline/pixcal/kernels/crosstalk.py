@@ -114,7 +114,7 @@ def _steps(
             for here, _, value in parts:
                 share[here] = value
                 times[here] += 1
-            # A pixel gives each of several shares by itself.
+            # Pixels that give several shares over one distance give them one after the other.
             if times.max(initial=0) == 1:
                 here, there = Coupling(dy, dx, 0.0).places(shape, first)
                 parts = [(here, there, share[here])]
@@ -144,7 +144,7 @@ def couple(
 
 
 def _move(out: NDArray[Any], step: _Step, moved: Sequence[NDArray[Any]]) -> None:
-    # All that is given first, then all that is got: so the last bits are the same for any parts.
+    # All losses first, then all gains: the last bits do not depend on how sources are grouped.
     for (here, _, _), own in zip(step.parts, moved, strict=True):
         out[(..., *here)] -= own
     for (_, there, _), own in zip(step.parts, moved, strict=True):

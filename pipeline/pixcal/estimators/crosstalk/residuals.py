@@ -117,7 +117,7 @@ def _without_response(rest: F32, charge: F32) -> F32:
 
     A bend makes more harmonics than pixels are free to have here. Changed in place.
     """
-    # Frame by frame: of all at once the places among the levels would need more memory than they.
+    # Frame by frame: the level indices of all frames would take more memory than the frames.
     step = float(charge.max()) / LEVELS or 1.0
     count, total = np.zeros((2, LEVELS))
     for noise, level in zip(rest, charge, strict=True):

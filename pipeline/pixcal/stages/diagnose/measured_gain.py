@@ -14,8 +14,8 @@ from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import Recording
 
 DECLARED_ERROR = 0.01  # least relative error of a declared gain
-# flats that are simulated with and without effects, from the same random numbers, at a time: as
-# many as tell the change of their noise to this, or as there are
+# Flats are simulated with and without effects, from the same random numbers, so many at a time,
+# until the relative change of their noise is known to this error or all flats are used.
 FRAMES = 8
 CHANGE_ERROR = 0.003
 # shot noise over read noise, as variances, of a flat that tells what effects do to the former

@@ -235,7 +235,7 @@ def estimate(
 
 def detect(evidence: Evidence, kind: Signature, bound: Bound = OF_ESTIMATE) -> float | None:
     """Significance of an effect; None where it cannot be told."""
-    # One slow one at a time: the plan of simulations has no room for what two would need.
+    # Slow detections run one at a time: the memory plan of simulations has no room for two.
     with nullcontext() if kind.quick else _SLOW:
         found = _kept_within(bound, kind.detect, evidence)
     return found if isinstance(found, float) and np.isfinite(found) else None

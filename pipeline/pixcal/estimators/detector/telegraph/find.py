@@ -14,8 +14,8 @@ from pixcal.estimators.detector.telegraph.population import (
 from pixcal.kernels.significance import sigmas_of_best
 
 ROUNDS = 3  # most, in which population and time are found, each with the other known
-# decades over which stays differ where they do, and chi-square by which frames further apart must
-# say so: of equal stays they do by 1.9 at most in eight draws (jumps of 3 sigma in 3 % of 16,000)
+# decades over which stays differ where they do, and the chi-square by which frames further apart
+# must say so (equal stays: at most 1.9 in eight draws of 3-sigma jumps in 3 % of 16,000 pixels)
 SPREAD, DIFFER = 1.5, 2.0
 SETTLED = 0.5  # change of the time, over its error, after which no other round is needed
 
