@@ -8,6 +8,7 @@ import pytest
 from numba.core import event
 
 from pixcal.engine.bounds import Bound, Exceeded
+from pixcal.engine.run import Runtime
 
 ALL = 1 << 60
 
@@ -74,6 +75,18 @@ def test_work_that_fills_the_memory_is_ended() -> None:
     with pytest.raises(Exceeded), Bound(60.0, 600 << 20).kept():
         fill()
     assert len(held) < 40
+
+
+def test_memory_that_the_process_held_before_is_not_counted() -> None:
+    """A notebook with a large array open gets the answers of the command line."""
+    before = np.ones(600 << 20, np.uint8)
+    beside = Runtime().beside
+    assert beside > 300 << 20
+    with Bound(5.0, 500 << 20, beside).kept():
+        busy(0.5)
+    with pytest.raises(Exceeded), Bound(5.0, 500 << 20).kept():
+        busy(3.0)
+    assert before.all()
 
 
 def test_others_who_try_several_ways_do_not_go_on() -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from numba.core import event
 
 LOOK_S = 0.2  # from one look at what is used to the next
+OWN = 256 << 20  # bytes: a process that has loaded pixcal and nothing else
 
 
 class Exceeded(BaseException):
@@ -55,6 +56,7 @@ class Bound:
     # nor a first use makes a difference
     seconds: float
     memory: int = sys.maxsize  # bytes of this process
+    beside: int = 0  # bytes that it holds for other work and that do not count
 
     @contextmanager
     def kept(self) -> Iterator[None]:
@@ -71,7 +73,7 @@ class Bound:
 
         def watch() -> None:
             while not done.wait(LOOK_S):
-                if used() > last or _beyond(self.memory):
+                if used() > last or _beyond(self.memory + self.beside):
                     with lock:
                         if not done.is_set():
                             raised = ctypes.pythonapi.PyThreadState_SetAsyncExc
@@ -91,6 +93,11 @@ class Bound:
         """What it allows, in words."""
         memory = "" if self.memory == sys.maxsize else f" and {self.memory >> 20} MiB of memory"
         return f"{self.seconds:g} s of processor time{memory}"
+
+
+def held_by_others() -> int:
+    """Bytes that this process holds now for other work than pixcal's."""
+    return max(0, _resident() - OWN)
 
 
 def _beyond(memory: int) -> bool:

@@ -4,7 +4,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, TypeVar
 
@@ -18,6 +18,7 @@ from rich.progress import (
 )
 from threadpoolctl import ThreadpoolController
 
+from pixcal.engine.bounds import held_by_others
 from pixcal.engine.local import run_here, run_in_processes, run_in_threads
 from pixcal.model.errors import InputError
 from pixcal.model.options import Running
@@ -40,7 +41,11 @@ class Runtime(Running):
         Bytes that the whole stage may use on this machine. Dask workers have their own limits.
     quiet : bool
         No progress on stderr.
+    beside : int
+        Bytes that this process held for other work when this began, which ``memory`` leaves out.
     """
+
+    beside: int = field(default_factory=held_by_others, compare=False)
 
     def __post_init__(self) -> None:
         known = ("threads", "processes", "sync")

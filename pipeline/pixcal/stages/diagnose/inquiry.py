@@ -239,7 +239,7 @@ def _each_of(
     kinds: Mapping[str, K], ask: Callable[..., R], runtime: Runtime, label: str
 ) -> dict[str, R]:
     """What is asked of each effect, by its name."""
-    bound = replace(OF_ESTIMATE, memory=runtime.memory)
+    bound = replace(OF_ESTIMATE, memory=runtime.memory, beside=runtime.beside)
     asked = partial(ask, bound=bound)
     results = run_tasks(asked, list(kinds.values()), runtime.here, label=label)
     return dict(zip(kinds, results, strict=True))
