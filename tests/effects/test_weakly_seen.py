@@ -7,10 +7,11 @@ from pixcal.effects.ipc import Ipc
 from pixcal.effects.row_noise import RowNoise
 from pixcal.estimators.diagnosis.expectation import Reference, expect_nominal
 from pixcal.estimators.diagnosis.gap import compare
-from pixcal.estimators.diagnosis.test_statistics import Curve, Key
+from pixcal.estimators.diagnosis.test_statistics import Curve
+from pixcal.estimators.diagnosis.test_statistics.signature import signature_key
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.candidates import Candidate
-from pixcal.stages.diagnose.inquiry import outdone_by_others, weakly_seen
+from pixcal.stages.diagnose.inquiry import REFERENCES, outdone_by_others, weakly_seen
 
 KINDS: dict[str, type[Effect]] = {"ipc": Ipc, "row_noise": RowNoise}
 
@@ -37,22 +38,18 @@ def test_a_slow_estimate_is_a_statistic_only_if_weak_and_the_strongest(
 
 
 @pytest.mark.parametrize(
-    ("slow", "other", "dropped"), [(9.0, 12.0, True), (12.0, 9.0, False), (9.0, 1.0, False)]
+    ("slow", "other", "outdone"),
+    [(9.0, 18.0, True), (18.0, 9.0, False), (9.0, 1.0, False), (None, 18.0, True)],
 )
-def test_a_slow_statistic_is_dropped_where_another_differs_by_more(
-    slow: float, other: float, dropped: bool
+def test_a_slow_statistic_is_not_simulated_where_another_differs_by_more(
+    slow: float | None, other: float, outdone: bool
 ) -> None:
     rng = np.random.default_rng(3)
-    keys = [("harmonics", "a"), ("harmonics", "b")]
-
-    def curves(sizes: tuple[float, float]) -> dict[Key, Curve]:
-        return {
-            key: Curve(np.zeros(1), size + rng.standard_normal(1))
-            for key, size in zip(keys, sizes, strict=True)
-        }
-
-    reference = Reference.of([curves((0.0, 0.0)) for _ in range(64)])
-    data = {keys[0]: np.array([slow]), keys[1]: np.array([other])}
-    outdone = outdone_by_others(compare(data, expect_nominal(reference)), keys[:1])
-    assert outdone == (set(keys[:1]) if dropped else set())
-    assert (keys[0] in reference.without(outdone).values) is not dropped
+    quick, wanted = ("harmonics", "a"), signature_key("ipc", "space")
+    none = [{quick: Curve(np.zeros(1), rng.standard_normal(1))} for _ in range(REFERENCES)]
+    measured = {quick: Curve(np.zeros(1), np.array([other]))}
+    if slow is not None:
+        measured[wanted] = Curve(np.zeros(1), np.array([slow]))
+    reference = Reference.of(none)
+    differences = compare(reference.on_scale(measured), expect_nominal(reference))
+    assert outdone_by_others(differences, measured, [wanted]) == ({wanted} if outdone else set())

@@ -1,8 +1,7 @@
 """What a bench lets expect of every curve, from simulations with different random numbers."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 from scipy.special import stdtr
@@ -60,15 +59,6 @@ class Reference:
             if curve is not None and len(curve.value) == self.values[key].shape[1]:
                 found[key] = curve.value if usual is None else scaled(curve.value, usual)
         return found
-
-    def without(self, keys: Collection[Key]) -> Self:
-        """The reference of all other curves."""
-        kept = self.values.keys() - set(keys)
-        return type(self)(
-            {key: self.usual[key] for key in self.values if key in kept},
-            {key: v for key, v in self.values.items() if key in kept},
-            {key: self.independent[key] for key in self.values if key in kept},
-        )
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.special import stdtr
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.evidence import Evidence
@@ -85,23 +86,30 @@ def inquire(
         if candidate.estimate is None and not candidate.reason:
             candidate.reason = _needs(kinds[name], look.facts)
     estimates = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
-    trials = Trials(look.windows, scratch, look.runtime, signatures, estimates, SCREEN)
+    # A slow statistic is simulated only where no quick one tells as much.
+    quick = tuple(s for s in signatures if kinds[s.name].quick)
+    trials = Trials(look.windows, scratch, look.runtime, quick, estimates, SCREEN)
+    reference, data = _nominal(trials, look, base, run_dir)
+    slow = {_key_of(s) for s in signatures if s not in quick}
+    if not slow <= outdone_by_others(compare(data, expect_nominal(reference)), look.measured, slow):
+        trials = Trials(look.windows, scratch, look.runtime, signatures, estimates, SCREEN)
+        reference, data = _nominal(trials, look, base, run_dir)
+
+    asking = _Asking(look, base, kinds, candidates, trials)
+    search = Search(reference, data, asking.simulate, asking.again)
+    return Inquiry(base, look, trials, reference, data, search, search.run(candidates))
+
+
+def _nominal(
+    trials: Trials, look: DiagnosisInput, base: Effects, run_dir: Path
+) -> tuple[Reference, dict[Key, F64]]:
+    """What the nominal bench lets expect, and the curves of the data on its scales."""
     (nominal,) = trials.curves([base], REFERENCES, "nominal bench")
     if isinstance(nominal, str):
         where = "--nominal" if base else f"{run_dir}: its nominal bench"
         raise InputError(f"{where}: {nominal}")
     reference = Reference.of(nominal)
-    data = reference.on_scale(look.measured)
-    slow = {_key_of(s): s for s in signatures if not kinds[s.name].quick}
-    if outdone := outdone_by_others(compare(data, expect_nominal(reference)), slow):
-        reference = reference.without(outdone)
-        data = reference.on_scale(look.measured)
-        kept = tuple(s for s in signatures if _key_of(s) not in outdone)
-        trials = replace(trials, signatures=kept)
-
-    asking = _Asking(look, base, kinds, candidates, trials)
-    search = Search(reference, data, asking.simulate, asking.again)
-    return Inquiry(base, look, trials, reference, data, search, search.run(candidates))
+    return reference, reference.on_scale(look.measured)
 
 
 @dataclass(frozen=True)
@@ -224,11 +232,21 @@ def weakly_seen(
     )
 
 
-def outdone_by_others(differences: Mapping[Key, Difference], slow: Collection[Key]) -> set[Key]:
-    """Slow statistics that need not be made again: another one differs, and by more."""
-    others = flagged(differences) - set(slow)
-    least = min((differences[key].log_chance for key in others), default=np.inf)
-    return {key for key in slow if key in differences and differences[key].log_chance > least}
+def outdone_by_others(
+    differences: Mapping[Key, Difference], measured: Curves, slow: Collection[Key]
+) -> set[Key]:
+    """Slow statistics that need not be simulated: a quick one differs, and by more.
+
+    Without an effect they would scatter by one standard deviation about 0; ``differences`` are of
+    the quick ones.
+    """
+    others = flagged(differences)
+    if not others:
+        return set()
+    least = min(differences[key].log_chance for key in others)
+    sizes = {key: float(np.abs(measured[key].value).max()) for key in slow if key in measured}
+    chances = {key: np.log(2 * stdtr(REFERENCES - 1, -size)) for key, size in sizes.items()}
+    return {key for key in slow if key not in chances or chances[key] > least}
 
 
 def _key_of(kind: Signature) -> Key:
