@@ -15,7 +15,7 @@ install = PATH="$$PATH:$(BIN)" uv pip install --quiet --python $(BIN)/python $(1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-long lint smoke wheel-check docs doc-pages precision bench bench-run bench-full cluster fuzz torture power effect-pictures reproduce reproduce-full blind blind-second blind-full clean
+.PHONY: help install demo test test-long lint smoke wheel-check docs doc-pages precision bench bench-run bench-full cluster fuzz torture sensors power effect-pictures reproduce reproduce-full blind blind-second blind-full clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 17
@@ -93,6 +93,9 @@ fuzz: $(INSTALLED) ## bad input in thousands of cases, for docs/appendix/fuzz.md
 
 torture: $(TOOLS) ## faults of all kinds done on purpose, for docs/appendix/torture.md (12 minutes)
 	$(BIN)/python benchmarks/torture.py
+
+sensors: $(INSTALLED) ## all kinds of simulated cameras without fringes, diagnosed, into work/sensors (hours)
+	$(BIN)/python benchmarks/sensors.py --draws 2 --seed $(SEED) --out work/sensors
 
 power: $(INSTALLED) ## from which strength on the diagnosis names each effect, and false causes, into work/ (hours)
 	$(BIN)/python benchmarks/power.py

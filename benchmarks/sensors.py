@@ -22,6 +22,7 @@ import pixcal
 from second_bench.sensors import KINDS, make, write
 
 GAIN_WITHIN, NOISE_WITHIN, MASK_WITHIN = 0.01, 0.01, 1e-3
+LINES = ("row", "column")
 
 
 def examine(
@@ -56,8 +57,8 @@ def mark(run: Path, truth: dict[str, Any]) -> dict[str, Any]:
         return float("nan") if found is None else float(found)
 
     # The read noise that was drawn is that of single pixels.
-    rows = figures.get("row_noise", {}).get("value", 0.0)
-    noise = np.sqrt(max(value("read_noise") ** 2 - rows**2, 0.0))
+    shared = sum(figures.get(f"{line}_noise", {}).get("value", 0.0) ** 2 for line in LINES)
+    noise = np.sqrt(max(value("read_noise") ** 2 - shared, 0.0))
 
     mask = np.asarray(opened.detector["mask"]) != 0
     true = np.zeros(mask.size, np.bool_)
@@ -75,15 +76,20 @@ def mark(run: Path, truth: dict[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _diagnosis(file: Path, causes: list[list[str]]) -> dict[str, Any]:
-    """Causes named, and whether they are one of each that is to be named."""
+def _diagnosis(file: Path, causes: list[list[str]] | None) -> dict[str, Any]:
+    """Causes named, and whether they are one of each that is to be named; None: any is wrong."""
     if not file.exists():
         return {"right": False}
     found = json.loads(file.read_text())
     named = [cause["effect"] for cause in found["causes"]]
-    right = len(named) == len(causes) and all(set(named) & set(one) for one in causes)
+    if causes is None:
+        right = not named
+    elif not causes:
+        right = found["verdict"] == "no gap"
+    else:
+        right = len(named) == len(causes) and all(set(named) & set(one) for one in causes)
     return {
-        "right": right and (bool(causes) or found["verdict"] == "no gap"),
+        "right": right,
         "verdict": found["verdict"], "named": named,
         "p": [cause["p_value"] for cause in found["causes"]],
         "parameters": [[cause["parameters"], cause["uncertainty"]] for cause in found["causes"]],
