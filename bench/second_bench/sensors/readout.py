@@ -116,14 +116,30 @@ def _outputs(sensor: Sensor, at: tuple[float, float]) -> NDArray[np.int_]:
     return 2 * (np.arange(ny)[:, None] >= round(at[0] * ny)) + right
 
 
-@kind("?")
+@kind("output_jitter")
 def drifting_outputs(sensor: Sensor) -> Drawn:
     """Four outputs whose levels jump from frame to frame, each by itself."""
     rng, outputs = sensor.rng, _outputs(sensor, (0.5, 0.5))
-    size = float(rng.uniform(0.1, 0.5) * sensor.read_noise_e.mean())
-    sensor.shared_e = size
+    size = sensor.shared_e = float(rng.uniform(0.1, 0.5) * sensor.read_noise_e.mean())
     sensor.amplified.append(lambda e, _: e + size * rng.standard_normal(4)[outputs])
     return {"output_e": size}
+
+
+@kind("output_jitter")
+def wandering_outputs(sensor: Sensor) -> Drawn:
+    """Four outputs whose levels walk and jump, each by itself; they meet somewhere."""
+    rng, at = sensor.rng, sensor.rng.uniform(0.3, 0.7, 2)
+    outputs = _outputs(sensor, (float(at[0]), float(at[1])))
+    step, size = rng.uniform(0.03, 0.15, 2) * sensor.read_noise_e.mean()
+    sensor.shared_e = float(np.hypot(size, step / np.sqrt(2)))
+    levels = np.zeros(4)
+
+    def walks(e: F64, _: int) -> F64:
+        levels[:] += step * rng.standard_normal(4)
+        return np.asarray(e + (levels + size * rng.standard_normal(4))[outputs])
+
+    sensor.amplified.append(walks)
+    return {"step_e": float(step), "jump_e": float(size), "at": at.tolist()}
 
 
 @kind()
@@ -146,8 +162,9 @@ def two_amplifiers(sensor: Sensor) -> Drawn:
     right = np.arange(sensor.shape[1]) >= sensor.shape[1] // 2
     apart, noisier = float(rng.uniform(0.05, 0.15)), float(rng.uniform(1.2, 1.6))
     gains = 1 + apart * (right - right.mean())
+    # Of all pixels in electrons of the common gain.
     sensor.read_noise_e = sensor.read_noise_e * np.where(right, noisier, 1.0)
-    sensor.amplified.append(lambda e, _: np.asarray(e * gains))
+    sensor.collected.append(lambda e, _: np.asarray(e * gains))
     return {"apart": apart, "noisier": noisier}
 
 

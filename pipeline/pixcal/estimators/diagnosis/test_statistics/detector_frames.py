@@ -33,11 +33,24 @@ def _differences(evidence: Evidence, stack: Stack) -> F32:
         light = light * (means.mean() / means)[:, None, None].astype(np.float32)
     count = len(light) // 2 * 2
     steps = light[1:count:2] - light[:count:2]
+    if stack.kind == "flat":
+        steps = _without_gradient(steps, evidence)
     steps -= steps[:, good].mean(axis=1)[:, None, None]
     # Root mean squares: medians of whole numbers jump.
     rest = steps / np.sqrt((steps[:, good] ** 2).mean())
     rest[np.abs(rest) > WILD] = 0
     return np.asarray(rest * good, np.float32)
+
+
+def _without_gradient(steps: F32, evidence: Evidence) -> F32:
+    """Differences (t, y, x) of flats without what a change of the light's gradient does."""
+    # Of the sky it turns from frame to frame; the lamp is no part of the detector.
+    ny, nx = evidence.good.shape
+    y, x = np.linspace(-1, 1, ny)[:, None], np.linspace(-1, 1, nx)
+    lit = np.where(evidence.good, evidence.flat, 0)
+    basis = np.linalg.qr(np.stack([lit, lit * y, lit * x]).reshape(3, -1).T)[0].astype(np.float32)
+    flat = steps.reshape(len(steps), -1)
+    return np.asarray((flat - flat @ basis @ basis.T).reshape(steps.shape))
 
 
 def _stacks(evidence: Evidence, kind: str) -> tuple[Stack, ...]:

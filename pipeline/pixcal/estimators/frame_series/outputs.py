@@ -1,0 +1,160 @@
+"""Where outputs meet whose levels change from frame to frame, and by how much they change.
+
+Beside an edge between two outputs, the means of some rows (columns) on either side differ anew in
+every frame; noise of rows, white or 1/f, does so alike at all places.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best, sigmas_of_chi2
+from pixcal.model.arrays import F32, F64, Indices, Mask
+
+MIN_FRAMES = 8
+MAX_EDGES = 15  # along each axis
+NARROWEST = 8  # rows or columns of an output at least; even: two that alternate cancel
+_FAR = 24  # lines on either side by which an edge is placed
+_WILD = 5.0  # standard deviations from which a sample, _CLIP from which a step of a frame is cut
+_CLIP = 3.0
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Edges between outputs, and the noise of their levels."""
+
+    row_edges: tuple[int, ...]  # row_edges, column_edges: first line of each output but the first
+    column_edges: tuple[int, ...]
+    variance: float  # of the level of an output from frame to frame, e-²
+    error: float
+    sigmas: float  # significance of the clearest edge
+
+
+def find_outputs(stacks: Sequence[F32], good: Mask) -> Outputs | None:
+    """Outputs of stacks (t, y, x), e-, less the mean of each pixel; None with too few frames.
+
+    Where no edge is significant, the clearest one is given.
+    """
+    rests = [_calm(rest, good) for rest in stacks if len(rest) >= MIN_FRAMES]
+    if not rests:
+        return None
+    found = [_edges(rests, good, axis) for axis in (0, 1)]
+    clearest = max(found, key=lambda own: own[1])
+    if clearest[1] == -np.inf:
+        return None
+    kept = [[e for e, s in own[0] if s > SIGNIFICANT] for own in found]
+    if not any(kept):
+        kept[found.index(clearest)] = [clearest[0][0][0]]
+    rows, columns = (tuple(sorted(own)) for own in kept)
+    numbers = output_numbers(rows, columns, np.arange(good.shape[0]), np.arange(good.shape[1]))
+    variance, error = _variance(rests, good, numbers)
+    return Outputs(rows, columns, variance, error, clearest[1])
+
+
+def output_numbers(
+    row_edges: Sequence[int], column_edges: Sequence[int], rows: Indices, columns: Indices
+) -> Indices:
+    """Number (y, x) of the output that reads each pixel of some rows and columns."""
+    along = np.searchsorted(column_edges, columns, side="right")
+    down = np.searchsorted(row_edges, rows, side="right")
+    return np.asarray(down[:, None] * (len(column_edges) + 1) + along)
+
+
+def _calm(rest: F32, good: Mask) -> F32:
+    """Without the mean of each frame; samples of bad pixels and outliers are zero."""
+    rest = rest - rest[:, good].mean(axis=1)[:, None, None]
+    spread = 1.4826 * float(np.median(np.abs(rest[:, good])))
+    rest[np.abs(rest) > _WILD * max(spread, 1e-6)] = 0
+    return np.asarray(rest * good, np.float32)
+
+
+def _edges(rests: Sequence[F32], good: Mask, axis: int) -> tuple[list[tuple[int, float]], float]:
+    """Edges along an axis with their significance, clearest first, and that of the clearest."""
+    size = good.shape[axis]
+    places = np.arange(NARROWEST, size - NARROWEST + 1)
+    count = np.maximum(good.sum(axis=1 - axis), 1)
+    if len(places) < 4 * NARROWEST:
+        return [], -np.inf
+    lines = [rest.sum(axis=2 - axis, dtype=float) / count for rest in rests]
+    square, frames = np.zeros(len(places)), 0
+    for own in lines:
+        steps = _means(own, places, NARROWEST) - _means(own, places - NARROWEST, NARROWEST)
+        usual = 1.4826 * np.median(np.abs(steps)) or 1.0
+        square += np.square(np.clip(steps / usual, -_CLIP, _CLIP)).sum(axis=0)
+        frames += len(own)
+    dof = frames - len(rests)
+    square *= dof / np.maximum(_usual(square), 1e-9)
+    found: list[tuple[int, float]] = []
+    free = square.copy()
+    while len(found) < MAX_EDGES and free.max() > 0:
+        at = int(free.argmax())
+        chance = sigmas_of_chi2(float(free[at]), dof)
+        sigmas = sigmas_of_best(*[chance] * (2 * len(places)))
+        found.append((_placed(lines, int(places[at])), sigmas))
+        if sigmas < SIGNIFICANT:
+            break
+        free[max(at - NARROWEST, 0) : at + NARROWEST + 1] = 0
+    return found, found[0][1] if found else -np.inf
+
+
+def _usual(square: F64) -> F64:
+    """Median (n,) of all places or, where it is larger, of those on a side: noise may differ."""
+    away, near = 4 * NARROWEST, NARROWEST
+    found = np.full(len(square), np.median(square))
+    for n in range(len(square)):
+        sides = (square[max(n - away, 0) : max(n - near, 0)], square[n + near : n + away])
+        found[n] = max(found[n], *(float(np.median(side)) for side in sides if len(side) >= near))
+    return found
+
+
+def _means(lines: F64, first: Indices, count: int) -> F64:
+    """Means (t, n) of so many lines from some on."""
+    total = np.concatenate([np.zeros((len(lines), 1)), np.cumsum(lines, axis=1)], axis=1)
+    return np.asarray((total[:, first + count] - total[:, first]) / count)
+
+
+def _placed(lines: Sequence[F64], about: int) -> int:
+    """Place about an edge that parts the lines best."""
+    size = lines[0].shape[1]
+    first, last = max(about - _FAR, 0), min(about + _FAR, size)
+    places = range(
+        max(about - NARROWEST // 2, first + 1), min(about + NARROWEST // 2, last - 1) + 1
+    )
+    gains = []
+    for place in places:
+        before, after = place - first, last - place
+        step = [own[:, place:last].mean(axis=1) - own[:, first:place].mean(axis=1) for own in lines]
+        gains.append(before * after / (before + after) * sum(float(s @ s) for s in step))
+    return places[int(np.argmax(gains))]
+
+
+def _variance(rests: Sequence[F32], good: Mask, numbers: Indices) -> tuple[float, float]:
+    """Variance of the levels of outputs beyond the noise of their pixels, rows and columns."""
+    masks = [good & (numbers == n) for n in range(int(numbers.max()) + 1)]
+    masks = [mask for mask in masks if np.count_nonzero(mask) >= NARROWEST**2]
+    if len(masks) < 2:
+        return 0.0, 1.0
+    total = freedom = noise = 0.0
+    for rest in rests:
+        levels = np.stack([rest[:, mask].mean(axis=1, dtype=float) for mask in masks], axis=1)
+        levels -= levels.mean(axis=1, keepdims=True)
+        dof = (len(rest) - 1) * (len(masks) - 1)
+        total, freedom = total + float((levels**2).sum()), freedom + dof
+        noise += dof * float(np.mean([_noise(rest, mask) for mask in masks]))
+    found, noise = total / freedom, noise / freedom
+    return found - noise, float(np.sqrt(2 / freedom)) * max(found, noise)
+
+
+def _noise(rest: F32, mask: Mask) -> float:
+    """Variance of the mean of some pixels that are a rectangle but for bad ones."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    cut = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+    own, used = rest[:, *cut] * mask[cut], np.maximum(np.count_nonzero(mask), 1)
+    ny, nx = mask[cut].shape
+    own = own - own.sum(axis=(1, 2), keepdims=True) / used
+    pixels = float(np.square(own, dtype=float).sum()) / len(own) / used
+    lines = [own.sum(axis=a) / np.maximum(mask[cut].sum(axis=a - 1), 1) for a in (2, 1)]
+    # Neighbours: what rows share over long distances is no less than between them.
+    of_rows, of_columns = (float(np.square(line, dtype=float).mean()) for line in lines)
+    return float(max(of_rows / ny + of_columns / nx - pixels / used, 0.0))
