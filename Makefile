@@ -8,9 +8,11 @@ DOCS := $(VENV)/.installed-docs
 # Of the whole blind examination; each is used once (docs/appendix/blind.md).
 SEED ?= 2004
 # Compiled on first use: most of what is installed is never imported.
-PIP := $(BIN)/python -m pip --quiet install --no-compile
+QUIETLY := --quiet install --no-compile
+# Takes longer than all the rest of an installation: only where nothing else can install.
+PIP := $(BIN)/python -m ensurepip >/dev/null && $(BIN)/python -m pip $(QUIETLY)
 # uv takes a third of the processor time of pip, which installs what uv cannot.
-install = PATH="$$PATH:$(BIN)" uv pip install --quiet --python $(BIN)/python $(1) 2>/dev/null || $(PIP) $(1)
+install = PATH="$$PATH:$(BIN)" uv pip install --quiet --python $(BIN)/python $(1) 2>/dev/null || { $(PIP) $(1); }
 # Where it is set, every process would compile all that it imports: seconds each.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -26,9 +28,10 @@ $(INSTALLED): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "pixcal needs Python 3.11 or newer, $(PYTHON) is not; try: make PYTHON=python3.12" >&2; \
 	  exit 1; }
-	$(PYTHON) -m venv $(VENV)
-	-@command -v uv >/dev/null || $(PIP) uv
-	@$(call install,--editable .)
+	$(PYTHON) -m venv --without-pip $(VENV)
+	-@command -v uv >/dev/null || \
+	  $(PYTHON) -m pip --python $(BIN)/python $(QUIETLY) uv 2>/dev/null || { $(PIP) uv; }
+	@$(call install,pip --editable .)
 	@touch $@
 
 $(TOOLS): $(INSTALLED)
