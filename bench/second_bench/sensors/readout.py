@@ -197,7 +197,7 @@ def binned(sensor: Sensor) -> Drawn:
             2 * np.median(sensor.read_noise_e) / sensor.gain * rng.standard_normal((4, *adu.shape))
         )
         mean = np.rint(adu + apart - apart.mean(axis=0)).mean(axis=0)
-        return np.asarray(np.rint(mean) if whole else mean)
+        return np.asarray(np.floor(mean + 0.5) if whole else mean)
 
     sensor.converter = means
     sensor.stored = np.float32

@@ -126,6 +126,22 @@ def noisy(
     return np.asarray(loud | telegraph | blinking)
 
 
+def variance_nearby(variance: F64, dof: F64, usual: float) -> F64:
+    """Variance of a usual pixel about each, ``usual`` or more: amplifiers differ in noise.
+
+    Parameters
+    ----------
+    variance, dof : (y, x) temporal variance (ADU²) and degrees of freedom, from a border of blocks
+    usual : that of a usual pixel of the detector (ADU²)
+    """
+    known = dof > 0
+    if not known.any():
+        return np.full(variance.shape, usual)
+    typical = max(float(np.median(dof[known])), 1.0)
+    nearby = _around(np.where(known, variance, np.nan))[0] * typical / chdtri(typical, 0.5)
+    return np.asarray(np.fmax(nearby, usual))
+
+
 def noisy_factor(least: float, variance: F64, dof: int, quantum: float) -> float:
     """Factor of the usual standard deviation that makes a pixel noisy, where pixels differ.
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.detector.bad_pixels import dead, hot, noisy, noisy_factor
+from pixcal.estimators.detector.bad_pixels import dead, hot, noisy, noisy_factor, variance_nearby
 from pixcal.estimators.detector.calibration import usual_variance
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.arrays import F32, F64, U8
@@ -195,7 +195,6 @@ def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> U
     limits, medians = job.limits, job.usual
     # A sample that lies on a change of code is one of two, however little noise it has.
     least = 3 * (job.floor / job.gain) ** 2
-    expected = np.full_like(flat, max(medians.dark_variance, least))
     if job.has_flat:
         mask[~np.isfinite(flat)] |= np.uint8(PixelFlag.NO_DATA)
         where = dead(flat, error, limits.dead, limits.bright, FLAT_FLOOR)
@@ -206,10 +205,11 @@ def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> U
         )
         mask[where] |= np.uint8(PixelFlag.HOT)
     if np.isfinite(medians.dark_variance):
+        variance, dof = found["dark_variance"], found["dark_dof"]
         where = noisy(
-            found["dark_variance"],
-            found["dark_dof"],
-            expected,
+            variance,
+            dof,
+            variance_nearby(variance, dof, max(medians.dark_variance, least)),
             found["kurtosis"],
             found["outliers"],
             medians.noisy,

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.detector.bad_pixels import noisy, noisy_factor, nonlinear
+from pixcal.estimators.detector.bad_pixels import noisy, noisy_factor, nonlinear, variance_nearby
 from pixcal.estimators.detector.calibration import (
     DarkLine,
     Rung,
@@ -308,7 +308,8 @@ def _loud(job: Measuring, frames: F32) -> NDArray[np.bool_]:
     usual = max(usual_variance(variance, len(frames) - 1), job.quantum**2 / 4)
     unknown = np.full(variance.shape, np.nan)
     factor = noisy_factor(job.limits.noisy, variance, len(frames) - 1, job.quantum)
-    return noisy(variance, dof, np.full(variance.shape, usual), unknown, 0 * dof, factor)
+    nearby = variance_nearby(variance, dof, usual)
+    return noisy(variance, dof, nearby, unknown, 0 * dof, factor)
 
 
 def _usable(job: Measuring, samples: NDArray[Any], lamp: bool) -> F32:
