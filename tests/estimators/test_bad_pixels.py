@@ -184,3 +184,19 @@ def test_pixels_of_a_noisier_amplifier_are_not_noisy(dof: int) -> None:
     assert np.count_nonzero(found & ~bad) <= 3
     # Of few samples the median of a variance is below its mean, which counts.
     assert np.median(nearby[:, 96:]) == pytest.approx(2.2, rel=0.05)
+
+
+@pytest.mark.parametrize("soft", [1.5, 3.0, 8.0])
+def test_the_soft_edge_of_a_round_field_is_not_dead(soft: float) -> None:
+    rng = np.random.default_rng(4)
+    y, x = np.mgrid[:160, :176]
+    lit = 1 / (1 + np.exp((np.hypot(y - 80, x - 88) - 70) / soft))
+    true = rng.random(lit.shape) < 2e-3
+    true[40:44, 90:94] = True
+    flat = lit * (1 + 0.01 * rng.standard_normal(lit.shape)) * np.where(true, 0.2, 1.0)
+    found = dead(flat, np.full(lit.shape, 1e-3), 0.5, 1.5, 0.05)
+    seen = lit > 0.25
+    assert np.count_nonzero(found & ~true & seen) <= 1e-4 * lit.size
+    # Beside the edge a dead pixel may be as bright as those on one side of it.
+    assert found[true & (lit > 0.8)].all()
+    assert found[lit < 0.04].all()

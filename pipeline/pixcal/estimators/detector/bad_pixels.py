@@ -15,6 +15,10 @@ from pixcal.model.arrays import F64, Mask
 
 NEIGHBOURS = 16  # pixels along each side of the blocks whose median a response is compared with
 
+# rows and columns to pixels on squares about one, of its colour in a mosaic; opposite ones are
+# as far from either end of the list
+_AROUND = np.array(np.meshgrid(*[np.arange(-6, 7, 2)] * 2, indexing="ij")).reshape(2, -1).T
+_RINGS = tuple(_AROUND[abs(_AROUND).max(axis=1) == reach] for reach in (2, 4, 6))
 _FALSE_ALARM = 1e-6
 _SIGNIFICANT = 5.0
 _MANY_SIGNIFICANT = 6.0
@@ -63,7 +67,33 @@ def dead(flat: F64, error: F64, low: float, high: float, floor: float) -> Mask:
     median, upper = _around(flat)[0], _around(np.where(flat < floor, np.nan, flat))[1]
     below = (flat < low * median) & (median - flat > _SIGNIFICANT * error)
     above = (flat > high * upper) & (flat - upper > _SIGNIFICANT * error) & (flat > floor)
-    return below | above | (flat < floor)
+    unlit = flat < floor
+    below[below & ~unlit] = _below_rings(flat, below & ~unlit, low)
+    above[above] = _below_rings(-flat, above, high)
+    return below | above | unlit
+
+
+def _below_rings(flat: F64, where: Mask, factor: float) -> Mask:
+    """Whether some pixels (n,) are below ``factor`` times the median of a ring about them.
+
+    Across the edge of what is lit, light falls steeply, but the pixels of a ring that lie along the
+    edge have as much of it. Of a cluster of dead pixels the widest ring reaches the others.
+    """
+    y, x = np.nonzero(where)
+    found = np.zeros(len(y), np.bool_)
+    for offsets in _RINGS:
+        rows, columns = y[:, None] + offsets[:, 0], x[:, None] + offsets[:, 1]
+        inside = (rows >= 0) & (rows < flat.shape[0]) & (columns >= 0) & (columns < flat.shape[1])
+        values = np.where(
+            inside, flat[np.where(inside, rows, 0), np.where(inside, columns, 0)], np.nan
+        )
+        # In pairs about the pixel, or a ring that is cut off would lie on one side of the edge.
+        pairs = np.isfinite(values) & np.isfinite(values[:, ::-1])
+        values[~pairs] = np.nan
+        # Without any, what the block says holds.
+        values[~pairs.any(axis=1)] = np.inf
+        found |= flat[where] < factor * np.nanmedian(values, axis=1)
+    return found
 
 
 def _around(values: F64) -> tuple[F64, F64]:
