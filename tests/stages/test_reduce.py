@@ -616,6 +616,18 @@ def test_real_numbers_with_holes_are_reduced(tmp_path: Path) -> None:
     assert found["quantisation"]["a"]["range_from"] == "frames"
 
 
+def test_whole_numbers_in_files_of_real_ones_are_codes(tmp_path: Path) -> None:
+    camera = Camera(12, SMALL)
+    camera.read[:] = 0.6 * GAIN
+    bias = camera.take(40, 0)
+    found = [
+        small(tmp_path / kind, {"bias": (bias.astype(kind), [0.0] * 40)}, saturation_adu=None)
+        for kind in ("uint16", "float32")
+    ]
+    assert found[0]["read_noise_e"] == found[1]["read_noise_e"]
+    assert found[0]["read_noise_e"]["before_rounding"] == pytest.approx(0.6 * GAIN, rel=0.03)
+
+
 def test_a_range_that_needs_coarse_steps_is_measured_then_said(tmp_path: Path) -> None:
     camera = Camera(10, SMALL)
     camera.read[:] = 1.0

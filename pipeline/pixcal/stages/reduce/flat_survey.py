@@ -42,7 +42,7 @@ class FlatSurvey:
         dark = next((arrays[name] for name in ("bias", "dark") if name in arrays), None)
         pedestal = 0.0 if dark is None else float(np.nanmean(middle_rows(dark, 0, 1)))
         flats = arrays["flat"]
-        whole = flats.dtype.kind in "iu"
+        whole = of_whole_numbers(flats)
         levels, tops = [], []
         for number in range(flats.shape[0]):
             if number % TOGETHER == 0:
@@ -88,6 +88,14 @@ def noise_above(frames: Reader) -> float:
     """Noise of the first frame (ADU) by its upper half alone: the lower may be cut off."""
     lower, upper = np.quantile(middle_rows(frames, 0, 1), ndtr([1.0, 2.0]))
     return float(upper - lower)
+
+
+def of_whole_numbers(frames: Reader) -> bool:
+    """Whether samples are whole numbers; files of real numbers may hold such."""
+    if frames.dtype.kind in "iu":
+        return True
+    ends = (middle_rows(frames, n, n + 1) for n in {0, frames.shape[0] - 1})
+    return all(np.array_equal(np.rint(samples), samples) for samples in ends)
 
 
 def code_step(arrays: Sequence[Reader]) -> int:

@@ -12,7 +12,12 @@ import numpy as np
 from pixcal.model.acquisition import Detector
 from pixcal.model.errors import InputError
 from pixcal.stages.reduce.exposures import Exposures, group_exposures
-from pixcal.stages.reduce.flat_survey import FlatSurvey, code_step, of_several_levels
+from pixcal.stages.reduce.flat_survey import (
+    FlatSurvey,
+    code_step,
+    of_several_levels,
+    of_whole_numbers,
+)
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.frame_reader import ChosenFrames, FrameReader, Reader
@@ -161,7 +166,7 @@ class Ingested:
         """Step of the calibration frames (ADU), 0 where any are real numbers."""
         # Cameras of 12 bits that write 16 count in steps of 16.
         names = {group.array for group in (*self.exposures.dark, *self.exposures.flat)}
-        if not all(map(self._is_integer, names)):
+        if not all(of_whole_numbers(self.arrays[name]) for name in names):
             return 0.0
         return float(code_step([self.arrays[name] for name in sorted(names)]))
 
