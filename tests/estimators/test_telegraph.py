@@ -7,6 +7,7 @@ import pytest
 from scipy.special import logsumexp
 
 from pixcal.estimators.detector.telegraph.classes import Mixture
+from pixcal.estimators.detector.telegraph.dwell import LitSeries, find_stays
 from pixcal.estimators.detector.telegraph.find import find_telegraph
 from pixcal.estimators.detector.telegraph.moments import QUIET, Series, moments_of, thinned
 
@@ -128,3 +129,41 @@ def test_quiet_pixels_stand_for_those_left_out() -> None:
     assert some.stands_for.sum() == pytest.approx(n)
     error = np.sqrt(2 / 15 * n * n / QUIET)
     assert abs(some.stands_for @ some.variance - whole.variance.sum()) < 4 * error
+
+
+@pytest.mark.parametrize(("time_s", "decades"), [(0.3, 0.0), (1.5, 0.0), (0.9, 1.5)])
+def test_frames_of_fringes_tell_how_long_pixels_stay(time_s: float, decades: float) -> None:
+    """Also where the few frames by which they were chosen let those that stay long go unseen."""
+    rng = np.random.default_rng(5)
+    dark, bright = jumping(rng, 1.0, 8.0, time_s, decades, (21, 311), 420, tail=0.3)
+    for quiet in (dark, bright):
+        quiet.noise[:, 400:] = rng.standard_normal((len(quiet.noise), 20))
+    noisier = 9.0  # the light's own noise, over that of the dark frames
+    charge = bright.noise + rng.normal(0, noisier, bright.noise.shape)
+    weight = np.full(charge.shape, 1 / (1 + noisier**2))
+    seen = moments_of(with_quiet(dark, rng))
+    assert seen is not None
+    chosen = seen.pixel[seen.excess > 0]
+    chosen = chosen[chosen < 400]
+    lit = LitSeries(charge[:, chosen], weight[:, chosen], bright.frame, PERIOD_S)
+    found = find_stays([lit], seen)
+    assert found is not None
+    stays, error = found
+    assert abs(stays.mean_s - time_s) < 4 * error < 1.6 * time_s
+    assert abs(stays.decades - decades) <= 0.5
+
+
+def test_noise_without_jumps_tells_no_stays() -> None:
+    rng = np.random.default_rng(6)
+    (dark,) = jumping(rng, 0.2, 6.0, 0.5, 0.0, (40,), 1000)
+    seen = moments_of(dark)
+    assert seen is not None
+    charge = rng.standard_normal((307, 60))
+    assert find_stays([LitSeries(charge, np.ones((307, 60)), np.arange(307), 0.14)], seen) is None
+    assert find_stays([], seen) is None
+
+
+def with_quiet(series: Series, rng: np.random.Generator) -> Series:
+    """The series with 4,000 more pixels of usual noise."""
+    noise = np.hstack([series.noise, rng.standard_normal((len(series.noise), 4000))])
+    return Series(noise, series.frame, np.arange(noise.shape[1]), 1.0, PERIOD_S)

@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
 from pixcal.estimators.detector.telegraph.classes import Stays
+from pixcal.estimators.detector.telegraph.dwell import LitSeries
 from pixcal.estimators.detector.telegraph.find import Telegraph, find_telegraph
 from pixcal.estimators.detector.telegraph.moments import Series
 from pixcal.estimators.diagnosis.distortions import Freedom
@@ -20,6 +21,7 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 HARMONICS = 5  # of the phase that are taken out of fringe residuals before they count as noise
+LIT_HARMONICS = 1  # of pixels that are known to jump
 _MIN_FRAMES = 10
 _ENOUGH = 20
 _MIN_NOISE_ADU = 0.8
@@ -106,7 +108,7 @@ class TelegraphNoise(Effect):
         series = tuple(_series(evidence))
         if not series:
             return None
-        found = find_telegraph(series)
+        found = find_telegraph(series, partial(_lit, evidence))
         if found is None:
             return None
         return _estimate(cls, found)
@@ -199,6 +201,22 @@ def _of_stack(stack: Stack, evidence: Evidence) -> Series | None:
         rest / spread, stack.frame, np.flatnonzero(pixels), spread,
         max(_period(stack.time_s), seconds),
     )  # fmt: skip
+
+
+def _lit(evidence: Evidence, pixels: Indices) -> list[LitSeries]:
+    """Charge of some pixels in every fringe set that the fringes do not explain."""
+    found = []
+    for fringes in evidence.fringes.values():
+        own = np.zeros(fringes.good.size, bool)
+        own[pixels] = True
+        own &= np.isfinite(fringes.theta).all(axis=0).ravel()
+        chosen = replace(fringes, good=own.reshape(fringes.good.shape))
+        freedom = Freedom(chosen, LIT_HARMONICS)
+        left = freedom.left_over(freedom.of_good(chosen.residual))
+        charge = np.where(freedom.weight > 0, left, 0.0).astype(float)
+        period = _period(fringes.time_s) if len(fringes.time_s) > 1 else 0.0
+        found.append(LitSeries(charge, freedom.weight.astype(float), fringes.frame, period))
+    return found
 
 
 def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Series:

@@ -84,6 +84,16 @@ class Stays:
 
 
 @lru_cache(maxsize=64)
+def states(keeps: tuple[float, ...], count: int) -> F64:
+    """States (frame, pixel), -1 or 1, less their mean; pixels keep them by turns so well."""
+    rng = np.random.default_rng(0)
+    keep = np.resize(keeps, _DRAWN)
+    turns = np.where(rng.random((count, _DRAWN)) < (1 - keep) / 2, -1.0, 1.0)
+    found = np.cumprod(turns, axis=0)
+    return np.asarray(found - found.mean(axis=0))
+
+
+@lru_cache(maxsize=64)
 def _levels(keeps: tuple[float, ...], count: int) -> tuple[F64, F64]:
     """What a pixel of an amplitude shows in a number of frames, by its stays.
 
@@ -97,16 +107,12 @@ def _levels(keeps: tuple[float, ...], count: int) -> tuple[F64, F64]:
     products : (lag, level, class) float64
         That chance, times the products of frames apart it then has over its full variance.
     """
-    rng = np.random.default_rng(0)
-    keep = np.resize(keeps, _DRAWN)
-    turns = np.where(rng.random((count, _DRAWN)) < (1 - keep) / 2, -1.0, 1.0)
-    states = np.cumprod(turns, axis=0)
-    states -= states.mean(axis=0)
-    seen = (states**2).sum(axis=0) / (count - 1)
+    shown = states(keeps, count)
+    seen = (shown**2).sum(axis=0) / (count - 1)
     near = np.zeros((len(LAGS), _DRAWN))
     for own, lag in zip(near, LAGS, strict=True):
         if count > lag:
-            own[:] = (states[lag:] * states[:-lag]).sum(axis=0) / (count - lag)
+            own[:] = (shown[lag:] * shown[:-lag]).sum(axis=0) / (count - lag)
     step = np.log(AMPLITUDES[1] / AMPLITUDES[0])
     moves = np.rint(np.log(np.maximum(seen, 1e-12)) / 2 / step).astype(int)
     classes = np.arange(len(AMPLITUDES))
@@ -191,6 +197,16 @@ class Mixture:
         # Amplitudes below those looked at do nothing.
         quiet = np.log(max(1 - weight.sum(), 1e-12))
         return np.asarray(np.logaddexp(quiet, self.log_telegraph(weight)))
+
+    def slope(self, weight: F64, stands_for: F64) -> F64:
+        """Slope (class,) of the sum of `log_likelihood` with the weights.
+
+        Each pixel counts as often as it ``stands_for``.
+        """
+        likely = self.log_likelihood(weight)
+        own = stands_for * np.exp(self.largest - likely)
+        quiet = float(np.sum(stands_for * np.exp(-likely)))
+        return np.asarray(own @ self.ratio - quiet)
 
     def chance(self, weight: F64) -> F64:
         """Of each pixel, that it is not quiet."""

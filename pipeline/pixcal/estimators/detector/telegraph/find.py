@@ -1,9 +1,10 @@
 """Telegraph noise: the signs of it, the population of pixels and the time, found together."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from pixcal.estimators.detector.telegraph.classes import Stays
+from pixcal.estimators.detector.telegraph.dwell import LitSeries, find_stays
 from pixcal.estimators.detector.telegraph.moments import Moments, Series, moments_of, signs, thinned
 from pixcal.estimators.detector.telegraph.population import (
     Population,
@@ -11,7 +12,8 @@ from pixcal.estimators.detector.telegraph.population import (
     find_switching,
     off_later,
 )
-from pixcal.kernels.significance import sigmas_of_best
+from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best
+from pixcal.model.arrays import Indices
 
 ROUNDS = 3  # most, in which population and time are found, each with the other known
 # decades over which stays differ where they do, and the chi-square by which frames further apart
@@ -41,25 +43,31 @@ class Telegraph:
     noisy: int  # pixels that stand out
 
 
-def find_telegraph(series: Sequence[Series]) -> Telegraph | None:
-    """Telegraph noise from one or several series of the same pixels; None without samples."""
+def find_telegraph(
+    series: Sequence[Series], lit: Callable[[Indices], Sequence[LitSeries]] = lambda _: ()
+) -> Telegraph | None:
+    """Telegraph noise from one or several series of the same pixels; None without samples.
+
+    ``lit``: gives the frames of fringes of some pixels, which tell how long they stay.
+    """
     parts = [m for s in series if (m := moments_of(s)) is not None]
     if not parts:
         return None
     flat_top, staying, noisy = signs(parts)
+    significance = sigmas_of_best(flat_top, staying)
+    longest = max(parts, key=lambda m: m.frames)
+    chosen = longest.pixel[longest.excess > 0]
+    known = find_stays(lit(chosen), longest) if significance > SIGNIFICANT and noisy else None
     parts = thinned(parts)
-    even = _of_stays(parts, 0.0)
-    found = even
-    if even.stays.mean_s > 0:
-        # Times of traps differ widely, where frames further apart say so.
-        spread = _of_stays(parts, SPREAD)
-        if even.later**2 - spread.later**2 > DIFFER:
-            found = spread
+    if known is not None:
+        found = _Found(find_population(parts, known[0]), *known, 0.0)
+    else:
+        found = _likeliest(parts)
     p = found.population
     return Telegraph(
         p.share, p.amplitude, p.shape, found.stays.mean_s, found.stays.decades,
         p.share_error, p.amplitude_error, p.shape_error, found.error,
-        sigmas_of_best(flat_top, staying), flat_top, staying, noisy,
+        significance, flat_top, staying, noisy,
     )  # fmt: skip
 
 
@@ -71,6 +79,17 @@ class _Found:
     stays: Stays
     error: float  # of the mean stay, s
     later: float  # what frames further apart have in common beyond that, in errors
+
+
+def _likeliest(parts: Sequence[Moments]) -> _Found:
+    """Population and stays, of equal stays or of such that differ, by the same frames."""
+    even = _of_stays(parts, 0.0)
+    if even.stays.mean_s > 0:
+        # Times of traps differ widely, where frames further apart say so.
+        spread = _of_stays(parts, SPREAD)
+        if even.later**2 - spread.later**2 > DIFFER:
+            return spread
+    return even
 
 
 def _of_stays(parts: Sequence[Moments], decades: float) -> _Found:

@@ -27,6 +27,13 @@ from pixcal.model.arrays import F64, Indices
 
 # logarithm of the shape: what is usual, and the most that is tried
 _USUAL, _MAX_LOG_SHAPE = 1.5, 4.0
+_MOVE = 1e-4  # by which parameters are moved for the slope of the classes' shares
+# of the logits of shares, of logarithms of amplitudes over the noise, and of shapes
+_RANGES = (
+    (-16.0, 16.0),
+    (np.log(AMPLITUDES[0]), np.log(AMPLITUDES[-1])),
+    (-_MAX_LOG_SHAPE, _MAX_LOG_SHAPE),
+)
 _CLEAR = 8.0  # by which another shape than the exponential's must be likelier
 # chance of telegraph noise from which a pixel's frames are looked at for how long it stays,
 LIKELY = 0.1
@@ -71,9 +78,16 @@ def find_population(parts: Sequence[Moments], stays: Stays) -> Population:
         far = float(np.sum(p[2:] ** 2)) / (2 * _USUAL**2)
         return far - float(stands_for @ mixture.log_likelihood(weights(p)))
 
+    def slope(p: F64) -> F64:
+        moves = _MOVE * np.eye(len(p))
+        by = np.array([(weights(p + m) - weights(p - m)) / (2 * _MOVE) for m in moves])
+        of_weight = mixture.slope(weights(p), stands_for)
+        return np.concatenate([np.zeros(2), p[2:] / _USUAL**2]) - by @ of_weight
+
     def lowest(start: F64) -> F64:
-        options = {"xatol": 1e-3, "fatol": 1e-3}
-        return np.asarray(minimize(cost, start, method="Nelder-Mead", options=options).x)
+        return np.asarray(
+            minimize(cost, start, jac=slope, method="L-BFGS-B", bounds=_RANGES[: len(start)]).x
+        )
 
     best = lowest(np.array([-4.0, 1.0]))
     other = lowest(np.append(best, 0.5))

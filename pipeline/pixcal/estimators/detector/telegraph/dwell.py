@@ -1,0 +1,132 @@
+"""How long pixels stay in a level, from frames of which there are many.
+
+A few dozen bias or dark frames show which pixels jump, and how far; hundreds of fringe frames show
+for how long they stay. Charge that is left over in the same pixel is alike in frames that are near
+each other: its mean products fall with the frames between them as the stays are long (a sum of
+exponentials, Machlup 1954, J. Appl. Phys. 25, 341).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from pixcal.estimators.detector.telegraph.classes import PLACES, Stays, states
+from pixcal.estimators.detector.telegraph.moments import NOISY, Moments
+from pixcal.kernels.frame_order import follows
+from pixcal.model.arrays import F64, Indices
+
+LAGS = np.array([1, 2, 4, 8, 16, 32])  # frames apart
+DECADES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)  # ranges of the pixels' times that are tried
+TRUSTED = 0.1  # share by which the variance in fringes may differ from that in darker frames
+DIFFER = 4.0  # by which the chi-square of unequal times must be lower
+CLEAR = 5.0  # errors of the variance from which it tells a time
+FEWEST_PIXELS = 20
+_FEWEST_PAIRS = 16
+_LEAST, _MOST = 0.2, 5.0  # periods, and lengths of the series, between which times are looked for
+
+
+@dataclass(frozen=True)
+class LitSeries:
+    """Charge of some pixels that the fringes do not explain, in frames that follow one another."""
+
+    charge: F64  # (t, n) e-; 0 where there is none
+    weight: F64  # (t, n) inverse of its variance without jumps, e-⁻²; 0 where there is none
+    frame: Indices  # (t,) numbers of the frames
+    period_s: float
+
+
+def find_stays(lit: Sequence[LitSeries], seen: Moments) -> tuple[Stays, float] | None:
+    """Stays of the pixels, and the error (s) of their mean; None where the frames do not tell.
+
+    ``seen``: of the frames by which the pixels were chosen. One that stayed in a level there was
+    not: the others stay less long.
+    """
+    lit = [s for s in lit if s.charge.shape[1] >= FEWEST_PIXELS and s.period_s > 0]
+    products = [_products(s) for s in lit]
+    if not products:
+        return None
+    period, count = lit[0].period_s, max(len(s.frame) for s in lit)
+    used = np.all([np.isfinite(p).all(axis=1) for p, _ in products], axis=0)
+    sums = np.concatenate([p[used] for p, _ in products], axis=1)
+    weights = np.concatenate([w[used] for _, w in products], axis=1)
+    total = weights.sum(axis=1)
+    mean = sums.sum(axis=1) / total
+    scatter = (sums - mean[:, None] * weights) / total[:, None]
+    covariance = scatter @ scatter.T
+    if used.sum() < 3 or np.linalg.matrix_rank(covariance) < used.sum():
+        return None
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+
+    def expected(log_time: float, decades: float) -> F64:
+        stays = Stays(float(np.exp(log_time)), decades)
+        kept = np.broadcast_to(stays.kept(period, PLACES), PLACES.shape)
+        chosen, shown = _chosen(stays, seen)
+        variance = _excess(seen) * seen.sigma**2 * chosen.sum() / max(float(chosen @ shown), 1e-9)
+        powers = kept ** LAGS[used, None] - _of_mean(kept, count)
+        return np.asarray(variance * (powers @ chosen) / max(chosen.sum(), 1e-9))
+
+    def fitted(decades: float) -> tuple[float, F64, F64]:
+        def rest(p: F64) -> F64:
+            off = whiten @ (p[0] * expected(p[1], decades) - mean)
+            return np.append(off, (p[0] - 1) / TRUSTED)
+
+        low, high = np.log(_LEAST * period), np.log(_MOST * period * count)
+        start = [1.0, np.clip(np.log(4 * period), low, high)]
+        bounds = [0.0, low], [np.inf, high]
+        found = least_squares(rest, start, bounds=bounds, diff_step=1e-2)
+        information = found.jac.T @ found.jac
+        if np.linalg.cond(information) > 1e12:
+            return np.inf, found.x, np.full(2, np.inf)
+        return 2 * found.cost, found.x, np.sqrt(np.diag(np.linalg.inv(information)))
+
+    if mean[0] < CLEAR * covariance[0, 0] ** 0.5:
+        return None
+    tried = [(decades, *fitted(decades)) for decades in DECADES]
+    best = min(tried[1:], key=lambda one: one[1])
+    if tried[0][1] - best[1] < DIFFER:
+        best = tried[0]
+    decades, chi2, (_, log_time), (_, error) = best
+    if not np.isfinite(chi2):
+        return None
+    time = float(np.exp(log_time))
+    return Stays(time, decades), float(min(error, 1.0)) * time
+
+
+def _products(series: LitSeries) -> tuple[F64, F64]:
+    """Mean products (lag, n) of each pixel times their weights, and these; NaN without frames."""
+    root = np.sqrt(series.weight)
+    noise = series.charge * root
+    shape = len(LAGS), noise.shape[1]
+    sums, weights = np.full(shape, np.nan), np.full(shape, np.nan)
+    for n, lag in enumerate(LAGS):
+        later = np.flatnonzero(follows(series.frame, int(lag)))
+        if len(later) >= _FEWEST_PAIRS:
+            sums[n] = (noise[later] * noise[later - lag]).mean(axis=0)
+            weights[n] = (root[later] * root[later - lag]).mean(axis=0)
+    return sums, weights
+
+
+def _of_mean(kept: F64, count: int) -> F64:
+    """Variance of the mean of so many frames, which is taken off, over that of one."""
+    k = np.minimum(kept, 1 - 1e-9)
+    both = (1 + k) / (1 - k) / count - 2 * k * (1 - k**count) / (count * (1 - k)) ** 2
+    return np.asarray(both)
+
+
+def _excess(seen: Moments) -> float:
+    """Variance of the pixels that were chosen beyond the common one, over that."""
+    return float(np.mean(seen.variance[seen.excess > 0])) - 1
+
+
+def _chosen(stays: Stays, seen: Moments) -> tuple[F64, F64]:
+    """Share (place,) of pixels that showed both levels where they were chosen; how much of them."""
+    limit = NOISY * np.sqrt(2 / seen.dof) / max(_excess(seen), 1e-9)
+    kept = np.broadcast_to(stays.kept(seen.period_s, PLACES), PLACES.shape)
+    shown = states(tuple(kept.tolist()), seen.frames)
+    variance = ((shown**2).sum(axis=0) / (seen.frames - 1)).reshape(-1, len(PLACES))
+    chosen = variance > limit
+    return chosen.mean(axis=0), np.where(chosen, variance, 0).sum(axis=0) / np.maximum(
+        chosen.sum(axis=0), 1
+    )
