@@ -302,7 +302,8 @@ class Scout:
     ) -> tuple[FrameParameters, F64, F64]:
         """One Gauss-Newton step of every frame; its size and normal matrices (t, 5, 5) too."""
         n = len(frames.g)
-        g, dk = frames.g.astype(np.float32), frames.dk.astype(np.float32)
+        # In C order: for another the kernel would be compiled again.
+        g, dk = frames.g.astype(np.float32, order="C"), frames.dk.astype(np.float32)
 
         def sums_of(number: int) -> tuple[F64, F64]:
             tile, theta, (picked, codes) = self.tiles[number], self.theta[number], samples[number]
