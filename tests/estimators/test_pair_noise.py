@@ -8,6 +8,7 @@ from pixcal.estimators.detector.pair_noise import (
     dark_pair_sums,
     flat_pair_sums,
     shared_by_blocks,
+    shared_by_lines,
 )
 from pixcal.model.arrays import F32
 
@@ -108,3 +109,16 @@ def test_nearly_full_pixels_of_one_colour_do_not_lower_the_noise_of_the_others(k
     off = GAIN * (square - dof * READ**2) / level - 1
     error = np.sqrt(2 / dof) * (1 + GAIN * READ**2 * dof / level)
     assert (abs(off) < 4 * error) == known
+
+
+@pytest.mark.parametrize(("row", "column"), [(3.0, 6.0), (6.0, 1.5), (0.0, 6.0), (5.0, 5.0)])
+def test_noise_of_rows_is_found_beside_that_of_columns(row: float, column: float) -> None:
+    rng = np.random.default_rng(9)
+    dark = READ * rng.standard_normal((DARKS, *SHAPE))
+    dark += row * rng.standard_normal((DARKS, SHAPE[0], 1))
+    dark += column * rng.standard_normal((DARKS, 1, SHAPE[1]))
+    found = shared_by_lines(dark_pair_sums(dark.astype(np.float32), READ, 0.0))
+    for line, size, lines in (("row", row, SHAPE[0]), ("column", column, SHAPE[1])):
+        # The scatter of a few lines, and the smaller of two lags.
+        error = np.hypot(found[line][1], size**2 * np.sqrt(4 / (DARKS * lines)))
+        assert found[line][0] == pytest.approx(size**2, abs=4 * error)

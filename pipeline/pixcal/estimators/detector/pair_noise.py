@@ -41,14 +41,17 @@ def shared_by_lines(dark: F64) -> dict[str, Measure]:
     if not total[0]:
         return {}
     error = total[2] / total[0] / math.sqrt(total[0])
-    found = {}
-    for name, lags in LINES.items():
-        at = [3 + LAGS.tolist().index(list(lag)) for lag in lags]
-        # A coupling reaches the next pixel, and a row that repeats the row after it; not both.
-        # The mean of its block was taken off.
-        shared = float(total[at].min() / total[0]) * (BLOCK + 1) / BLOCK
-        found[name] = (shared if shared > _SHARED * error else 0.0, error)
-    return found
+    # A coupling reaches the next pixel, and a row that repeats the row after it; not both.
+    lags = [[3 + LAGS.tolist().index(list(lag)) for lag in own] for own in LINES.values()]
+    seen = np.array([float(total[at].min() / total[0]) for at in lags])
+    # The mean of its block was taken off: of what the rows share a part, and of what the columns
+    # share as much from all that are not the same column.
+    kept, taken = BLOCK / (BLOCK + 1), (BLOCK - 1) / BLOCK**2
+    shared = np.linalg.solve([[kept, -taken], [-taken, kept]], seen)
+    return {
+        name: (float(own) if own > _SHARED * error else 0.0, error)
+        for name, own in zip(LINES, shared, strict=True)
+    }
 
 
 def shared_by_blocks(difference: F32, quantum: float) -> float:
