@@ -35,7 +35,7 @@ def test_an_output_moves_as_a_whole_and_by_itself(
 ) -> None:
     bench = make_effect_bench()
     bias = next(r for r in recordings(bench) if r.kind == "bias")
-    change = frames_of(bench, bias, [OutputJitter(5.0, (20,), (32,))]).astype(float)
+    change = frames_of(bench, bias, [OutputJitter(5.0, 0.0, (20,), (32,))]).astype(float)
     change -= frames_of(bench, bias)
     parts = [
         change[:, y, x] for y in (slice(20), slice(20, None)) for x in (slice(32), slice(32, None))
@@ -60,7 +60,7 @@ def test_edges_and_sizes_are_found(
     rows: tuple[int, ...],
     columns: tuple[int, ...],
 ) -> None:
-    effect = OutputJitter(rms, rows, columns)
+    effect = OutputJitter(rms, 0.0, rows, columns)
     found = OutputJitter.estimate(in_the_dark(acquired(), make_effect_bench(), effect))
     assert found is not None
     assert isinstance(found.effect, OutputJitter)
@@ -70,10 +70,30 @@ def test_edges_and_sizes_are_found(
     assert found.errors["output_rms"] < 0.2 * rms
 
 
+@pytest.mark.parametrize(("jump", "walk"), [(0.5, 1.5), (3.0, 0.0), (1.0, 0.5)])
+def test_jumps_and_walks_are_told_apart(jump: float, walk: float) -> None:
+    pulls = []
+    for seed in range(12):
+        rng = np.random.default_rng([seed, int(10 * jump)])
+        time = 2.0 * np.arange(60)
+        level = jump * rng.standard_normal((60, 4))
+        level += walk * np.cumsum(np.sqrt(2.0) * rng.standard_normal((60, 4)), axis=0)
+        numbers = output_numbers((70,), (40,), np.arange(SHAPE[0]), np.arange(SHAPE[1]))
+        frames = (6 * rng.standard_normal((60, *SHAPE)) + level[:, numbers]).astype(np.float32)
+        found = find_outputs([frames - frames.mean(axis=0)], [time], GOOD)
+        assert found is not None
+        assert (found.row_edges, found.column_edges) == ((70,), (40,))
+        pulls.append((np.array(found.size) - [jump**2, walk**2]) / found.error)
+    mean = np.mean(pulls, axis=0)
+    # Nothing below zero is found: where there is none, the mean lies above.
+    assert np.abs(mean).max() < 4 / np.sqrt(12)
+    assert np.std(pulls) < 1.6
+
+
 def test_edges_are_counted_on_the_chip(
     acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench]
 ) -> None:
-    evidence = in_the_dark(acquired(), make_effect_bench(), OutputJitter(5.0, (), (32,)))
+    evidence = in_the_dark(acquired(), make_effect_bench(), OutputJitter(5.0, 0.0, (), (32,)))
     found = OutputJitter.estimate(replace(evidence, origin=(100, 200)))
     assert found is not None
     assert isinstance(found.effect, OutputJitter)
@@ -104,7 +124,7 @@ def test_an_edge_of_the_noise_is_no_edge_of_the_level(axis: int) -> None:
     noise = np.expand_dims(np.where(np.arange(SHAPE[axis]) < SHAPE[axis] // 2, 1.0, 2.0), 1 - axis)
     for _ in range(5):
         frames = (noise * rng.standard_normal((200, *SHAPE))).astype(np.float32)
-        found = find_outputs([frames - frames.mean(axis=0)], GOOD)
+        found = find_outputs([frames - frames.mean(axis=0)], [np.arange(float(len(frames)))], GOOD)
         assert found is not None
         assert found.sigmas < 4
 
@@ -114,7 +134,7 @@ def test_significance_is_that_of_chance() -> None:
     sigmas = []
     for _ in range(40):
         frames = rng.standard_normal((30, *SHAPE)).astype(np.float32)
-        found = find_outputs([frames - frames.mean(axis=0)], GOOD)
+        found = find_outputs([frames - frames.mean(axis=0)], [np.arange(float(len(frames)))], GOOD)
         assert found is not None
         sigmas.append(found.sigmas)
     # Places near each other are not independent, so chance comes out lower.
@@ -129,4 +149,4 @@ def test_outputs_are_numbered_along_rows() -> None:
 
 
 def test_few_frames_say_nothing() -> None:
-    assert find_outputs([np.zeros((7, *SHAPE), np.float32)], GOOD) is None
+    assert find_outputs([np.zeros((7, *SHAPE), np.float32)], [np.arange(7.0)], GOOD) is None

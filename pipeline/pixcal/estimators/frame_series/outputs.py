@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pixcal.estimators.frame_series.walk_modes import walk_modes
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best, sigmas_of_chi2
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
@@ -18,6 +19,8 @@ NARROWEST = 8  # rows or columns of an output at least; even: two that alternate
 _FAR = 24  # lines on either side by which an edge is placed
 _WILD = 5.0  # standard deviations from which a sample, _CLIP from which a step of a frame is cut
 _CLIP = 3.0
+_STEPS = 30  # of the likelihood's maximisation
+_LEAST = 1e-9  # noise of a level, e-²: frames may be alike
 
 
 @dataclass(frozen=True)
@@ -26,17 +29,19 @@ class Outputs:
 
     row_edges: tuple[int, ...]  # row_edges, column_edges: first line of each output but the first
     column_edges: tuple[int, ...]
-    variance: float  # of the level of an output from frame to frame, e-²
-    error: float
+    # size, error: white noise of an output's level (e-²), and its random walk (e-²/s)
+    size: tuple[float, float]
+    error: tuple[float, float]
     sigmas: float  # significance of the clearest edge
 
 
-def find_outputs(stacks: Sequence[F32], good: Mask) -> Outputs | None:
-    """Outputs of stacks (t, y, x), e-, less the mean of each pixel; None with too few frames.
+def find_outputs(stacks: Sequence[F32], times: Sequence[F64], good: Mask) -> Outputs | None:
+    """Outputs of stacks (t, y, x), e-, less the mean of each pixel, at times (t,), s.
 
-    Where no edge is significant, the clearest one is given.
+    None with too few frames. Where no edge is significant, the clearest one is given.
     """
-    rests = [_calm(rest, good) for rest in stacks if len(rest) >= MIN_FRAMES]
+    chosen = [n for n, rest in enumerate(stacks) if len(rest) >= MIN_FRAMES]
+    rests = [_calm(stacks[n], good) for n in chosen]
     if not rests:
         return None
     found = [_edges(rests, good, axis) for axis in (0, 1)]
@@ -48,8 +53,8 @@ def find_outputs(stacks: Sequence[F32], good: Mask) -> Outputs | None:
         kept[found.index(clearest)] = [clearest[0][0][0]]
     rows, columns = (tuple(sorted(own)) for own in kept)
     numbers = output_numbers(rows, columns, np.arange(good.shape[0]), np.arange(good.shape[1]))
-    variance, error = _variance(rests, good, numbers)
-    return Outputs(rows, columns, variance, error, clearest[1])
+    size, error = _sizes(rests, [times[n] for n in chosen], good, numbers)
+    return Outputs(rows, columns, size, error, clearest[1])
 
 
 def output_numbers(
@@ -91,10 +96,13 @@ def _edges(rests: Sequence[F32], good: Mask, axis: int) -> tuple[list[tuple[int,
         at = int(free.argmax())
         chance = sigmas_of_chi2(float(free[at]), dof)
         sigmas = sigmas_of_best(*[chance] * (2 * len(places)))
-        found.append((_placed(lines, int(places[at])), sigmas))
+        edge = _placed(lines, int(places[at]))
+        found.append((edge, sigmas))
         if sigmas < SIGNIFICANT:
             break
-        free[max(at - NARROWEST, 0) : at + NARROWEST + 1] = 0
+        # Steps that are cut are alike at several places, of which the first need not be the edge.
+        for middle in (at, edge - NARROWEST):
+            free[max(middle - NARROWEST, 0) : middle + NARROWEST + 1] = 0
     return found, found[0][1] if found else -np.inf
 
 
@@ -129,21 +137,38 @@ def _placed(lines: Sequence[F64], about: int) -> int:
     return places[int(np.argmax(gains))]
 
 
-def _variance(rests: Sequence[F32], good: Mask, numbers: Indices) -> tuple[float, float]:
-    """Variance of the levels of outputs beyond the noise of their pixels, rows and columns."""
+def _sizes(
+    rests: Sequence[F32], times: Sequence[F64], good: Mask, numbers: Indices
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """White noise and walk of the levels of outputs beyond the noise of pixels, rows and columns.
+
+    By the likelihood of the modes in which both are independent; with their errors.
+    """
     masks = [good & (numbers == n) for n in range(int(numbers.max()) + 1)]
     masks = [mask for mask in masks if np.count_nonzero(mask) >= NARROWEST**2]
     if len(masks) < 2:
-        return 0.0, 1.0
-    total = freedom = noise = 0.0
-    for rest in rests:
+        return (0.0, 0.0), (1.0, 1.0)
+    parts = []
+    for rest, time in zip(rests, times, strict=True):
         levels = np.stack([rest[:, mask].mean(axis=1, dtype=float) for mask in masks], axis=1)
         levels -= levels.mean(axis=1, keepdims=True)
-        dof = (len(rest) - 1) * (len(masks) - 1)
-        total, freedom = total + float((levels**2).sum()), freedom + dof
-        noise += dof * float(np.mean([_noise(rest, mask) for mask in masks]))
-    found, noise = total / freedom, noise / freedom
-    return found - noise, float(np.sqrt(2 / freedom)) * max(found, noise)
+        basis = walk_modes(time)
+        square = (basis.of(levels) ** 2).sum(axis=1) / (len(masks) - 1)
+        noise = np.full(len(square), np.mean([_noise(rest, mask) for mask in masks]) + _LEAST)
+        parts.append((square, noise, np.ones(len(square)), basis.walk))
+    square, noise, *shapes = (np.concatenate(own) for own in zip(*parts, strict=True))
+    shape, size = np.stack(shapes), np.zeros(2)
+    for _ in range(_STEPS):
+        weight = (len(masks) - 1) / (2 * (np.maximum(size, 0) @ shape + noise) ** 2)
+        normal = (weight * shape) @ shape.T
+        size = np.linalg.solve(normal, (weight * shape) @ (square - noise))
+        if size.min() < 0:
+            # The other one alone.
+            other = int(size.argmax())
+            size = np.zeros(2)
+            size[other] = (weight * shape[other]) @ (square - noise) / normal[other, other]
+    error = np.sqrt(np.diag(np.linalg.inv(normal)))
+    return (float(size[0]), float(size[1])), (float(error[0]), float(error[1]))
 
 
 def _noise(rest: F32, mask: Mask) -> float:
