@@ -215,3 +215,15 @@ def test_a_piece_is_undone_as_the_whole(first: int) -> None:
 def test_frames_that_are_not_known_undo_nothing() -> None:
     maps = FringeMaps(np.ones((3, 4, 5)), (0.7, 0.0))
     assert RollingShutter(0.0, settling=RINGING).undo(maps) is None
+
+
+def test_an_unknown_exposure_time_is_an_instant() -> None:
+    """Rows that start after the step hold the next frame whole; without a line time none does."""
+    rows = np.arange(5.0)
+    for shutter, after in (
+        (RollingShutter(0.0), [0.0] * 5),
+        (RollingShutter(2.0, 3.0), [0, 0, 1, 1, 1]),
+    ):
+        following, last = shutter.shares(rows, 0.0, 0.14)
+        np.testing.assert_array_equal(following, after)
+        np.testing.assert_array_equal(last, 0.0)

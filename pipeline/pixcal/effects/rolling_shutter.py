@@ -97,8 +97,10 @@ class RollingShutter(Effect):
         """Shares of the next and of the last phase in the exposure of rows of the window."""
         start = self.line_time_us * 1e-6 * rows
         step = exptime_s + self.delay_us * 1e-6
-        after = np.clip((start + exptime_s - step) / exptime_s, 0, 1)
-        before = np.clip((step - period_s - start) / exptime_s, 0, 1)
+        # An exposure that is not known counts as none.
+        lit = max(exptime_s, 1e-12)
+        after = np.clip((start + exptime_s - step) / lit, 0, 1)
+        before = np.clip((step - period_s - start) / lit, 0, 1)
         return after, before
 
     def photons(self, mean: F32, shot: Shot) -> F32:
