@@ -1,20 +1,18 @@
 """A reduced run is looked at, its nominal bench simulated, and causes of the gap are searched."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from scipy.special import stdtr
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.expectation import Reference, expect_nominal, expect_with
-from pixcal.estimators.diagnosis.gap import Difference, compare, flagged
+from pixcal.estimators.diagnosis.gap import compare, flagged
 from pixcal.estimators.diagnosis.test_statistics import Key
-from pixcal.estimators.diagnosis.test_statistics.signature import signature_key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 from pixcal.model.config import to_plain
@@ -86,12 +84,11 @@ def inquire(
         if candidate.estimate is None and not candidate.reason:
             candidate.reason = _needs(kinds[name], look.facts)
     estimates = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
-    # A slow statistic is simulated only where no quick one tells as much.
+    # A slow statistic is simulated only where no quick one differs.
     quick = tuple(s for s in signatures if kinds[s.name].quick)
     trials = Trials(look.windows, scratch, look.runtime, quick, estimates, SCREEN)
     reference, data = _nominal(trials, look, base, run_dir)
-    slow = {_key_of(s) for s in signatures if s not in quick}
-    if not slow <= outdone_by_others(compare(data, expect_nominal(reference)), look.measured, slow):
+    if len(quick) < len(signatures) and not flagged(compare(data, expect_nominal(reference))):
         trials = Trials(look.windows, scratch, look.runtime, signatures, estimates, SCREEN)
         reference, data = _nominal(trials, look, base, run_dir)
 
@@ -230,27 +227,6 @@ def weakly_seen(
         if estimate.significance >= SIGNIFICANT
         and (kinds[name].quick or (slow and estimate.significance == most < CLEAR))
     )
-
-
-def outdone_by_others(
-    differences: Mapping[Key, Difference], measured: Curves, slow: Collection[Key]
-) -> set[Key]:
-    """Slow statistics that need not be simulated: a quick one differs, and by more.
-
-    Without an effect they would scatter by one standard deviation about 0; ``differences`` are of
-    the quick ones.
-    """
-    others = flagged(differences)
-    if not others:
-        return set()
-    least = min(differences[key].log_chance for key in others)
-    sizes = {key: float(np.abs(measured[key].value).max()) for key in slow if key in measured}
-    chances = {key: np.log(2 * stdtr(REFERENCES - 1, -size)) for key, size in sizes.items()}
-    return {key for key in slow if key not in chances or chances[key] > least}
-
-
-def _key_of(kind: Signature) -> Key:
-    return signature_key(kind.name, kind.domains[0])
 
 
 def _each_of(
