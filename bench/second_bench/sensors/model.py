@@ -49,7 +49,7 @@ class Sensor:
     stored : dtype
         Of the samples in the files.
     shared_e : float
-        Noise that all pixels of an output share, rms; it is part of the read noise.
+        Noise that pixels of an output share, and not all of the frame, rms; part of the read noise.
     """
 
     rng: np.random.Generator

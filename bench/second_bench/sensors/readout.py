@@ -116,11 +116,16 @@ def _outputs(sensor: Sensor, at: tuple[float, float]) -> NDArray[np.int_]:
     return 2 * (np.arange(ny)[:, None] >= round(at[0] * ny)) + right
 
 
+# Levels of four outputs about their mean, which is that of the frame.
+_APART = np.sqrt(3 / 4)
+
+
 @kind("output_jitter")
 def drifting_outputs(sensor: Sensor) -> Drawn:
     """Four outputs whose levels jump from frame to frame, each by itself."""
     rng, outputs = sensor.rng, _outputs(sensor, (0.5, 0.5))
-    size = sensor.shared_e = float(rng.uniform(0.1, 0.5) * sensor.read_noise_e.mean())
+    size = float(rng.uniform(0.1, 0.5) * sensor.read_noise_e.mean())
+    sensor.shared_e = size * _APART
     sensor.amplified.append(lambda e, _: e + size * rng.standard_normal(4)[outputs])
     return {"output_e": size}
 
@@ -131,7 +136,7 @@ def wandering_outputs(sensor: Sensor) -> Drawn:
     rng, at = sensor.rng, sensor.rng.uniform(0.3, 0.7, 2)
     outputs = _outputs(sensor, (float(at[0]), float(at[1])))
     step, size = rng.uniform(0.03, 0.15, 2) * sensor.read_noise_e.mean()
-    sensor.shared_e = float(np.hypot(size, step / np.sqrt(2)))
+    sensor.shared_e = float(np.hypot(size, step / np.sqrt(2))) * _APART
     levels = np.zeros(4)
 
     def walks(e: F64, _: int) -> F64:
