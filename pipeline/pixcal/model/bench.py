@@ -301,6 +301,10 @@ class SimulatedFrames:
         return datetime.fromisoformat(self.start).replace(tzinfo=None)
 
 
+# Here, not where they are used: a diagnosis asks for them thousands of times.
+_OPTICS_OF_SETS = {f.name for f in fields(SimulatedOptics)} & {f.name for f in fields(SimulatedSet)}
+
+
 @dataclass(frozen=True)
 class Bench:
     """Contents of a bench file."""
@@ -322,9 +326,8 @@ class Bench:
     def optics_of(self, number: int) -> SimulatedOptics:
         """Optics of a fringe set, by its number: what the set says goes before ``optics``."""
         scan = self.frames.fringes[number]
-        shared = {f.name for f in fields(SimulatedOptics)} & {f.name for f in fields(scan)}
-        given = {name: getattr(scan, name) for name in shared}
-        return replace(self.optics, **{n: v for n, v in given.items() if v is not None})
+        given = {n: v for n in _OPTICS_OF_SETS if (v := getattr(scan, n)) is not None}
+        return replace(self.optics, **given) if given else self.optics
 
 
 def load_bench(path: Path) -> Bench:
