@@ -124,6 +124,29 @@ def test_sizes_and_errors_are_honest() -> None:
     assert np.mean(np.abs(ramps) < 2) > 0.8
 
 
+@pytest.mark.parametrize("size", [1e3, 1e5])
+def test_a_drift_far_above_the_noise_is_a_walk(size: float) -> None:
+    """Not noise of two channels, whose covariance the first step would take below zero."""
+    rng = np.random.default_rng(9)
+    ramp = size * np.linspace(-1, 1, T)
+    channels = [EVEN.of(rng.standard_normal(T) + sign * ramp) for sign in (1, -1)]
+    one = np.ones(T - 1)[:, None, None]
+    eye, cross = np.diag([1.0, 0.0]), np.array([[0.0, 0.3], [0.3, 0.0]])
+    white, walk = [one * eye, one * eye[::-1, ::-1]], EVEN.walk[:, None, None]
+    modes = Modes(
+        values=np.stack(channels, axis=1),
+        known=np.zeros((T - 1, 2, 0)),
+        parts=np.stack(
+            [walk * eye, walk * eye[::-1, ::-1], *white, white[0], one * cross, white[1]]
+        ),
+        start=np.array([0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0]),
+        least=np.array([-1e-3, -1e-3, -0.01, -0.01, 0.05, -np.inf, 0.05]),
+    )
+    found = estimate_components(modes)
+    # Its steps are all alike: 2 size over T frames.
+    assert found.size[:2] == pytest.approx((2 * size / T) ** 2, rel=0.5)
+
+
 def test_chances_are_those_of_chi_square_and_sigmas_those_of_a_normal() -> None:
     for pairs in (1, 2, 5):
         for growth in (0.1, 3.0, 40.0):

@@ -9,6 +9,7 @@ Biometrics 51, 1440), which converges faster.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,6 +22,9 @@ from pixcal.model.arrays import F64, Mask
 
 MAX_STEPS = 60
 CONVERGED = 1e-5  # growth of the log-likelihood at which scoring ends
+_DOUBLINGS = 60  # of an error in search of the upper limit of a size
+HALVINGS = 12  # of a step that does not make the data likelier
+FAR = 1e3  # growth by the first step of the signals from which they are found before the noise
 NEAR = 2.0  # growth from which the average information makes the steps
 
 
@@ -82,8 +86,12 @@ class Components:
             return _State(self.modes, sizes).likelihood - top + 0.5
 
         width = max(float(np.sqrt(self.covariance[part, part])), 1e-300)
-        while left(width) > 0:
+        for _ in range(_DOUBLINGS):
+            if left(width) <= 0:
+                break
             width *= 2
+        else:
+            return width  # The modes set no upper limit.
         return width * float(brentq(lambda share: left(share * width), 0.0, 1.0, xtol=1e-3))
 
     def root(self, part: int) -> tuple[float, float]:
@@ -117,35 +125,45 @@ def estimate_components(
     free = np.ones(len(modes.parts), bool)
     free[list(absent)] = False
     state = _begin(modes, free, start)
+    # Far from the maximum a step of all sizes gives to the noise what is a signal.
+    signals = free & (modes.start == 0)
+    state, gained = _climbed(state, signals, 1) if steps and signals.any() else (state, 0.0)
+    if gained > FAR:
+        state, _ = _climbed(state, signals, steps)
+    state, _ = _climbed(state, free, steps)
     size = state.size
-    gain = np.inf
-    for _ in range(steps):
-        score = state.score()
-        information = state.information() if gain > NEAR else state.average_information()
-        held = ~free | ((size <= modes.least) & (score <= 0))
-        step = np.zeros(len(size))
-        step[~held] = inverse_normal(information[np.ix_(~held, ~held)]) @ score[~held]
-        moved = state
-        for _ in range(12):
-            try:
-                moved = _State(modes, np.maximum(size + step, np.where(free, modes.least, 0.0)))
-            except np.linalg.LinAlgError:
-                moved = state
-            if moved.likelihood > state.likelihood:
-                break
-            step /= 2
-        gain = moved.likelihood - state.likelihood
-        if gain <= 0:
-            break
-        state, size = moved, moved.size
-        if gain < CONVERGED:
-            break
     covariance = np.zeros((len(size), len(size)))
     inside = np.ix_(free, free)
     covariance[inside] = inverse_normal(state.information()[inside])
     return Components(
         size, covariance, state.beta, state.spread, state.likelihood, state.profile, modes
     )
+
+
+def _climbed(state: "_State", free: Mask, steps: int) -> tuple["_State", float]:
+    """After so many steps of some sizes, or where none helps; and how much likelier the last is."""
+    modes, gain = state.modes, np.inf
+    for _ in range(steps):
+        score = state.score()
+        information = state.information() if gain > NEAR else state.average_information()
+        held = ~free | ((state.size <= modes.least) & (score <= 0))
+        step = np.zeros(len(held))
+        step[~held] = inverse_normal(information[np.ix_(~held, ~held)]) @ score[~held]
+        moved = state
+        for _ in range(HALVINGS):
+            with suppress(np.linalg.LinAlgError):
+                least = np.where(free, modes.least, state.size)
+                moved = _State(modes, np.maximum(state.size + step, least))
+            if moved.likelihood > state.likelihood:
+                break
+            step /= 2
+        gain = moved.likelihood - state.likelihood
+        if gain <= 0:
+            break
+        state = moved
+        if gain < CONVERGED:
+            break
+    return state, gain
 
 
 def _begin(modes: Modes, free: Mask, start: Components | None) -> "_State":
