@@ -30,16 +30,22 @@ class Started:
 
 
 @pytest.mark.parametrize(
-    ("kept", "workers", "before", "starts"),
+    ("kept", "workers", "load", "before", "starts"),
     [
-        (True, 2, False, True),
-        (True, 2, True, False),
-        (True, 1, False, False),
-        (False, 2, False, False),
+        (True, 2, 0.5, False, True),
+        (True, 2, 0.5, True, False),
+        (True, 2, 1.5, False, False),
+        (True, 1, 0.0, False, False),
+        (False, 2, 0.5, False, False),
     ],
 )
 def test_a_process_is_started_where_it_is_of_use_and_ends_with_the_run(
-    kept: bool, workers: int, before: bool, starts: bool, monkeypatch: pytest.MonkeyPatch
+    kept: bool,
+    workers: int,
+    load: float,
+    before: bool,
+    starts: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     log: list[str] = []
 
@@ -49,6 +55,7 @@ def test_a_process_is_started_where_it_is_of_use_and_ends_with_the_run(
     monkeypatch.setattr(ahead, "KEPT", kept)
     monkeypatch.setattr(ahead, "_compiled_before", lambda: before)
     monkeypatch.setattr(ahead.subprocess, "Popen", popen)
+    monkeypatch.setattr(ahead.os, "getloadavg", lambda: (load, 9.0, 9.0))
     with suppress(KeyError), ahead.compiled_ahead(Runtime(workers=workers)):
         log.append("run")
         raise KeyError

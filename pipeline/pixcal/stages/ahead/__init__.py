@@ -1,5 +1,6 @@
 """Kernels of the diagnosis, compiled by another process while a first run reads its frames."""
 
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -17,7 +18,9 @@ def compiled_ahead(runtime: Runtime) -> Iterator[None]:
 
     A process, for Numba compiles in one thread at a time, and mostly holds Python's lock.
     """
-    if not KEPT or runtime.n_workers < 2 or _compiled_before():
+    # It costs a tenth more processor time: on a busy machine that is lost.
+    busy = os.getloadavg()[0] > runtime.n_workers - 1
+    if not KEPT or busy or runtime.n_workers < 2 or _compiled_before():
         yield
         return
     quiet = subprocess.DEVNULL

@@ -7,7 +7,6 @@ from pixcal.kernels import (
     boundaries,
     normals,
     pair_sums,
-    photon_transfer,
     residual_sums,
     robust,
     sample_sums,
@@ -21,13 +20,9 @@ D1, D2, D3 = (Array(float64, n, "C") for n in (1, 2, 3))
 I1, I2 = (Array(int64, n, "C") for n in (1, 2))
 MASK, CODES = Array(boolean, 2, "C"), Array(uint16, 2, "C")
 
-# In the order in which a run calls them. Those of the fit are missing: it comes early, and the run
-# compiles them itself meanwhile; so are small ones, and those of any type of raw samples.
+# In the order in which a diagnosis calls them. Those of the fit and before are missing: the run
+# compiles these meanwhile. So are those of any type of raw samples.
 KERNELS = (
-    (robust._median_and_deviation, (F3, F2, F2)),
-    (robust._add_frames, (F3, F1, F1, F2, F2, D3)),
-    (photon_transfer._ratios, (F2, F2, float64, float64, F2)),
-    (photon_transfer._add_blocks, (F2, F2, float64, float64, float64, F1, F1, I2, D2)),
     (residual_sums._sum, (F3, F3, F2, F2, MASK, F2, F3, F1, I2, float32, D2)),
     (tracks.add_tracks, (F2, D2, float64, int64)),
     (two_way._project, (F2, F2, F2, F3, F2, F3, int64)),
@@ -58,7 +53,8 @@ KERNELS = (
 
 def compile_all() -> None:
     """Compile what is not kept yet."""
-    for kernel, types in KERNELS:
+    # The last first: in their order, a run that catches up would compile each at the same time.
+    for kernel, types in reversed(KERNELS):
         kernel.compile(types)
 
 
