@@ -1,9 +1,10 @@
-"""Processor time and peak memory of ``pixcal run`` on acquisitions of the second bench.
+"""Processor time and peak memory of ``pixcal run``, of the second bench or of any acquisition.
 
 Fails where the memory passes the limit that ``pixcal run`` plans for by default, or the processor
 time passes that of the longest run allowed: 120 s on two cores.
 
     python benchmarks/run_cost.py ordinary:5 lag/traps:6 --strength 0.7
+    python benchmarks/run_cost.py path/to/acq another/acq
 """
 
 import argparse
@@ -21,15 +22,22 @@ LONGEST_S, CORES = 120.0, 2
 BENCH = Path(__file__).parents[1] / "bench"
 
 
-def cost(case: str, seed: str, strength: str) -> bool:
+def made(case: str, strength: str, place: Path) -> Path:
+    """An acquisition of the second bench, ``CASE:SEED``."""
+    name, _, seed = case.rpartition(":")
+    command = [sys.executable, "-m", "second_bench", name, "--seed", seed, "--strength", strength]
+    command += ["--out", str(place / "acq"), "--truth", str(place / "truth.json")]
+    subprocess.run(command, cwd=BENCH, check=True)
+    return place / "acq"
+
+
+def cost(case: str, strength: str) -> bool:
     """Run a case; whether it stays within its limits."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        made = [sys.executable, "-m", "second_bench", case, "--seed", seed]
-        made += ["--strength", strength, "--out", str(place / "acq")]
-        subprocess.run([*made, "--truth", str(place / "truth.json")], cwd=BENCH, check=True)
+        acquisition = Path(case) if Path(case).is_dir() else made(case, strength, place)
         code = "from pixcal_cli.main import main; main()"
-        command = [sys.executable, "-c", code, "run", str(place / "acq"), "--quiet"]
+        command = [sys.executable, "-c", code, "run", str(acquisition), "--quiet"]
         begin = time.monotonic()
         with subprocess.Popen([*command, "--out", str(place / "run")], stdout=-3) as process:
             _, status, used = os.wait4(process.pid, 0)
@@ -38,7 +46,7 @@ def cost(case: str, seed: str, strength: str) -> bool:
     seconds, peak = used.ru_utime + used.ru_stime, used.ru_maxrss << 10
     causes = ", ".join(cause["effect"] for cause in found["causes"]) or "none"
     print(
-        f"{case} seed {seed}: {found['verdict']}, causes {causes}; {seconds:.0f} s of processor "
+        f"{case}: {found['verdict']}, causes {causes}; {seconds:.0f} s of processor "
         f"time ({time.monotonic() - begin:.0f} s in all), {peak >> 20} MiB of the "
         f"{Running().memory >> 20} MiB planned for",
         flush=True,
@@ -50,12 +58,10 @@ def cost(case: str, seed: str, strength: str) -> bool:
 def main() -> int:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("cases", nargs="+", metavar="CASE:SEED")
+    parser.add_argument("cases", nargs="+", metavar="CASE:SEED|ACQ")
     parser.add_argument("--strength", default="0.7")
     asked = parser.parse_args()
-    beyond = 0
-    for case, _, seed in (listed.rpartition(":") for listed in asked.cases):
-        beyond += not cost(case, seed, asked.strength)
+    beyond = sum(not cost(case, asked.strength) for case in asked.cases)
     return 1 if beyond else 0
 
 
