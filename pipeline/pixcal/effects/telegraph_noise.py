@@ -103,7 +103,8 @@ class TelegraphNoise(Effect):
         rather than being noisier, from two signs that Gaussian noise of any size has not: a flat
         top (negative kurtosis), and neighbouring frames that resemble each other. Each is summed
         over the noisy pixels, so nothing is to be corrected for having looked at many of them.
-        Bias and dark frames; without enough of them the residuals of fringes.
+        Bias and dark frames; without enough of them the residuals of fringes. How long pixels stay,
+        by the fringes where there are any.
         """
         series = tuple(_series(evidence))
         if not series:
