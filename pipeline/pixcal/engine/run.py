@@ -45,7 +45,7 @@ class Runtime(Running):
         Bytes that this process held for other work when this began, which ``memory`` leaves out.
     """
 
-    beside: int = field(default_factory=held_by_others, compare=False)
+    beside: int = field(default_factory=held_by_others, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         known = ("threads", "processes", "sync")
