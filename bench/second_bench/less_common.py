@@ -6,7 +6,7 @@ from second_bench.model import F64, WARM_UP, Bench, Frame, stream
 
 LESS_COMMON = (
     "noise_tail", "coarse_gain", "hot_clusters", "bad_frames", "dropped_frames", "phase_errors",
-    "dim_fringes", "far_aims", "long_period", "levels",
+    "dim_fringes", "far_aims", "long_period", "levels", "no_stamps",
 )  # fmt: skip
 SHARE = dict.fromkeys(LESS_COMMON, 0.15)
 """Probability of each."""
@@ -64,6 +64,9 @@ def vary_runs(bench: Bench, varied: set[str]) -> None:
             bench.notes[run.name]["phase_errors"] = rms
     if "bad_frames" in varied:
         _cut_frames(bench)
+    if "no_stamps" in varied:
+        bench.stamped = False
+        bench.notes["no_stamps"] = True
 
 
 def _cut_frames(bench: Bench) -> None:

@@ -169,6 +169,8 @@ class Bench:
         on samples before they are rounded (ADU).
     notes : dict
         Ordinary variations that were drawn.
+    stamped : bool
+        Whether headers tell when and for how long a frame was exposed.
     """
 
     seed: int
@@ -196,6 +198,7 @@ class Bench:
     offset: list[Step] = field(default_factory=list)
     samples: list[Step] = field(default_factory=list)
     notes: dict[str, Any] = field(default_factory=dict)
+    stamped: bool = True
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -28,8 +28,10 @@ def write_acquisition(
         for first in range(0, len(frames), PER_FILE):
             seconds = run.start_s + (first + WARM_UP) * (bench.period_s + _longer(run))
             header = fits.Header()
-            header["DATE-OBS"] = (NIGHT + TimeDelta(seconds, format="sec")).isot
-            header["EXPTIME"] = run.exptime_s
+            if bench.stamped:
+                header["DATE-OBS"] = (NIGHT + TimeDelta(seconds, format="sec")).isot
+            if bench.stamped or run.kind == "dark":
+                header["EXPTIME"] = run.exptime_s
             cube = np.ascontiguousarray(frames[first : first + PER_FILE][WINDOW])
             file = out / run.name / f"{run.name}_{first:05d}.fits"
             fits.PrimaryHDU(cube, header).writeto(file)

@@ -19,6 +19,7 @@ from second_bench.effects import LAWS, Law
 from second_bench.model import WARM_UP, Bench, Frame, stream
 from second_bench.optics import expose, gaussian, light_of
 from second_bench.ordinary import VARIATIONS, Layout
+from second_bench.writing import write_acquisition
 
 SMALL = Layout(shape=(33, 40), frames=24, bias=6, dark=3, flat=30)
 CASES = [f"{one.effect}/{one.name}" for one in LAWS]
@@ -263,6 +264,19 @@ def test_a_cut_frame_is_zero_from_some_row_on() -> None:
         frame = cubes[name][index - WARM_UP]
         assert not frame[row:].any()
         assert frame[:row].all()
+
+
+def test_headers_without_stamps_tell_the_exposure_of_darks_alone(tmp_path: Path) -> None:
+    bench, _ = make_case("ordinary/no_stamps", 4, SMALL)
+    write_acquisition(bench, record(bench), tmp_path / "acq")
+    stamped = {
+        folder.name: [k in fits.getheader(next(folder.iterdir())) for k in ("DATE-OBS", "EXPTIME")]
+        for folder in (tmp_path / "acq").iterdir()
+        if folder.is_dir()
+    }
+    assert stamped.pop("dark") == [False, True]
+    assert {"bias", "flat", "vertical", "horizontal"} == set(stamped)
+    assert not np.any([*stamped.values()])
 
 
 def test_one_set_may_be_all_there_is() -> None:
