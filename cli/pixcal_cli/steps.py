@@ -1,6 +1,5 @@
 """``pixcal run``, its steps one by one, and ``pixcal simulate``."""
 
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,13 +43,9 @@ def from_acquisition(body: Command) -> Command:
 @command(options.Run, "pixcal run data_samples/demo --out demo", argument=from_acquisition)
 def run(acquisition: Path, run: Path, config: options.Run, runtime: "Runtime") -> None:
     """All steps."""
-    # Here: for a fast `pixcal --help`; it also begins before the rest is imported.
-    from pixcal.stages.ahead import compiled_ahead
+    from pixcal.stages import chain  # here: for a fast `pixcal --help`
 
-    with compiled_ahead(runtime) if config.diagnosed else nullcontext():
-        from pixcal.stages import chain
-
-        done = chain.run(acquisition, run, config, runtime, results.announce, click.echo)
+    done = chain.run(acquisition, run, config, runtime, results.announce, click.echo)
     results.show_run(run, fitted=done.fitted, diagnosed=done.diagnosed)
 
 

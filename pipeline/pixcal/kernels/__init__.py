@@ -17,12 +17,9 @@ def _probe() -> None:
     """Never called: only where it would be kept matters."""
 
 
-# Whether other processes find what this one has compiled.
-KEPT = True
 try:
     numba.njit(cache=True)(_probe)
 except RuntimeError:
-    KEPT = False
     # Of this process alone: what others could write there would be run.
     numba.config.CACHE_DIR = tempfile.mkdtemp(prefix="pixcal-")
     atexit.register(shutil.rmtree, numba.config.CACHE_DIR, ignore_errors=True)
