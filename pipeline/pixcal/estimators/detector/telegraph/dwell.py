@@ -1,9 +1,9 @@
 """How long pixels stay in a level, from frames of which there are many.
 
 A few dozen bias or dark frames show which pixels jump, and how far; hundreds of fringe frames show
-for how long they stay. Charge that is left over in the same pixel is alike in frames that are near
-each other: its mean products fall with the frames between them as the stays are long (a sum of
-exponentials, Machlup 1954, J. Appl. Phys. 25, 341).
+for how long they stay. What the fringes leave of a pixel's charge is alike in frames near each
+other. Its mean product falls exponentially with the time between two frames (Machlup 1954, J. Appl.
+Phys. 25, 341): slowly where pixels stay long.
 """
 
 from collections.abc import Sequence
@@ -40,8 +40,8 @@ class LitSeries:
 def find_stays(lit: Sequence[LitSeries], seen: Moments) -> tuple[Stays, float] | None:
     """Stays of the pixels, and the error (s) of their mean; None where the frames do not tell.
 
-    ``seen``: of the frames by which the pixels were chosen. One that stayed in a level there was
-    not: the others stay less long.
+    ``seen``: of the frames by which the pixels were chosen. Pixels that stayed in one level there
+    were not chosen, and this is allowed for.
     """
     lit = [s for s in lit if s.charge.shape[1] >= FEWEST_PIXELS and s.period_s > 0]
     products = [_products(s) for s in lit]
@@ -121,7 +121,10 @@ def _excess(seen: Moments) -> float:
 
 
 def _chosen(stays: Stays, seen: Moments) -> tuple[F64, F64]:
-    """Share (place,) of pixels that showed both levels where they were chosen; how much of them."""
+    """Share (place,) of pixels that stood out enough to be chosen; their mean variance (place,).
+
+    The variance is over that of two levels which are equally frequent.
+    """
     limit = NOISY * np.sqrt(2 / seen.dof) / max(_excess(seen), 1e-9)
     kept = np.broadcast_to(stays.kept(seen.period_s, PLACES), PLACES.shape)
     shown = states(tuple(kept.tolist()), seen.frames)
