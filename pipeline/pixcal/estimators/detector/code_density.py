@@ -14,7 +14,6 @@ from scipy.ndimage import minimum_filter1d, uniform_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.special import log_ndtr
 
-from pixcal.kernels.local_fit import local_fit, middle_weights
 from pixcal.model.arrays import F64, I64, Mask
 
 MAX_CODES = 1 << 17
@@ -309,25 +308,27 @@ def code_widths(
     half = int(np.clip(noise / 2, _MIN_HALF, _MAX_HALF))
     if noise < MIN_NOISE or len(counts) < 2 * _CALM:
         return None
+    # Here: scipy.signal takes most of a second to import, and few runs need it.
+    from scipy.signal import savgol_coeffs, savgol_filter
+
     length = 2 * half + 1
-    weights = middle_weights(half, _ORDER)
     gap = _carried_over(counts)
     code = np.arange(len(counts))
     filled = np.interp(code, code[~gap], counts[~gap])
-    expected = local_fit(filled, half, _ORDER)
+    expected = savgol_filter(filled, length, _ORDER)
     # Weights that hardly depend on the code's own count.
     calm = uniform_filter1d(expected, length)
     used = (uniform_filter1d(filled, length) > FEWEST_COUNTS) & (calm > FEWEST_COUNTS)
     used &= (expected > 0) & (code >= first + half) & (code < last - length)
     if np.count_nonzero(used) < FEWEST_CODES:
         return None
-    kernel = -weights
+    kernel = -savgol_coeffs(length, _ORDER)
     kernel[half] += 1
     width = (counts - expected)[used] / calm[used]
     # What another fit still changes, beyond what uneven codes do to it, the first one missed.
-    again = np.convolve(kernel, weights)
+    again = np.convolve(kernel, savgol_coeffs(length, _ORDER))
     share = 2 * float(again @ again) / float(kernel @ kernel)
-    change = uniform_filter1d((expected - local_fit(expected, half, _ORDER)) ** 2, length)
+    change = uniform_filter1d((expected - savgol_filter(expected, length, _ORDER)) ** 2, length)
     missed = np.maximum(change - share * uniform_filter1d((filled - expected) ** 2, length), 0)
     variance = expected + _MISSED**2 * missed + (_UNEVEN * expected) ** 2
     number = np.flatnonzero(used)
