@@ -1,12 +1,14 @@
 """Which estimates are made of every simulation, as test statistics."""
 
+import numpy as np
 import pytest
 
 from pixcal.effects.ipc import Ipc
 from pixcal.effects.row_noise import RowNoise
+from pixcal.estimators.diagnosis.gap import Difference
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.candidates import Candidate
-from pixcal.stages.diagnose.inquiry import weakly_seen
+from pixcal.stages.diagnose.inquiry import needs_slow, weakly_seen
 
 KINDS: dict[str, type[Effect]] = {"ipc": Ipc, "row_noise": RowNoise}
 
@@ -30,3 +32,16 @@ def test_a_slow_estimate_is_a_statistic_only_if_weak_and_the_strongest(
     sizes = {"ipc": crosstalk, "row_noise": rows}
     found = {n: Candidate(n, Estimate(KINDS[n](), {}, s, "")) for n, s in sizes.items()}
     assert set(weakly_seen(found, KINDS)) == made
+
+
+@pytest.mark.parametrize(
+    ("made", "log_chance", "needed"),
+    [((Ipc, RowNoise), -2.0, True), ((Ipc, RowNoise), -40.0, False), ((RowNoise,), -2.0, False)],
+    ids=["nothing differs", "a quick one differs", "none is slow"],
+)
+def test_a_slow_estimate_is_simulated_only_where_no_quick_statistic_differs(
+    made: tuple[type[Effect], ...], log_chance: float, needed: bool
+) -> None:
+    quick = [kind for kind in made if kind.quick]
+    differences = {("lines", "detector"): Difference(np.zeros(1), log_chance, 0.0)}
+    assert needs_slow(made, quick, differences) is needed

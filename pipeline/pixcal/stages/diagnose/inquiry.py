@@ -11,7 +11,7 @@ import numpy as np
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.expectation import Reference, expect_nominal, expect_with
-from pixcal.estimators.diagnosis.gap import compare, flagged
+from pixcal.estimators.diagnosis.gap import Difference, compare, flagged
 from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
@@ -84,11 +84,11 @@ def inquire(
         if candidate.estimate is None and not candidate.reason:
             candidate.reason = _needs(kinds[name], look.facts)
     estimates = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
-    # A slow statistic is simulated only where no quick one differs.
     quick = tuple(s for s in signatures if kinds[s.name].quick)
     trials = Trials(look.windows, scratch, look.runtime, quick, estimates, SCREEN)
     reference, data = _nominal(trials, look, base, run_dir)
-    if len(quick) < len(signatures) and not flagged(compare(data, expect_nominal(reference))):
+    differences = compare(data, expect_nominal(reference))
+    if needs_slow(signatures, quick, differences):
         trials = Trials(look.windows, scratch, look.runtime, signatures, estimates, SCREEN)
         reference, data = _nominal(trials, look, base, run_dir)
 
@@ -227,6 +227,15 @@ def weakly_seen(
         if estimate.significance >= SIGNIFICANT
         and (kinds[name].quick or (slow and estimate.significance == most < CLEAR))
     )
+
+
+def needs_slow(
+    signatures: Sequence[Signature],
+    quick: Sequence[Signature],
+    differences: Mapping[Key, Difference],
+) -> bool:
+    """Whether slow estimates must be statistics too: no quick one differs."""
+    return len(quick) < len(signatures) and not flagged(differences)
 
 
 def _each_of(
