@@ -18,7 +18,7 @@ import yaml
 from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime
-from pixcal.kernels.bilinear import N_SUMS, sweep_block
+from pixcal.kernels.bilinear import GOES_ON, N_SUMS, sweep_batches
 from pixcal.stages import fit, ingest, reduce, simulate
 from pixcal.stages.reduced_set import ReducedSet
 
@@ -46,18 +46,16 @@ def weighted_sums(source: ReducedSet) -> Callable[[NDArray[np.uint16]], None]:
     @cache
     def of_pixels(shape: tuple[int, int]) -> tuple[NDArray[Any], ...]:
         model = np.multiply.outer([2e4, 1.2e4, 1.2e4], np.ones(shape)).astype(np.float32)
-        return (
-            model,
-            np.full(shape, 256, np.float32),
-            np.ones(shape, np.float32),
-            np.zeros((N_SUMS, *shape)),
-        )
+        sums = np.zeros((2, shape[0], N_SUMS, shape[1]))
+        of_batches = np.zeros((2, 0, *shape), np.float32)
+        return model, np.full(shape, 256, np.float32), np.ones(shape, np.float32), sums, of_batches
 
     def add(codes: NDArray[np.uint16]) -> None:
         n, *shape = codes.shape
-        sweep_block(
-            codes, coding.scale, coding.offset, coding.fill, g[:n], still[:n], 0.0, 0.0,
-            *of_pixels((shape[0], shape[1])),
+        *fixed, sums, of_batches = of_pixels((shape[0], shape[1]))
+        sweep_batches(
+            codes, *coding, g[:n], still[:n], 0.0, 0.0, *fixed, np.array([n]), np.array([GOES_ON]),
+            *sums, *of_batches,
         )  # fmt: skip
 
     return add

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.kernels.bilinear import N_SUMS, frame_sums, solve_pixels, sweep_block
+from pixcal.kernels.bilinear import GOES_ON, N_SUMS, frame_sums, solve_pixels, sweep_batches
 
 
 def case(seed=0, t=37, ny=5, nx=23, moving=True):
@@ -39,15 +39,25 @@ def expected(g, dk, theta, read, shot, codes, y0, x0, scale, offset):
     return sums
 
 
+def add_block(sums, codes, scale, offset, g, dk, y0, x0, *maps):
+    """Add a block of no batch to sums (N_SUMS, y, x)."""
+    n, (ny, nx) = len(codes), codes.shape[1:]
+    part, total = np.zeros((2, ny, N_SUMS, nx))
+    f, none = np.float32, np.zeros((0, ny, nx), np.float32)
+    fixed = (m.astype(f) for m in maps)
+    stops, closes = np.array([n]), np.array([GOES_ON])
+    sweep_batches(
+        codes, scale, offset, 65535, g.astype(f), dk.astype(f), y0, x0, *fixed,
+        stops, closes, part, total, none, none,
+    )  # fmt: skip
+    sums += np.moveaxis(part, 1, 0)
+
+
 @pytest.mark.parametrize("moving", [False, True])
-def test_sweep_block_is_the_weighted_sum_of_every_pixel(moving):
+def test_a_sweep_is_the_weighted_sum_of_every_pixel(moving):
     g, dk, theta, read, shot, codes = case(moving=moving)
     sums = np.zeros((N_SUMS, 5, 23))
-    f = np.float32
-    sweep_block(
-        codes, 1.5, -200.0, 65535, g.astype(f), dk.astype(f), -2.0, -11.0,
-        theta.astype(f), read.astype(f), shot.astype(f), sums,
-    )  # fmt: skip
+    add_block(sums, codes, 1.5, -200.0, g, dk, -2.0, -11.0, theta, read, shot)
     wanted = expected(g, dk, theta, read, shot, codes, -2.0, -11.0, 1.5, -200.0)
     scale = np.abs(wanted).max(axis=(1, 2), keepdims=True)
     np.testing.assert_allclose(sums / scale, wanted / scale, atol=2e-5)
@@ -56,15 +66,11 @@ def test_sweep_block_is_the_weighted_sum_of_every_pixel(moving):
 
 @pytest.mark.long
 def test_blocks_add_up():
-    g, dk, theta, read, shot, codes = case(moving=True)
-    f = np.float32
-    fixed = (theta.astype(f), read.astype(f), shot.astype(f))
+    g, dk, *maps, codes = case(moving=True)
     whole, parts = np.zeros((2, N_SUMS, 5, 23))
-    sweep_block(codes, 1, 0, 65535, g.astype(f), dk.astype(f), -2, -11, *fixed, whole)
+    add_block(whole, codes, 1.0, 0.0, g, dk, -2.0, -11.0, *maps)
     for a, b in ((0, 5), (5, 18), (18, 37)):
-        sweep_block(
-            codes[a:b], 1, 0, 65535, g[a:b].astype(f), dk[a:b].astype(f), -2, -11, *fixed, parts
-        )
+        add_block(parts, codes[a:b], 1.0, 0.0, g[a:b], dk[a:b], -2.0, -11.0, *maps)
     np.testing.assert_allclose(parts, whole, rtol=1e-4, atol=1e-4 * np.abs(whole).max())
 
 

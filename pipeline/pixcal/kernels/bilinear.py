@@ -131,52 +131,6 @@ def _pour(part: Any, total: Any) -> None:
             part[k, i] = 0
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def sweep_block(
-    codes: Any,
-    scale: float,
-    offset: float,
-    fill: int,
-    g: F32,
-    dk: F32,
-    y0: float,
-    x0: float,
-    theta: F32,
-    read: F32,
-    shot: F32,
-    sums: F64,
-) -> None:
-    """Add a block of frames to the weighted sums of every pixel of a tile.
-
-    Parameters
-    ----------
-    codes : (t, y, x) unsigned int
-        Stored samples, of which ``fill`` has no weight; at most some
-        100 frames, so that the block's float32 sums keep their precision.
-    scale, offset : electrons of a code
-    g : (t, 3) float32
-        Frame parameters at the tile's centre.
-    dk : (t, 2) float32
-        Change of the fringe vector (x, y), rad/px; used to second order.
-    y0, x0 : the tile's first pixel relative to its centre, px
-    theta : (3, y, x) float32
-        Start model, e-.
-    read, shot : (y, x) float32
-        Variance of a sample: ``shot * model + read``, e-².
-    sums : (N_SUMS, y, x) float64
-        Added to: normal sums 00, 01, 02, 11, 12, 22, right-hand sums 0
-        to 2 (of the residual to the start model), its weighted square, number of samples.
-    """
-    moving = np.any(dk != 0)
-    p = np.zeros((N_SUMS, codes.shape[2]), np.float32)
-    for row in range(codes.shape[1]):
-        _sum_row(
-            codes, row, scale, offset, fill, g, dk, moving, y0 + row, x0,
-            theta[0, row], theta[1, row], theta[2, row], read[row], shot[row], p,
-        )  # fmt: skip
-        _pour(p, sums[:, row])
-
-
 GROUP = 1024  # pixels summed at a time: what is kept of them stays in the first cache
 
 
@@ -203,7 +157,7 @@ def frame_sums(
     codes : (t, p) stored samples of p pixels; of other types it would be compiled again
     g, dk : (t, 3), (t, 2) float32, current frame parameters; sums are of the residual to them
     y, x : (p,) pixel coordinates relative to the point where ``g`` holds, px
-    theta, read, shot : (3, p), (p,), (p,) float32, as in `sweep_block`
+    theta, read, shot : (3, p), (p,), (p,) float32, as in `sweep_batches`
     normal : (t, 15) added to: upper triangle, by row, for (g0, g1, g2, dkx, dky)
     right : (t, 5) added to: right-hand sides
     """
@@ -325,7 +279,7 @@ def add_right(
 def solve_pixels(sums: F64) -> tuple[F64, F64, F64]:
     """Solve the pixels' 3 x 3 systems.
 
-    Of sums (10 or more, ...) as in `sweep_block`: the correction to the start model (3, ...), NaN
+    Of sums (10 or more, ...) as in `sweep_batches`: the correction to the start model (3, ...), NaN
     where it is not determined; the upper triangle (6, ...) of the covariance of theta; and the
     weighted square (...) of the residual that remains.
     """
@@ -411,11 +365,20 @@ def sweep_batches(
     """Add a block of frames to the sums of batches, and those of full batches to the run's.
 
     Row by row, so that the sums of a row stay in the first cache whatever the number of batches.
+    The sums are: normal 00, 01, 02, 11, 12, 22; right-hand 0 to 2 (of the residual to the start
+    model), its weighted square; number of samples.
 
     Parameters
     ----------
-    codes, scale, offset, fill, g, dk, y0, x0, theta, read, shot : as in `sweep_block`
-    stops : (n,) frames of the block at which its sums are cut; the last is their number
+    codes : (t, y, x) unsigned int stored samples, of which ``fill`` has no weight
+    scale, offset : electrons of a code
+    g : (t, 3) float32 frame parameters at the tile's centre
+    dk : (t, 2) float32 change of the fringe vector (x, y), rad/px; used to second order
+    y0, x0 : the tile's first pixel relative to its centre, px
+    theta : (3, y, x) float32 start model, e-
+    read, shot : (y, x) float32 variance of a sample: ``shot * model + read``, e-²
+    stops : (n,) frames of the block at which its sums are cut; the last is their number. At most
+        some 100 from one to the next, so that sums in float32 keep their precision
     closes : (n,) batch that ends there; `GAP` where frames of none do, `GOES_ON` where none does
     part, total : (y, N_SUMS, x) sums of the batch at hand, and of all that have ended; added to
     turn, sigma : (batch, y, x) written: phase of a batch relative to the start model and its error,

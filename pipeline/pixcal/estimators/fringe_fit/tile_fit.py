@@ -13,7 +13,6 @@ from pixcal.kernels.bilinear import (
     N_SUMS,
     solve_pixels,
     sweep_batches,
-    sweep_block,
 )
 from pixcal.kernels.robust import median
 from pixcal.model.arrays import C128, F32, F64, U16, Mask
@@ -61,9 +60,10 @@ class PixelSums:
 
     Parameters
     ----------
-    tile, coding, frames : as in `accumulate`
+    frames : of all blocks together
     model : (3, y, x) float32 start model
     ranges : first frame and the one after the last of each batch; empty for a gap
+    variance : (read, shot) instead of the tile's own
 
     Attributes
     ----------
@@ -78,12 +78,15 @@ class PixelSums:
         frames: FrameParameters,
         model: F32,
         ranges: Sequence[tuple[int, int]] = (),
+        variance: tuple[F32, F32] | None = None,
     ) -> None:
-        self.model, self.position = model, 0
-        self._fixed = (*_corner(tile), model, tile.read, tile.shot)
-        self._coding = coding
-        self._g, self._dk = _moved(tile, frames)
         ny, nx = tile.shape
+        self.model, self.position = model, 0
+        read, shot = variance or (tile.read, tile.shot)
+        # The first pixel relative to the tile's centre, at which the frames' parameters hold.
+        self._fixed = (-(ny - 1) / 2, -(nx - 1) / 2, model, read, shot)
+        self._coding = coding
+        self._g, self._dk = (f.astype(np.float32) for f in (frames.at(*tile.centre), frames.dk))
         self._part, self._total = np.zeros((2, ny, N_SUMS, nx))
         self.turn, self.sigma = np.full((2, len(ranges), ny, nx), np.nan, np.float32)
         # Where sums are cut: at the ends of batches, and where one begins after a gap.
@@ -102,22 +105,17 @@ class PixelSums:
         )  # fmt: skip
         self.position = last
 
+    @property
+    def sums(self) -> F64:
+        """Of all frames so far (N_SUMS, y, x), as `solve_pixels` takes them."""
+        return np.moveaxis(self._total + self._part, 1, 0)
+
     def finish(self) -> tuple[F64, F64, F64, F64]:
         """End the run: theta (3, y, x); phase errors, chi-square and samples, each (y, x)."""
-        sums = np.moveaxis(self._total + self._part, 1, 0)
+        sums = self.sums
         step, covariance, chi2 = solve_pixels(sums)
         theta = self.model + step
         return theta, phase_sigma(theta, covariance), chi2, sums[10]
-
-
-def _moved(tile: Tile, frames: FrameParameters) -> tuple[F32, F32]:
-    """Parameters of the frames at a tile's centre, and the changes of their fringe vector."""
-    return frames.at(*tile.centre).astype(np.float32), frames.dk.astype(np.float32)
-
-
-def _corner(tile: Tile) -> tuple[float, float]:
-    """First pixel (y, x) relative to the tile's centre."""
-    return -(tile.shape[0] - 1) / 2, -(tile.shape[1] - 1) / 2
 
 
 def phase_sigma(theta: F64, covariance: F64) -> F64:
@@ -145,30 +143,16 @@ def accumulate(
     coding: Coding,
     frames: FrameParameters,
     theta: F32,
-    sums: F64 | None = None,
     variance: tuple[F32, F32] | None = None,
 ) -> F64:
-    """Weighted sums of a tile over blocks of frames that follow one another.
+    """Sums (N_SUMS, y, x) of a tile over blocks of codes (t, y, x) that follow one another.
 
-    Parameters
-    ----------
-    blocks : (t, y, x) stored codes; together as many frames as ``frames`` holds
-    theta : (3, y, x) float32 start model
-    sums : (N_SUMS, y, x) float64 sums to add to
-    variance : (read, shot) instead of the tile's own
+    Together they have as many frames as ``frames`` holds; the others as of `PixelSums`.
     """
-    sums = np.zeros((N_SUMS, *tile.shape)) if sums is None else sums
-    read, shot = variance or (tile.read, tile.shot)
-    g, dk = _moved(tile, frames)
-    around = (*_corner(tile), theta, read, shot)
-    start = 0
+    sums = PixelSums(tile, coding, frames, theta, variance=variance)
     for block in blocks:
-        for first in range(0, len(block), MOST_FRAMES):
-            part = block[first : first + MOST_FRAMES]
-            at = slice(start + first, start + first + len(part))
-            sweep_block(part, *coding, g[at], dk[at], *around, sums)
-        start += len(block)
-    return sums
+        sums.add(block)
+    return sums.sums
 
 
 def start_model(
