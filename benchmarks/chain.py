@@ -103,7 +103,7 @@ def write_again(work: Workload, threads: int) -> float:
     took = 0.0
     for number, source in enumerate(work.sources):
         reader = ArrayReader(source.folder / "signal")
-        columns = list(reader.tiles())
+        columns = [source.ranges(tile) for tile in source.tiles()]
         target = work.folder / f"again-{number}"
         writer = create_array(target, reader.shape, reader.dtype)
         for n in range(0, len(columns), 16):

@@ -20,7 +20,9 @@ import yaml
 
 from comparators.measure import METHODS, PIXCAL
 from pixcal.engine.run import Runtime
+from pixcal.model.acquisition import load_acquisition
 from pixcal.stages import ingest, reduce, simulate
+from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.storage.products import read_map
 from truth import PLANE, Truth
 
@@ -67,23 +69,15 @@ def bench(folder: Path, scenario: str, size: int, frames: int) -> Path:
     return path
 
 
-def nominal_vector(config: dict[str, Any]) -> tuple[float, float]:
-    """Fringe vector that an acquisition declares, rad/px (paper, equation 4)."""
-    optics, (scan,) = config["optics"], config["frames"]["fringes"]
-    wavelength, pitch = optics["wavelength_nm"] * 1e-6, config["detector"]["pitch_um"] * 1e-3
-    scale = 2 * np.pi * pitch / (wavelength * optics["distance_mm"])
-    return float(scale * scan["baseline_mm"][0]), float(scale * scan["baseline_mm"][1])
-
-
 def measure(
     method: str, folder: Path, truth: Truth, options: argparse.Namespace
 ) -> dict[str, float]:
     """What a method costs, in a process of its own, and how far it is from the truth."""
-    config = yaml.safe_load((folder / "acq" / "acquisition.yaml").read_text())
+    described = load_acquisition(folder / "acq")
     phase = folder / f"{method}.npy"
     command = [sys.executable, "-m", "comparators.measure", method, str(folder / "run"), NAME]
-    command += ["--vector", *(str(k) for k in nominal_vector(config))]
-    command += ["--read-noise", str(config["detector"]["read_noise_e"])]
+    command += ["--vector", *(str(k) for k in nominal_vector(described, NAME))]
+    command += ["--read-noise", str(described.detector.read_noise_e)]
     command += ["--pixels", str(options.pixels), "--repeat", str(options.repeat)]
     command += ["--phase", str(phase)]
     done = subprocess.run(command, cwd=HERE, check=True, stdout=subprocess.PIPE, text=True)

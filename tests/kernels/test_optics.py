@@ -12,7 +12,6 @@ from pixcal.kernels.optics import (
     fringe_vector,
     gaussian_beam,
     interfringe,
-    opd,
     paraxial_phase,
     paraxial_vector,
     phase,
@@ -54,7 +53,6 @@ def test_the_phase_is_exact_all_over_the_chip(seed: int) -> None:
     found = phase(x, y, g)
     for n in range(x.size):
         assert abs(Decimal(found[n]) - exact(x[n], y[n], g)) < Decimal("1e-9")
-    assert np.allclose(opd(x, y, g) * 2 * np.pi / g.wavelength, found, rtol=1e-14)
 
 
 def test_the_phase_grows_along_the_baseline_by_the_paraxial_vector() -> None:

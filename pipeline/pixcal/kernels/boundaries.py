@@ -41,12 +41,10 @@ def area_changes(falloff_px: float) -> F64:
     charge squared. Of charges at rows and columns ``-REACH`` to ``REACH``, in units of the shift by
     an electron in px; of those at the rim only the nearer boundaries count.
     """
-    size = 2 * REACH + 1
     right = np.pad(boundary_shifts(falloff_px), ((0, 0), (1, 0)))
     left = right[:, ::-1]
     across = right + left
     area: F64 = across + across.T
-    assert area.shape == (size, size)
     return area
 
 

@@ -68,11 +68,6 @@ def phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> F64:
     return result
 
 
-def opd(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> F64:
-    """Exact optical path difference in mm; parameters as `phase`."""
-    return phase(x, y, geometry) / geometry.wavenumber
-
-
 def paraxial_vector(geometry: Geometry) -> tuple[float, float]:
     """Fringe vector (kx, ky) in rad/px of the straight-fringe limit (paper, eq. 4)."""
     scale = geometry.wavenumber * geometry.pitch / geometry.distance

@@ -5,8 +5,8 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pixcal.model.acquisition import check_names, check_set
-from pixcal.model.config import parse, quantity
+from pixcal.model.acquisition import Detector, FringeSet, Optics, check_names, check_set
+from pixcal.model.config import as_in, parse, quantity
 from pixcal.model.errors import InputError
 from pixcal.model.yaml_file import read_yaml
 
@@ -29,10 +29,10 @@ class SimulatedDetector:
     shape: tuple[int, int] = quantity(
         unit="px", low=1, high=65536, doc="window that is read out: [rows, columns]"
     )
-    pitch_um: float = quantity(unit="um", low=0.01, high=1000, doc="pixel pitch")
-    gain_e_per_adu: float = quantity(unit="e-/ADU", low=1e-6, high=1e6, doc="conversion gain")
-    read_noise_e: float = quantity(unit="e-", low=0, high=1e6, doc="read noise, rms")
-    name: str = quantity("", doc="free text")
+    pitch_um: float = as_in(Detector, "pitch_um")
+    gain_e_per_adu: float = as_in(Detector, "gain_e_per_adu")
+    read_noise_e: float = as_in(Detector, "read_noise_e")
+    name: str = as_in(Detector, "name")
     seed: int = quantity(
         0, low=0, high=10**18, doc="random seed of the detector: its fixed patterns"
     )
@@ -140,7 +140,7 @@ class SimulatedDetector:
 class SimulatedOptics:
     """Laser, fibres and their light; lengths on the detector are from the chip's centre."""
 
-    wavelength_nm: float = quantity(unit="nm", low=1, high=1e6, doc="laser wavelength")
+    wavelength_nm: float = as_in(Optics, "wavelength_nm")
     distance_mm: float = quantity(unit="mm", low=0.1, high=1e7, doc="fibres to detector, true")
     beam_radius_mm: float = quantity(
         unit="mm", low=1e-3, high=1e7, doc="1/e² radius of each fibre's light on the detector"
@@ -168,14 +168,17 @@ class SimulatedOptics:
     }
 
 
+def _of_pair(name: str, doc: str) -> Any:
+    """What a pair of fibres may have of its own."""
+    return as_in(SimulatedOptics, name, default=None, doc=f"{doc}; default: that in optics")
+
+
 @dataclass(frozen=True)
 class SimulatedSet:
     """One scan of the fringes of a pair of fibres."""
 
-    name: str = quantity(doc="letters, digits, '-' and '_'")
-    baseline_mm: tuple[float, float] = quantity(
-        unit="mm", low=-1e4, high=1e4, doc="fibre B minus fibre A along x and y"
-    )
+    name: str = as_in(FringeSet, "name")
+    baseline_mm: tuple[float, float] = as_in(FringeSet, "baseline_mm")
     count: int = quantity(low=1, high=MAX_FRAMES, doc="number of frames")
     peak_e: float = quantity(
         unit="e-",
@@ -190,27 +193,13 @@ class SimulatedSet:
         high=1e4,
         doc="fibre B minus fibre A along the optical axis (tilt)",
     )
-    offset_mm: tuple[float, float] | None = quantity(
-        None, unit="mm", low=-1e5, high=1e5, doc="centre of this pair; default: that in optics"
-    )
-    distance_mm: float | None = quantity(
-        None, unit="mm", low=0.1, high=1e7, doc="of this pair, true; default: that in optics"
-    )
-    beam_radius_mm: float | None = quantity(
-        None, unit="mm", low=1e-3, high=1e7, doc="of this pair's light; default: that in optics"
-    )
-    pointing_a_mm: tuple[float, float] | None = quantity(
-        None, unit="mm", low=-1e5, high=1e5, doc="of this pair's fibre A; default: that in optics"
-    )
-    pointing_b_mm: tuple[float, float] | None = quantity(
-        None, unit="mm", low=-1e5, high=1e5, doc="of this pair's fibre B; default: that in optics"
-    )
-    power_ratio: float | None = quantity(
-        None, low=1e-3, high=1e3, doc="of this pair, B over A; default: that in optics"
-    )
-    visibility: float | None = quantity(
-        None, above=0, high=1, doc="of this pair; default: that in optics"
-    )
+    offset_mm: tuple[float, float] | None = _of_pair("offset_mm", "centre of this pair")
+    distance_mm: float | None = _of_pair("distance_mm", "of this pair, true")
+    beam_radius_mm: float | None = _of_pair("beam_radius_mm", "of this pair's light")
+    pointing_a_mm: tuple[float, float] | None = _of_pair("pointing_a_mm", "of this pair's fibre A")
+    pointing_b_mm: tuple[float, float] | None = _of_pair("pointing_b_mm", "of this pair's fibre B")
+    power_ratio: float | None = _of_pair("power_ratio", "of this pair, B over A")
+    visibility: float | None = _of_pair("visibility", "of this pair")
     phase_law: str = quantity(
         "random", choices=("random", "ramp"), doc="random: uniform over 2π; ramp: equal steps"
     )

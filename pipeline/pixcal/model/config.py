@@ -51,6 +51,12 @@ def quantity(
     return dataclasses.field(default=default, metadata=meta)
 
 
+def as_in(kind: type, name: str, **changes: Any) -> Any:
+    """Declare a field as another class has it, but for some changes of what `quantity` takes."""
+    (field,) = (f for f in dataclasses.fields(kind) if f.name == name)
+    return quantity(**{"default": field.default, **field.metadata, **changes})
+
+
 @dataclasses.dataclass(frozen=True)
 class _Place:
     """Where a value stands: file, dotted key, and line where it is known."""

@@ -10,11 +10,11 @@ field may say
 - ``metavar``, ``flag``, ``shown``: how help shows its value, its name, and a default of None.
 """
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pixcal.model.config import StrPath, quantity
+from pixcal.model.config import StrPath, as_in, quantity
 from pixcal.model.errors import InputError
 
 # limits (y0, y1, x0, x1) of a rectangle of pixels, ends excluded
@@ -22,12 +22,6 @@ Region = tuple[int, int, int, int]
 
 MAX_ELECTRONS = 1e15  # the Poisson generator counts so far
 FWHMS = (0.5, 50.0)  # widths of stars, px
-
-
-def _as_in(kind: type, name: str) -> Any:
-    """An option of another command as well."""
-    (option,) = (f for f in fields(kind) if f.name == name)
-    return field(default=option.default, metadata=option.metadata)
 
 
 def _python(default: Any, **meaning: Any) -> Any:
@@ -126,7 +120,7 @@ class Reduce:
     rounding_share: float = _python(
         1e-3, above=0, high=1, doc="Share of the variance that rounding may add."
     )
-    cubes: StrPath | None = _as_in(Ingest, "cubes")
+    cubes: StrPath | None = as_in(Ingest, "cubes")
 
 
 @dataclass(frozen=True)
@@ -382,11 +376,11 @@ class Simulate:
 class Run:
     """Run all steps, from an acquisition to corrected maps and the report."""
 
-    overwrite: bool = _as_in(Ingest, "overwrite")
-    copy: bool = _as_in(Ingest, "copy")
-    gain: Literal["declared", "measured"] = _as_in(Reduce, "gain")
-    model: str = _as_in(Fit, "model")
-    cubes: StrPath | None = _as_in(Ingest, "cubes")
+    overwrite: bool = as_in(Ingest, "overwrite")
+    copy: bool = as_in(Ingest, "copy")
+    gain: Literal["declared", "measured"] = as_in(Reduce, "gain")
+    model: str = as_in(Fit, "model")
+    cubes: StrPath | None = as_in(Ingest, "cubes")
     diagnosed: bool = quantity(
         True,
         flag="--diagnose/--no-diagnose",

@@ -64,13 +64,13 @@ class ColourScale:
         return Normalize(self.low, self.high)
 
 
-def symmetric_scale(image: NDArray[Any], middle: float = 0.0) -> ColourScale:
-    """Colours for three robust standard deviations on both sides of the middle."""
+def symmetric_scale(image: NDArray[Any]) -> ColourScale:
+    """Colours for three robust standard deviations on both sides of zero."""
     reach = 3 * median_and_sigma(image)[1]
     if not reach > 0:
         finite = image[np.isfinite(image)]
-        reach = float(np.max(np.abs(finite - middle), initial=0.0)) or 1.0
-    return _scale(image, middle - reach, middle + reach, DIVERGING)
+        reach = float(np.max(np.abs(finite), initial=0.0)) or 1.0
+    return _scale(image, -reach, reach, DIVERGING)
 
 
 def span_scale(image: NDArray[Any]) -> ColourScale:

@@ -426,12 +426,6 @@ class ArrayReader:
             *(range(a // c, -(-b // c)) for (a, b), c in zip(ranges, self.chunks, strict=True))
         )
 
-    def tiles(self) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
-        """Ranges ((y0, y1), (x0, x1)) of the columns of chunks, for arrays (time, y, x)."""
-        (_, ny, nx), (_, cy, cx) = self.shape, self.chunks
-        for y0, x0 in product(range(0, ny, cy), range(0, nx, cx)):
-            yield (y0, min(y0 + cy, ny)), (x0, min(x0 + cx, nx))
-
 
 class CachedReader(ArrayReader):
     """An `ArrayReader` that keeps chosen chunks in memory.

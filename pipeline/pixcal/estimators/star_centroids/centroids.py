@@ -79,9 +79,9 @@ class Star:
                 break
         return found
 
-    def information(self, place: F64, good: Good | None = None) -> F64:
+    def information(self, place: F64) -> F64:
         """Fisher's information of a, b, N and B: (4, 4)."""
-        jacobian, weight, _ = self._of_pixels(place, good)
+        jacobian, weight, _ = self._of_pixels(place, None)
         return np.asarray(np.einsum("iyx,jyx,yx->ij", jacobian, jacobian, weight))
 
     def bound(self, place: F64 | None = None) -> F64:

@@ -7,12 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
-from pixcal.estimators.fringe_fit.models.hyperbolic import (
-    PRIOR_BASELINE,
-    PRIOR_CENTRE_MM,
-    PRIOR_DISTANCE,
-    PRIOR_TILT,
-)
+from pixcal.estimators.fringe_fit.models.hyperbolic import prior_errors
 from pixcal.kernels.optics import PARAMETERS, Geometry, phase, phase_jacobian
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
@@ -35,10 +30,7 @@ class Prior:
     @classmethod
     def of_bench(cls, nominal: Geometry) -> "Prior":
         """The errors that the hyperbolic fit assumes of a bench's nominal values."""
-        length = float(np.hypot(nominal.baseline_x, nominal.baseline_y))
-        plane = [PRIOR_CENTRE_MM, PRIOR_CENTRE_MM, PRIOR_DISTANCE * nominal.distance]
-        baseline = [PRIOR_BASELINE * length, PRIOR_BASELINE * length, PRIOR_TILT * length]
-        return cls(nominal, np.array(plane + baseline))
+        return cls(nominal, prior_errors(nominal))
 
     @classmethod
     def none(cls, nominal: Geometry) -> "Prior":

@@ -16,6 +16,7 @@ from pixcal.estimators.detector.calibration import usual_variance
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.arrays import F32, F64, U8
 from pixcal.model.flags import PixelFlag
+from pixcal.model.options import Reduce
 from pixcal.stages.reduce.columns import (
     Index,
     Strip,
@@ -26,7 +27,7 @@ from pixcal.stages.reduce.columns import (
     span,
     strips,
 )
-from pixcal.stages.reduce.frame_statistics import STATISTICS, Limits, Measuring
+from pixcal.stages.reduce.frame_statistics import STATISTICS, Measuring
 from pixcal.stages.reduced_set import STRIP
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group
 from pixcal.storage.place import Place
@@ -109,7 +110,7 @@ def usual(job: Measuring, folder: Place, light: F64) -> Usual:
         *median_and_sigma(rate),
         usual_variance(variance[dof > 0], freedom),
         median_and_sigma(bias)[0],
-        noisy_factor(job.limits.noisy, variance[dof > 0], freedom, job.quantum),
+        noisy_factor(job.options.noisy_factor, variance[dof > 0], freedom, job.quantum),
     )
 
 
@@ -127,7 +128,7 @@ class Finishing:
     floor: float  # least read noise of a pixel (e-): the rounding of the converter
     has_rate: bool  # has_rate, has_flat: whether dark signal and response were measured
     has_flat: bool
-    limits: Limits  # of the flags
+    options: Reduce  # limits of the flags
     writers: Mapping[str, ArrayWriter]  # arrays for the maps
 
 
@@ -192,16 +193,16 @@ def _ends(maps: Mapping[str, NDArray[Any]]) -> tuple[float, float, float, float]
 
 def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> U8:
     mask = found["flags"].astype(np.uint8)
-    limits, medians = job.limits, job.usual
+    limits, medians = job.options, job.usual
     # A sample that lies on a change of code is one of two, however little noise it has.
     least = 3 * (job.floor / job.gain) ** 2
     if job.has_flat:
         mask[~np.isfinite(flat)] |= np.uint8(PixelFlag.NO_DATA)
-        where = dead(flat, error, limits.dead, limits.bright, FLAT_FLOOR)
+        where = dead(flat, error, limits.dead_below, limits.dead_above, FLAT_FLOOR)
         mask[where] |= np.uint8(PixelFlag.DEAD)
     if job.has_rate:
         where = hot(
-            found["dark_rate"], found["dark_rate_error"], medians.dark_rate_sigma, limits.hot
+            found["dark_rate"], found["dark_rate_error"], medians.dark_rate_sigma, limits.hot_sigma
         )
         mask[where] |= np.uint8(PixelFlag.HOT)
     if np.isfinite(medians.dark_variance):

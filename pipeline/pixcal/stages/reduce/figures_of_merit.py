@@ -249,7 +249,7 @@ def _dark_means(source: Ingested, middle: Window, good: Mask) -> tuple[F64, F64]
     pixels = good[window[0][0] - y0 : window[0][1] - y0]
     times, means = [], []
     for group in source.exposures.dark if pixels.any() else ():
-        for _, samples in frames_of(source, group.array, group.frames, window):
+        for samples in frames_of(source, group.array, group.frames, window):
             times.append(group.exptime)
             means.append(float(samples[pixels].mean(dtype=float)))
     return np.array(times), np.array(means)

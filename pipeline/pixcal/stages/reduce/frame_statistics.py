@@ -31,6 +31,7 @@ from pixcal.kernels.robust import BATCH, Combination, Combined, finite_median, l
 from pixcal.kernels.rounding import SHEPPARD
 from pixcal.model.arrays import F32, F64
 from pixcal.model.flags import PixelFlag
+from pixcal.model.options import Reduce
 from pixcal.stages.reduce.columns import (
     Index,
     Strip,
@@ -68,18 +69,6 @@ _COARSE = 3.0
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Limits of outliers and flags, see `pixcal.stages.reduce.Config`."""
-
-    clip: float
-    hot: float
-    dead: float
-    bright: float
-    noisy: float
-    nonlinear: float
-
-
-@dataclass(frozen=True)
 class Measuring:
     """What the first task of a column needs."""
 
@@ -96,7 +85,7 @@ class Measuring:
     cut_off: Mapping[str, float]  # arrays whose noise is cut off at code zero; it, roughly (ADU)
     gain: float  # gain, read_noise: rough guess: e-/ADU, ADU
     read_noise: float
-    limits: Limits  # of outliers and flags
+    options: Reduce  # limits of outliers and flags
     writers: Mapping[str, ArrayWriter]  # arrays for the results
 
 
@@ -251,7 +240,7 @@ def _measure_response(job: Measuring, column: _Column) -> None:
     column.levels[:, 0] = levels
     rungs, levels = unsaturated(column.rungs, levels, float(np.median(column.noise)))
     maps["response"], maps["response_error"] = relative_response(rungs, levels)
-    maps["flags"][nonlinear(rungs, levels, job.limits.nonlinear)] += int(PixelFlag.NONLINEAR)
+    maps["flags"][nonlinear(rungs, levels, job.options.nonlinear_share)] += int(PixelFlag.NONLINEAR)
 
 
 def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[Combined]:
@@ -259,7 +248,7 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
     lamp = group.array == "flat"
     # Of noise that is cut off the median deviation may be nothing.
     step = max(job.quantum, job.cut_off.get(group.array, 0.0))
-    every = [Combination(clip=job.limits.clip, lamp=lamp, quantum=step) for _ in columns]
+    every = [Combination(clip=job.options.clip_sigma, lamp=lamp, quantum=step) for _ in columns]
     pedestals: list[F32 | None] = [None] * len(columns)
     if lamp:
         exptime = group.exptime if job.flats_timed else 0.0
@@ -307,7 +296,7 @@ def _loud(job: Measuring, frames: F32) -> NDArray[np.bool_]:
     # A sample that lies on a change of code is one of two.
     usual = max(usual_variance(variance, len(frames) - 1), job.quantum**2 / 4)
     unknown = np.full(variance.shape, np.nan)
-    factor = noisy_factor(job.limits.noisy, variance, len(frames) - 1, job.quantum)
+    factor = noisy_factor(job.options.noisy_factor, variance, len(frames) - 1, job.quantum)
     nearby = variance_nearby(variance, dof, usual)
     return noisy(variance, dof, nearby, unknown, 0 * dof, factor)
 

@@ -95,7 +95,7 @@ def _averages(source: Ingested, series: tuple[Group, ...], window: Window) -> F6
     made = np.zeros((2 * len(series), y1 - y0, x1 - x0))
     for n, group in enumerate(series):
         used = group.frames[: min(_FRAMES, len(group.frames)) // 2 * 2]
-        for number, (_, samples) in enumerate(frames_of(source, group.array, used, window)):
+        for number, samples in enumerate(frames_of(source, group.array, used, window)):
             made[2 * n + number % 2] += samples
         made[2 * n : 2 * n + 2] /= len(used) / 2
     return made
@@ -103,10 +103,10 @@ def _averages(source: Ingested, series: tuple[Group, ...], window: Window) -> F6
 
 def frames_of(
     source: Ingested, array: str, numbers: Sequence[int], window: Window
-) -> Iterator[tuple[int, NDArray[Any]]]:
-    """Number and samples (y, x) of some frames, read in the blocks that they are stored in."""
+) -> Iterator[NDArray[Any]]:
+    """Samples (y, x) of some frames, read in the blocks that they are stored in."""
     for block, held in groupby(numbers, key=lambda number: number // CHUNK[0]):
         first = block * CHUNK[0]
         samples = source.arrays[array].read((first, first + CHUNK[0]), *window)
         for number in held:
-            yield number, samples[number - first]
+            yield samples[number - first]

@@ -62,7 +62,7 @@ def dark_charge(folder: Place, job: Measuring) -> float:
         return 0.0
     rate = on_grid(folder, job.shape, ("dark_rate",))[0]
     median, sigma = median_and_sigma(rate)
-    usual = np.abs(rate - median) <= job.limits.hot * sigma
+    usual = np.abs(rate - median) <= job.options.hot_sigma * sigma
     return max(float(rate[usual].mean()), 0.0) * series.exptime if usual.any() else 0.0
 
 

@@ -28,7 +28,6 @@ from pixcal.stages.reduce.electrons import convert_bytes
 from pixcal.stages.reduce.figures_of_merit import characterise
 from pixcal.stages.reduce.flat_survey import noise_above, share_at_zero
 from pixcal.stages.reduce.frame_statistics import (
-    Limits,
     Measuring,
     measure,
     measure_bytes,
@@ -90,7 +89,29 @@ class Reduction:
 
     def noise(self, config: Config) -> dict[str, dict[str, Any]]:
         """What ``reduce.json`` says of gain and read noise."""
-        return _report_noise(self.summary, config, self.gain, self.bounds)
+        summary, gain, fitted = self.summary, self.gain, self.summary.gain
+        noise = summary.noise_measured_e(summary.before_rounding, gain)
+        total = summary.noise_measured_e(summary.read_noise, gain)
+        return {
+            "gain_e_per_adu": {
+                "declared": summary.declared.gain_e_per_adu,
+                "measured": fitted.gain if fitted else None,
+                "error": fitted.error if fitted else None,
+                "chi2_reduced": fitted.chi2_reduced if fitted else None,
+                "levels_adu": list(fitted.levels) if fitted else None,
+                "neighbours": [list(lag) for lag in fitted.neighbours] if fitted else [],
+                "used": gain,
+                "used_from": config.gain,
+            },
+            "read_noise_e": {
+                "declared": summary.declared.read_noise_e,
+                "measured": noise[0] if noise else None,
+                "error": noise[1] if noise else None,
+                "with_rounding": total[0] if total else None,
+                "before_rounding": summary.noise_before_rounding_e(gain),
+                "used": self.bounds.read_noise,
+            },
+        }
 
 
 def reduce_frames(made: Workspace, source: Ingested, config: Config, runtime: Runtime) -> Reduction:
@@ -143,19 +164,8 @@ def _measuring(source: Ingested, config: Config, folder: Place) -> Measuring:
         cut_off={name: noise_above(source.arrays[name]) for name in _cut_off(source)},
         gain=detector.gain_e_per_adu,
         read_noise=max(detector.read_noise_e / detector.gain_e_per_adu, ROUNDING_ADU),
-        limits=_limits(config),
+        options=config,
         writers=statistics_writers(folder, source.shape, len(exposures.flat)),
-    )
-
-
-def _limits(config: Config) -> Limits:
-    return Limits(
-        clip=config.clip_sigma,
-        hot=config.hot_sigma,
-        dead=config.dead_below,
-        bright=config.dead_above,
-        noisy=config.noisy_factor,
-        nonlinear=config.nonlinear_share,
     )
 
 
@@ -182,7 +192,7 @@ def _calibrate(
         floor=gain * ROUNDING_ADU * source.quantum,
         has_rate=source.exposures.has_rate,
         has_flat=bool(source.exposures.flat),
-        limits=_limits(config),
+        options=config,
         writers=calibration_writers(made.folder / "calibration.zarr", source.shape),
     )
     todo = strips(indices(source.shape), STRIP)
@@ -278,33 +288,6 @@ def _dark_lines(mask: ArrayReader, shape: tuple[int, int]) -> list[str]:
                 "border of the detector"
             )
     return said
-
-
-def _report_noise(
-    summary: Summary, config: Config, gain: float, bounds: Bounds
-) -> dict[str, dict[str, Any]]:
-    fitted, noise = summary.gain, summary.noise_measured_e(summary.before_rounding, gain)
-    total = summary.noise_measured_e(summary.read_noise, gain)
-    return {
-        "gain_e_per_adu": {
-            "declared": summary.declared.gain_e_per_adu,
-            "measured": fitted.gain if fitted else None,
-            "error": fitted.error if fitted else None,
-            "chi2_reduced": fitted.chi2_reduced if fitted else None,
-            "levels_adu": list(fitted.levels) if fitted else None,
-            "neighbours": [list(lag) for lag in fitted.neighbours] if fitted else [],
-            "used": gain,
-            "used_from": config.gain,
-        },
-        "read_noise_e": {
-            "declared": summary.declared.read_noise_e,
-            "measured": noise[0] if noise else None,
-            "error": noise[1] if noise else None,
-            "with_rounding": total[0] if total else None,
-            "before_rounding": summary.noise_before_rounding_e(gain),
-            "used": bounds.read_noise,
-        },
-    }
 
 
 def _count_flags(mask: Place, shape: tuple[int, int]) -> dict[str, int]:

@@ -21,6 +21,13 @@ PRIOR_BASELINE = 0.05  # length and direction of the baseline, as a share of its
 PRIOR_TILT = 0.02  # the baseline's tilt out of the detector's plane, as a share of its length
 
 
+def prior_errors(nominal: Geometry) -> F64:
+    """Errors (6,) of a bench's nominal geometry, 1 sigma, mm, in the order of `PARAMETERS`."""
+    length = float(np.hypot(nominal.baseline_x, nominal.baseline_y))
+    plane = [PRIOR_CENTRE_MM, PRIOR_CENTRE_MM, PRIOR_DISTANCE * nominal.distance]
+    return np.array([*plane, PRIOR_BASELINE * length, PRIOR_BASELINE * length, PRIOR_TILT * length])
+
+
 @dataclass(frozen=True)
 class Hyperbolic(FringeShape):
     """Phase ``phase0 + 2 pi / lambda (|r - s_A| - |r - s_B|)``."""
@@ -40,19 +47,12 @@ class Hyperbolic(FringeShape):
     def start(cls, start: Start) -> Self:
         """Fit to the phases and slopes of the tiles, with the priors."""
         nominal = start.nominal
-        length = float(np.hypot(nominal.baseline_x, nominal.baseline_y))
-        sigma = np.array(
-            [PRIOR_CENTRE_MM, PRIOR_CENTRE_MM, PRIOR_DISTANCE * nominal.distance]
-            + [PRIOR_BASELINE * length] * 2
-            + [PRIOR_TILT * length]
-        )
         # The measured fringe vector gives the baseline over the distance at once.
         per_mm = nominal.wavenumber * nominal.pitch / nominal.distance
         first = nominal.vector()
         first[3:5] = np.array(start.k) / per_mm
-        shape = cls(
-            0.0, nominal.with_vector(first), tuple(nominal.vector()), tuple(sigma), start.reference
-        )
+        known = tuple(nominal.vector()), tuple(prior_errors(nominal))
+        shape = cls(0.0, nominal.with_vector(first), *known, start.reference)
         return shape._fit_planes(start)
 
     def _fit_planes(self, start: Start) -> Self:
