@@ -73,7 +73,7 @@ def mark(run: Path, truth: dict[str, Any]) -> dict[str, Any]:
         "noise_off": round(noise / truth["read_noise_e"] - 1, 5),
         "missed": round(float((true & ~mask.ravel()).mean()), 6),
         "false": round(float((mask.ravel() & ~true).mean()), 6),
-    }  # fmt: skip
+    }
 
 
 def _diagnosis(file: Path, causes: list[list[str]] | None) -> dict[str, Any]:

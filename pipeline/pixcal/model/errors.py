@@ -1,5 +1,8 @@
 """Errors that a user can mend: one line that names the file, the key or the option."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class PixcalError(Exception):
     """Anything that the command line reports without a traceback."""
@@ -32,6 +35,17 @@ class DamagedError(InputError):
 
     def __str__(self) -> str:
         return f"{self.args[0]}; {self.advice}"
+
+
+@contextmanager
+def naming(place: str) -> Iterator[None]:
+    """Name the place of an error of the input; what is damaged has a name already."""
+    try:
+        yield
+    except DamagedError:
+        raise
+    except InputError as error:
+        raise InputError(f"{place}: {error}") from error
 
 
 class PlanError(InputError):

@@ -13,7 +13,7 @@ import numpy as np
 
 from pixcal import __version__
 from pixcal.engine.plan import within_memory
-from pixcal.engine.run import Runtime, run_tasks
+from pixcal.engine.run import Runtime
 from pixcal.estimators.frame_series.stability import (
     MAX_DRAWS,
     NO_CURVE,
@@ -37,6 +37,7 @@ from pixcal.stages.allan.batches import (
     region_name,
     sums_of_region,
 )
+from pixcal.stages.steps import run_steps
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import ArrayWriter, create_array, create_group, create_map, write_array
 from pixcal.storage.formats import STAGES
@@ -129,17 +130,10 @@ def _write_maps(
         chunks=(1, *chunks), fill_value=np.nan, attrs={"units": "pixel"},
     )  # fmt: skip
     expected = create_map(folder / "expected", shape, chunks, units="pixel")
-    done = made.journal()
     squares = batches.tiles((0, shape[0], 0, shape[1]), TILES_HIGH)
-    steps = {square: f"{name}:{square[0][0]},{square[1][0]}" for square in squares}
-    squares = [square for square in squares if steps[square] not in done]
-    run_tasks(
-        partial(_maps_task, batches, lengths, adev, expected),
-        squares,
-        runtime,
-        label=f"Allan deviation {name}",
-        done=lambda n, _: made.note(steps[squares[n]]),
-    )
+    steps = {f"{name}:{y[0]},{x[0]}": (y, x) for y, x in squares}
+    task = partial(_maps_task, batches, lengths, adev, expected)
+    run_steps(made, task, steps, runtime, label=f"Allan deviation {name}")
     adev.finish()
     expected.finish()
     frames = np.array(lengths) * batches.frames

@@ -22,7 +22,7 @@ from pixcal import __version__
 from pixcal.estimators.fringe_fit.fringes import HONEST_FRINGES
 from pixcal.model.bench import Bench, load_bench
 from pixcal.model.config import to_plain
-from pixcal.model.errors import InputError
+from pixcal.model.errors import InputError, naming
 from pixcal.model.options import Budget as Config
 from pixcal.report.budget_figures import budget_figure
 from pixcal.report.drawing import png
@@ -58,10 +58,8 @@ def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, 
     own_effects(bench, str(bench_file))
     if not bench.frames.fringes:
         raise InputError(f"{bench_file}: frames.fringes: no fringe sets, nothing to budget")
-    try:
+    with naming(str(bench_file)):
         bound = joined(bench)
-    except InputError as error:
-        raise InputError(f"{bench_file}: {error}") from error
     for scan, s in zip(bench.frames.fringes, bound.sets, strict=True):
         if not np.isfinite(s.loss[0]):
             raise InputError(

@@ -25,7 +25,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels.optics import paraxial_vector
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.config import result_options
-from pixcal.model.errors import DamagedError, InputError
+from pixcal.model.errors import InputError, naming
 from pixcal.model.options import Crests as Config
 from pixcal.report.crest_figures import CrestView, Extract, crest_figure, outermost
 from pixcal.report.drawing import png
@@ -81,13 +81,9 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
                 source = ReducedSet(run_dir / "reduce" / "reduced.zarr" / name)
                 centre = ((source.shape[0] - 1) / 2, (source.shape[1] - 1) / 2)
                 nominal = nominal_geometry(acquisition, name, centre)
-                try:
+                with naming(f"{run_dir}: fringe set {name!r}"):
                     frames, paths = _trace(source, paraxial_vector(nominal), config, runtime)
                     fit = fit_crests(paths, nominal, Prior.of_bench(nominal))
-                except DamagedError:
-                    raise
-                except InputError as error:
-                    raise InputError(f"{run_dir}: fringe set {name!r}: {error}") from error
                 maps = _write_arrays(made.folder / "crests.zarr" / name, paths, fit)
                 picture = crest_figure(_view(source, frames[0], paths, fit, maps))
                 (made.folder / f"crests-{name}.png").write_bytes(png(picture))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.engine.plan import make_plan
+from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.fringe_fit.combine import axes_span_plane, combine_parallel, combine_sets
 from pixcal.estimators.fringe_fit.fringes import wrapped
@@ -72,7 +72,7 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
     most = max(f.n_batches for f in fitted)
     # Of a tile; of all maps of a strip, read, made and written.
     per_pixel = 500 + 60 * len(fitted) + 40 * most + STRIP * len(fitted) * (60 + 20 * most)
-    plan = make_plan("the maps of the fit", pixels * per_pixel, 0, runtime)
+    runtime = within_memory("the maps of the fit", pixels * per_pixel, 0, runtime)
     removed = {f.name: f.fit.basis.removed(f.planes, f.fit.coefficients) for f in fitted}
     # Each tile gets its own part of them: on a cluster they travel with it.
     jobs = {
@@ -82,7 +82,7 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
     every = run_tasks(
         partial(_write_strip, fitted, writers, both),
         [[jobs[at] for at in strip] for strip in source.strips()],
-        runtime.with_workers(plan.workers),
+        runtime,
         label="maps",
     )
     told = [of_tile for of_strip in every for of_tile in of_strip]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.engine.plan import make_plan
+from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, one_blas_thread, run_tasks
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
 from pixcal.estimators.fringe_fit.scout import Scout, in_turn
@@ -78,8 +78,7 @@ def scout_set(
     kept = len(places) * tile_bytes if keep else 0
     what = f"the scout of {name}"
     per_task = (4 if keep else max(4, len(places))) * chunk_bytes
-    plan = make_plan(what, per_task, 3 * PRIME_BYTES + kept, here)
-    here = here.with_workers(plan.workers)
+    here = within_memory(what, per_task, 3 * PRIME_BYTES + kept, here)
     each = partial(run_tasks, runtime=here, label=f"first look at {name}")
     scout = Scout(tiles, source.coding, nominal, ((ny - 1) / 2, (nx - 1) / 2), each)
     lookout = Lookout(source, places, keep)
@@ -92,11 +91,11 @@ def scout_set(
     scout.each = in_turn
     if len(parts[0].g) < source.n_frames:
         # A chunk of each place and what its solution takes.
-        plan = make_plan(what, 3 * len(places) * chunk_bytes, kept, runtime)
+        runtime = within_memory(what, 3 * len(places) * chunk_bytes, kept, runtime)
         parts = run_tasks(
             partial(_solve_block, lookout, scout),
             range(source.n_blocks),
-            runtime.with_workers(plan.workers),
+            runtime,
             label=f"scout {name}",
         )
     g = np.concatenate([p.g for p in parts])

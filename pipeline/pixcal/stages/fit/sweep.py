@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.engine.plan import make_plan
-from pixcal.engine.run import Runtime, run_tasks
+from pixcal.engine.plan import within_memory
+from pixcal.engine.run import Runtime
 from pixcal.estimators.fringe_fit.batches import FrameBatches, plan_batches
 from pixcal.estimators.fringe_fit.fit_flags import fit_flags, usual_chi2
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
@@ -25,11 +25,12 @@ from pixcal.estimators.fringe_fit.tile_sums import Carrier, TileSums, sum_row
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.config import result_options
-from pixcal.model.errors import DamagedError, InputError
+from pixcal.model.errors import InputError, naming
 from pixcal.model.options import Sweep as Config
 from pixcal.stages.fit.scouting import CACHE_BYTES, read_frames, scout_set
 from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.stages.reduced_set import STRIP, ReducedSet
+from pixcal.stages.steps import run_steps
 from pixcal.storage.artefact import Build, Workspace
 from pixcal.storage.cube import (
     ArrayReader,
@@ -68,13 +69,9 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         raise InputError(f"{run_dir}: the acquisition lists no fringes; fit needs frames.fringes")
 
     def body(made: Build) -> None:
-        try:
+        with naming(str(run_dir)):
             cubes = run_dir / "reduce" / "reduced.zarr"
             sets = sweep_sets(made, cubes, acquisition, config, runtime)
-        except DamagedError:
-            raise
-        except InputError as error:
-            raise InputError(f"{run_dir}: {error}") from error
         made.summary = {"sets": sets}
         write_json(made.folder / "sweep.json", made.summary)
 
@@ -90,12 +87,8 @@ def sweep_sets(
     sets = {}
     for name in (listed.name for listed in acquisition.frames.fringes):
         nominal = nominal_vector(acquisition, name)
-        try:
+        with naming(f"fringe set {name!r}"):
             sets[name] = sweep_set(made, ReducedSet(reduced / name), name, nominal, config, runtime)
-        except DamagedError:
-            raise
-        except InputError as error:
-            raise InputError(f"fringe set {name!r}: {error}") from error
     return sets
 
 
@@ -124,8 +117,8 @@ def sweep_set(
     """Sweep one set into ``sweep.zarr/<set name>`` of a build; returns its summary."""
     folder = made.folder / "sweep.zarr" / name
     create_group(folder)
-    done, scouted = made.journal(), folder / "scout.json"
-    if not scouted.exists() or f"{name}:scout {file_digest(scouted)}" not in done:
+    scouted = folder / "scout.json"
+    if not scouted.exists() or f"{name}:scout {file_digest(scouted)}" not in made.journal():
         scout_set(source, nominal, folder, runtime, name)
         made.note(f"{name}:scout {file_digest(scouted)}")
     facts: dict[str, Any] = read_json(scouted)
@@ -143,18 +136,11 @@ def sweep_set(
     held = 2 * min(prime, source.n_frames) + 4 * source.block
     kept = STRIP * (40 + 16 * n_batches)
     per_task = cy * cx * (held + 900 + 24 * n_batches + kept + source.more_bytes)
-    plan = make_plan(f"the fit of {name}", per_task, CACHE_BYTES, runtime)
-    strips = {f"{name}:{strip[0]}": strip for strip in source.strips()}
-    steps = [step for step in strips if step not in done]
+    runtime = within_memory(f"the fit of {name}", per_task, CACHE_BYTES, runtime)
     carrier = Carrier((float(facts["k"][0]), float(facts["k"][1])), frames.reference)
     job = _Job(source, writers, frames, carrier, batches, prime, facts["noise"], config.chi2_limit)
-    run_tasks(
-        partial(_sweep_strip, job),
-        [strips[step] for step in steps],
-        runtime.with_workers(plan.workers),
-        label=f"fit {name}",
-        done=lambda n, _: made.note(steps[n]),
-    )
+    steps = {f"{name}:{strip[0]}": strip for strip in source.strips()}
+    run_steps(made, partial(_sweep_strip, job), steps, runtime, label=f"fit {name}")
     for writer in writers.values():
         writer.finish()
     table = ArrayReader(folder / "tiles").read()

@@ -29,6 +29,7 @@ from pixcal.model.errors import DamagedError, InputError, RemoteError
 from pixcal.model.options import Ingest as Config
 from pixcal.stages.ingest.arrays import FRAMES_A_PIECE, Writers, find_kept, take_over
 from pixcal.stages.ingest.cut_frames import cut_from, cut_warning
+from pixcal.stages.steps import run_steps
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.cube_place import base_of, chosen_base, cubes_of
@@ -266,7 +267,6 @@ def _files(frames: Sequence[Frame]) -> list[FrameFile]:
 class _Piece:
     """A task: some frames, from a border of chunks on; samples are copied in strips of rows."""
 
-    step: str
     writers: Writers
     start: int
     frames: Sequence[Frame]
@@ -276,16 +276,15 @@ class _Piece:
 
 def _pieces(
     array: str, frames: Sequence[Frame], writers: Writers, rows: int, scratch: Path
-) -> Iterator[_Piece]:
-    """Tasks of an array: a block of frames each."""
+) -> Iterator[tuple[str, _Piece]]:
+    """Steps of an array and their tasks: a block of frames each."""
     # Compressed files can only be read whole: blocks that share one are one task.
     borders = [0]
     for t in range(0, len(frames), CHUNK[0] if writers.samples else FRAMES_A_PIECE):
         if t and (frames[t].plane == 0 or frames[t].file.container == "plain"):
             borders.append(t)
     for start, stop in zip(borders, [*borders[1:], len(frames)], strict=True):
-        step = f"{array} {start}:{stop}"
-        yield _Piece(step, writers, start, frames[start:stop], rows, scratch)
+        yield f"{array} {start}:{stop}", _Piece(writers, start, frames[start:stop], rows, scratch)
 
 
 def _fill(
@@ -299,19 +298,11 @@ def _fill(
     scratch = made.scratch
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
-    journal = made.journal()
-    todo: list[_Piece] = []
+    steps: dict[str, _Piece] = {}
     for array, frames in tables.items():
         writers = _writers(made, array, frames, copied[array])
-        pieces = _pieces(array, frames, writers, rows, scratch)
-        todo += [piece for piece in pieces if piece.step not in journal]
-    run_tasks(
-        _write_piece,
-        todo,
-        runtime.with_workers(plan.workers),
-        label="ingest",
-        done=lambda number, _: made.note(todo[number].step),
-    )
+        steps.update(_pieces(array, frames, writers, rows, scratch))
+    run_steps(made, _write_piece, steps, runtime.with_workers(plan.workers), label="ingest")
     shutil.rmtree(scratch, ignore_errors=True)
 
 

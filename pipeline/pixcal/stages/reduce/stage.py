@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.engine.plan import make_plan
+from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.config import result_options
 from pixcal.model.errors import InputError
@@ -130,7 +130,7 @@ def reduce_frames(made: Workspace, source: Ingested, config: Config, runtime: Ru
     job = _measuring(source, config, made.scratch / "statistics")
     width = strip_width(source.arrays.values(), need, runtime)
     least = transit + max(measure_bytes(exposures.dark, exposures.flat, width), convert_bytes(4, 1))
-    runtime = runtime.with_workers(make_plan("reduce", least, _SHARED_BYTES, runtime).workers)
+    runtime = within_memory("reduce", least, _SHARED_BYTES, runtime)
     create_group(made.scratch)
     run_noted(made, partial(measure, job), indices(source.shape), width, runtime, "statistics")
     for writer in job.writers.values():

@@ -27,7 +27,7 @@ from pixcal.model import acquisition as described
 from pixcal.model.arrays import U16
 from pixcal.model.bench import Bench, load_bench
 from pixcal.model.config import to_plain
-from pixcal.model.errors import InputError
+from pixcal.model.errors import InputError, naming
 from pixcal.model.options import Simulate as Config
 from pixcal.model.yaml_file import to_yaml
 from pixcal.simulation.exposure import Camera
@@ -119,10 +119,8 @@ def _checked_effects(bench: Bench, where: Path, own: tuple[Path, ...]) -> Effect
     """Effects of a bench file, which must go together with the bench."""
     found = parse_effects(bench.effects, str(where), known_effects(own))
     for effect in found:
-        try:
+        with naming(f"{where}: effects.{effect.name}"):
             effect.check(bench)
-        except InputError as error:
-            raise InputError(f"{where}: effects.{effect.name}: {error}") from error
     return found
 
 

@@ -1,0 +1,32 @@
+"""Work in steps, of which those that an interrupted build has noted are not done again."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.storage.artefact import Workspace
+
+T = TypeVar("T")
+
+
+def run_steps(
+    made: Workspace,
+    task: Callable[[T], Any],
+    steps: Mapping[str, T],
+    runtime: Runtime,
+    *,
+    label: str,
+) -> None:
+    """Run a task on what each step needs, and note the step when all that it wrote is in place.
+
+    ``steps`` are by their names in the journal; ``label`` names them on stderr.
+    """
+    done = made.journal()
+    names = [name for name in steps if name not in done]
+    run_tasks(
+        task,
+        [steps[name] for name in names],
+        runtime,
+        label=label,
+        done=lambda number, _: made.note(names[number]),
+    )
