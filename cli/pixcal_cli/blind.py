@@ -37,7 +37,7 @@ def blind() -> None:
     MakeConfig,
     "pixcal blind make --cases 10 --seed 1001 --out exam --sealed truth.json",
     "pixcal blind make --cases 100 --bench second --out exam --sealed truth.json",
-    argument=lambda body: out_option(sealed_option(body)),
+    arguments=(out_option, sealed_option),
 )
 def make(folder: Path, sealed: Path, config: MakeConfig, runtime: "Runtime") -> None:
     """The cases."""
@@ -49,7 +49,10 @@ def make(folder: Path, sealed: Path, config: MakeConfig, runtime: "Runtime") -> 
 
 
 @command(
-    RunConfig, "pixcal blind run exam", "pixcal blind run exam --limit 20", argument=cases_argument
+    RunConfig,
+    "pixcal blind run exam",
+    "pixcal blind run exam --limit 20",
+    arguments=[cases_argument],
 )
 def run(folder: Path, config: RunConfig, runtime: "Runtime") -> None:
     """The diagnoses."""
@@ -65,7 +68,7 @@ def run(folder: Path, config: RunConfig, runtime: "Runtime") -> None:
     "pixcal blind score exam --sealed truth.json",
     "pixcal blind score exam --sealed truth.json --oracle 20 --write docs/appendix/blind.md",
     "pixcal blind score exam --sealed truth.json --also exam-2 truth-2.json",
-    argument=lambda body: cases_argument(sealed_option(body)),
+    arguments=(cases_argument, sealed_option),
 )
 def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: "Runtime") -> None:
     """The scores."""

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from pixcal.model.options import Budget
-from pixcal_cli.click_options import PATH, Command, bench_argument, command
+from pixcal_cli.click_options import PATH, bench_argument, command
 from pixcal_cli.printing import Columns, show_notes, show_records
 
 LIMITS = {
@@ -21,26 +21,19 @@ LIMITS = {
 }
 
 
-def bench_and_output(body: Command) -> Command:
-    """BENCH.yaml, and where and how the plan is written."""
-    for option in (
-        click.option("--json", "as_json", is_flag=True, help="Print the contents of budget.json."),
-        click.option(
-            "--out",
-            type=PATH,
-            metavar="DIR",
-            help="Write budget.json and the picture budget.png there.",
-        ),
-    ):
-        body = option(body)
-    return bench_argument(body)
+out_option = click.option(
+    "--out", type=PATH, metavar="DIR", help="Write budget.json and the picture budget.png there."
+)
+json_option = click.option(
+    "--json", "as_json", is_flag=True, help="Print the contents of budget.json."
+)
 
 
 @command(
     Budget,
     "pixcal budget configs/demo.yaml",
     "pixcal budget configs/paper.yaml --precision 5e-4 --frames 10000 --out budget",
-    argument=bench_and_output,
+    arguments=(bench_argument, out_option, json_option),
     tasks=False,
 )
 def budget(bench: Path, config: Budget, out: Path | None, as_json: bool) -> None:

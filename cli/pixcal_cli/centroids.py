@@ -5,19 +5,14 @@ from pathlib import Path
 import click
 
 from pixcal.model.options import Centroids, Wcs
-from pixcal_cli.click_options import PATH, Command, command, run_argument
-
-
-def run_and_table(body: Command) -> Command:
-    """RUN and TABLE."""
-    return run_argument(click.argument("table", metavar="TABLE", type=PATH)(body))
+from pixcal_cli.click_options import PATH, command, run_argument
 
 
 @command(
     Centroids,
     "pixcal centroids demo stars.csv --out corrected.csv --fwhm 2.5",
     "pixcal centroids demo sex.fits --x X_IMAGE --y Y_IMAGE --origin 1 --fwhm 3 --out out.fits",
-    argument=run_and_table,
+    arguments=(run_argument, click.argument("table", metavar="TABLE", type=PATH)),
     tasks=False,
 )
 def centroids(run: Path, table: Path, config: Centroids) -> None:

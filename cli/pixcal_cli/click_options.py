@@ -4,7 +4,7 @@ import functools
 import inspect
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from types import UnionType
@@ -158,7 +158,7 @@ def runtime_options(command: Command) -> Command:
 def command(
     kind: type,
     *lines: str,
-    argument: Callable[[Command], Command] = run_argument,
+    arguments: Sequence[Callable[[Command], Command]] = (run_argument,),
     tasks: bool = True,
 ) -> Callable[[Command], click.Command]:
     """A command of RUN (or another argument) with the options of a dataclass and of how to run.
@@ -170,14 +170,16 @@ def command(
         is the help text.
     *lines : str
         Examples for its help.
-    argument : callable
-        What stands before the options.
+    arguments : sequence of callable
+        What stands before the options, in this order.
     tasks : bool
         Whether it runs tasks, and so has options on how to run.
     """
 
     def decorate(body: Command) -> click.Command:
-        body = argument(config_options(kind)(runtime_options(body) if tasks else body))
+        body = config_options(kind)(runtime_options(body) if tasks else body)
+        for argument in reversed(arguments):
+            body = argument(body)
         name = kind.__name__.removesuffix("Config").lower()
         return click.command(name, help=inspect.getdoc(kind), epilog=examples(*lines))(body)
 

@@ -9,7 +9,7 @@ import click
 
 from pixcal.model.options import Compare
 from pixcal.storage.manifest import read_json
-from pixcal_cli.click_options import PATH, Command, command
+from pixcal_cli.click_options import PATH, command
 from pixcal_cli.printing import Columns, show_notes, show_records, show_table, with_error
 from pixcal_cli.results import perform
 
@@ -17,25 +17,22 @@ if TYPE_CHECKING:
     from pixcal.engine.run import Runtime
 
 
-def runs_and_out(body: Command) -> Command:
-    """The runs, and where the result goes."""
-    out = click.option(
-        "--out",
-        type=PATH,
-        default=Path("compare"),
-        show_default=True,
-        metavar="DIR",
-        help="Directory of compare.json and compare.png.",
-    )
-    runs = click.argument("runs", metavar="RUN [RUN]...", type=PATH, nargs=-1, required=True)
-    return runs(out(body))
+runs_argument = click.argument("runs", metavar="RUN [RUN]...", type=PATH, nargs=-1, required=True)
+out_option = click.option(
+    "--out",
+    type=PATH,
+    default=Path("compare"),
+    show_default=True,
+    metavar="DIR",
+    help="Directory of compare.json and compare.png.",
+)
 
 
 @command(
     Compare,
     "pixcal compare demo",
     "pixcal compare monday tuesday --out repeatability",
-    argument=runs_and_out,
+    arguments=(runs_argument, out_option),
 )
 def compare(runs: tuple[Path, ...], out: Path, config: Compare, runtime: "Runtime") -> None:
     """Runs of the same window."""

@@ -11,7 +11,6 @@ from pixcal.model.errors import InputError
 from pixcal_cli import results
 from pixcal_cli.click_options import (
     PATH,
-    Command,
     acquisition_argument,
     bench_argument,
     command,
@@ -35,12 +34,10 @@ def step(kind: type, *examples: str) -> click.Command:
     return command(kind, *examples)(body)
 
 
-def from_acquisition(body: Command) -> Command:
-    """Of commands that make RUN from ACQ."""
-    return acquisition_argument(out_run_option(body))
+FROM_ACQUISITION = (acquisition_argument, out_run_option)
 
 
-@command(options.Run, "pixcal run data_samples/demo --out demo", argument=from_acquisition)
+@command(options.Run, "pixcal run data_samples/demo --out demo", arguments=FROM_ACQUISITION)
 def run(acquisition: Path, run: Path, config: options.Run, runtime: "Runtime") -> None:
     """All steps."""
     from pixcal.stages import chain  # here: for a fast `pixcal --help`
@@ -53,7 +50,7 @@ def run(acquisition: Path, run: Path, config: options.Run, runtime: "Runtime") -
     options.Ingest,
     "pixcal ingest data_samples/demo --out demo",
     "pixcal ingest data_samples/demo --out demo --copy --cubes s3://bucket/cubes",
-    argument=from_acquisition,
+    arguments=FROM_ACQUISITION,
 )
 def ingest(acquisition: Path, run: Path, config: options.Ingest, runtime: "Runtime") -> None:
     """From ACQ to RUN."""
@@ -102,16 +99,13 @@ def effect_list(text: str) -> tuple[str, ...]:
     return names
 
 
-def run_and_effects(body: Command) -> Command:
-    """RUN, and the effects to consider."""
-    effects = click.option(
-        "--effects",
-        "chosen",
-        type=effect_list,
-        metavar="NAMES",
-        help="Candidate effects, comma-separated; -NAME leaves one out. [default: all]",
-    )
-    return run_argument(effects(body))
+effects_option = click.option(
+    "--effects",
+    "chosen",
+    type=effect_list,
+    metavar="NAMES",
+    help="Candidate effects, comma-separated; -NAME leaves one out. [default: all]",
+)
 
 
 @command(
@@ -119,7 +113,7 @@ def run_and_effects(body: Command) -> Command:
     "pixcal diagnose demo",
     "pixcal diagnose demo --effects lag,ipc",
     "pixcal diagnose demo --effects=-telegraph_noise --own my_effect.py",
-    argument=run_and_effects,
+    arguments=(run_argument, effects_option),
 )
 def diagnose(
     run: Path, chosen: tuple[str, ...] | None, config: options.Diagnose, runtime: "Runtime"
@@ -136,24 +130,21 @@ def diagnose(
 report = step(options.Report, "pixcal report demo")
 
 
-def bench_and_acquisition(body: Command) -> Command:
-    """BENCH.yaml, and where the acquisition goes."""
-    out = click.option(
-        "--out",
-        "acquisition",
-        metavar="ACQ",
-        required=True,
-        type=PATH,
-        help="Directory of the acquisition; created if missing.",
-    )
-    return bench_argument(out(body))
+acquisition_option = click.option(
+    "--out",
+    "acquisition",
+    metavar="ACQ",
+    required=True,
+    type=PATH,
+    help="Directory of the acquisition; created if missing.",
+)
 
 
 @command(
     options.Simulate,
     "pixcal simulate configs/demo.yaml --out acquisition",
     "pixcal simulate bench.yaml --out acquisition --own glow.py",
-    argument=bench_and_acquisition,
+    arguments=(bench_argument, acquisition_option),
 )
 def simulate(bench: Path, acquisition: Path, config: options.Simulate, runtime: "Runtime") -> None:
     """From BENCH.yaml to ACQ."""

@@ -8,8 +8,8 @@ from pixcal.model.config import to_plain
 from pixcal.stages import fit, reduce
 from pixcal.stages.diagnose.parts import Raw
 from pixcal.stages.evidence import load_evidence
-from pixcal.stages.ingest.arrays import create, finish
 from pixcal.storage.artefact import build
+from pixcal.storage.cube import create_array
 from pixcal.storage.manifest import write_json
 
 
@@ -19,9 +19,10 @@ def evidence_on_disk(raw: Raw, folder: Path) -> Evidence:
     with build(folder, "ingest", 1, {}, {}) as made:
         facts = {}
         for name, frames in raw.arrays.items():
-            writer = create(made.cubes, name, frames.shape, frames.dtype)
+            writer = create_array(made.cubes / "raw.zarr" / name, frames.shape, frames.dtype)
             writer.write((0, 0, 0), frames)
-            facts[name] = finish(writer) | {"files": 1}
+            writer.finish()
+            facts[name] = {"shape": frames.shape, "dtype": frames.dtype.name, "files": 1}
         write_json(made.folder / "acquisition.json", to_plain(raw.acquisition))
         write_json(made.folder / "frames.json", raw.tables)
         made.summary.update(arrays=facts, warnings=[])

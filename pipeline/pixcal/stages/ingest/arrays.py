@@ -30,28 +30,18 @@ from pixcal.storage.sources import SourceFile
 FRAMES_A_PIECE = 16  # frames that one task catalogues: a chunk of the catalogue
 
 
-def create(cubes: Place, array: str, shape: Sequence[int], dtype: Any) -> ArrayWriter:
-    """Create an array (time, y, x) among the cubes of an artefact, in ADU, or reopen it."""
-    _create_groups(cubes / "raw.zarr", array)
-    return create_array(cubes / "raw.zarr" / array, shape, dtype, attrs={"units": "adu"})
-
-
 def _create_groups(store: Place, array: str) -> None:
     create_group(store)
     if "/" in array:
         create_group(store / array.split("/")[0])
 
 
-def finish(writer: ArrayWriter) -> dict[str, Any]:
-    """Close an array: shape, type and digest; DamagedError if a chunk is missing or cut."""
+def _finish(writer: ArrayWriter) -> str:
+    """Close an array; its digest, DamagedError if a chunk is missing or cut."""
     index = writer.finish()
     content = hashlib.sha256(repr((writer.shape, writer.dtype.str)).encode())
     content.update(index.tobytes())
-    return {
-        "shape": list(writer.shape),
-        "dtype": writer.dtype.name,
-        "digest": content.hexdigest()[:32],
-    }
+    return content.hexdigest()[:32]
 
 
 @dataclass(frozen=True)
@@ -76,7 +66,11 @@ class Writers:
             dims=("time", "band", "fact"), chunks=(FRAMES_A_PIECE, *facts),
             attrs={"fact": list(FACTS.values())},
         )  # fmt: skip
-        samples = create(made.cubes, array, shape, dtype) if copied else None
+        samples = None
+        if copied:
+            cubes = made.cubes / "raw.zarr"
+            _create_groups(cubes, array)
+            samples = create_array(cubes / array, shape, dtype, attrs={"units": "adu"})
         return cls(catalogue, samples, tuple(shape), str(dtype))
 
     def finish(self) -> dict[str, Any]:
@@ -86,7 +80,7 @@ class Writers:
             "shape": list(self.shape),
             "dtype": self.dtype,
             "copied": self.samples is not None,
-            "digest": digest([finish(writer)["digest"] for writer in parts]),
+            "digest": digest([_finish(writer) for writer in parts]),
         }
 
 

@@ -76,7 +76,9 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
             _refuse_other(out, earlier, plain, inputs)
 
         def keep(ready: Manifest) -> bool:
-            return base_of(out / STAGE.name) == base and _has_copies(ready, config.copy)
+            arrays = ready.summary["arrays"].values()
+            copied = not config.copy or all(facts["copied"] for facts in arrays)
+            return base_of(out / STAGE.name) == base and copied
 
         def body(made: Build) -> None:
             kept = []
@@ -86,7 +88,9 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
             known = {k.array: k.files for k in kept if k.array in facts}
             tables, warnings = _check(described, sources, known, runtime)
             copied = {
-                array: facts[array]["copied"] if array in facts else _needs_copy(frames, config)
+                array: facts[array]["copied"]
+                if array in facts
+                else config.copy or any(frame.file.container != "plain" for frame in frames)
                 for array, frames in tables.items()
             }
             _fill(made, {a: f for a, f in tables.items() if a not in known}, copied, runtime)
@@ -95,14 +99,6 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
 
         make(out, STAGE, plain, inputs, body, cubes=base, keep=keep)
         return _place(out, description.parent)
-
-
-def _has_copies(manifest: Manifest, copy: bool) -> bool:
-    return not copy or all(facts["copied"] for facts in manifest.summary["arrays"].values())
-
-
-def _needs_copy(frames: Sequence[Frame], config: Config) -> bool:
-    return config.copy or any(file.container != "plain" for file in _files(frames))
 
 
 def _place(out: Path, folder: Path) -> Manifest:
