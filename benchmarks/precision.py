@@ -12,29 +12,13 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime
 from pixcal.stages import fit, ingest, reduce, simulate
 from pixcal.storage.products import read_map
+from reproduction.maps import harmonics, plane, without
 
-F64 = NDArray[np.float64]
 ROOT = Path(__file__).parents[1]
-
-
-def modes(shape: tuple[int, int], facts: dict[str, float]) -> F64:
-    """Piston, slopes, and the fringe and its harmonic: (mode, y, x)."""
-    y, x = np.mgrid[: shape[0], : shape[1]]
-    psi = facts["kx"] * x + facts["ky"] * y
-    linear = [np.ones(shape), x / shape[1], y / shape[0]]
-    return np.stack([*linear, np.cos(psi), np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)])
-
-
-def without(error: F64, basis: F64) -> F64:
-    """A map less what the modes explain of it; NaN stay NaN."""
-    good = np.isfinite(error)
-    found = np.linalg.lstsq(basis[:, good].T, error[good], rcond=None)[0]
-    return np.asarray(error - np.tensordot(found, basis, 1))
 
 
 def main() -> None:
@@ -67,7 +51,8 @@ def main() -> None:
             )
             data, sigma, _, _ = read_map(run / "products" / f"{product}.fits")
             along = facts["axis"][0] * truth["delta_x"] + facts["axis"][1] * truth["delta_y"]
-            error = without(data - along, modes(along.shape, facts))
+            lost = [plane(along.shape), harmonics(along.shape, (facts["kx"], facts["ky"]))]
+            error = without(data - along, np.concatenate(lost))
             rms = float(np.nanstd(error))
             bound = facts["crb_median_px"]
             print(
