@@ -8,7 +8,7 @@ import pytest
 
 from pixcal.effects import parse_effects
 from pixcal.engine.run import Runtime
-from pixcal.kernels.optics import interfringe
+from pixcal.kernels.optics import interfringe, paraxial_vector
 from pixcal.kernels.scene import geometry
 from pixcal.model.bench import Bench, load_bench
 from reproduction import (
@@ -54,7 +54,9 @@ def only(bench: Bench, *names: str) -> Bench:
 def test_a_bench_of_the_paper_is_what_it_says(file: Path) -> None:
     bench = load_bench(file)
     parse_effects(bench.effects, str(file))
-    found = [interfringe(geometry(bench, n)) for n in range(len(bench.frames.fringes))]
+    found = [
+        interfringe(paraxial_vector(geometry(bench, n))) for n in range(len(bench.frames.fringes))
+    ]
     assert found == pytest.approx(INTERFRINGES[file.stem], abs=1e-3)
     assert bench.detector.pitch_um == 4.4
     assert all(s.count % bench.frames.per_file == 0 for s in bench.frames.fringes)

@@ -85,9 +85,9 @@ def paraxial_phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> F64:
     return result
 
 
-def interfringe(geometry: Geometry) -> float:
-    """Spatial period of the fringes in px, in the paraxial limit."""
-    return float(2 * np.pi / np.hypot(*paraxial_vector(geometry)))
+def interfringe(k: tuple[float, float]) -> float:
+    """Period (px) of fringes of a vector (kx, ky), rad/px."""
+    return float(2 * np.pi / np.hypot(*k))
 
 
 def fringe_vector(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[F64, F64]:

@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 from scipy.ndimage import maximum_filter
 
+from pixcal.kernels.optics import interfringe
 from pixcal.kernels.robust import median
 from pixcal.model.arrays import C128, F32, F64, Mask
 from pixcal.model.errors import InputError
@@ -86,8 +87,8 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
     """
     if max(map(abs, nominal)) * SHORTEST_PX > 2 * np.pi:
         raise InputError(
-            f"baseline_mm and optics give a fringe period of {2 * np.pi / np.hypot(*nominal):.2g} "
-            f"px, below {SHORTEST_PX:g} px along x or y; correct the numbers, or "
+            f"baseline_mm and optics give a fringe period of {interfringe(nominal):.2g} px, "
+            f"below {SHORTEST_PX:g} px along x or y; correct the numbers, or "
             "use a shorter baseline"
         )
     shape = maps.shape[1:]

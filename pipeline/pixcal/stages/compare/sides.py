@@ -33,6 +33,12 @@ Vector = tuple[float, float]
 PART_OF = 1e-3  # a set whose share in a direction is below this brings no modes of its own there
 
 
+def _middle(tile: Tile) -> Vector:
+    """(y, x), px."""
+    (y0, y1), (x0, x1) = tile
+    return (y0 + y1 - 1) / 2, (x0 + x1 - 1) / 2
+
+
 @dataclass(frozen=True)
 class ComparedSet:
     """One fringe set of a fitted run."""
@@ -42,15 +48,9 @@ class ComparedSet:
     shape: FringeShape  # of the fringes, as fitted
     batches: tuple[int, ...] | None = None  # those that count; None for the whole run
 
-    def vector(self, tile: Tile) -> Vector:
-        """Fringe vector (kx, ky) at the middle of a tile, rad/px."""
-        (y0, y1), (x0, x1) = tile
-        return self.shape.vector((y0 + y1 - 1) / 2, (x0 + x1 - 1) / 2)
-
     def axis(self, tile: Tile) -> Vector:
-        """Unit vector along which the set measures."""
-        kx, ky = self.vector(tile)
-        return kx / float(np.hypot(kx, ky)), ky / float(np.hypot(kx, ky))
+        """Unit vector along which the set measures, at the middle of a tile."""
+        return self.shape.axis(*_middle(tile))
 
     def delta(self, tile: Tile) -> tuple[F64, F64]:
         """Offset along the axis and its error (y, x), px; NaN where there is none."""
@@ -71,7 +71,7 @@ class ComparedSet:
         ratio = float(np.median(iota[lit] / alpha[lit])) if lit.any() else 1.0
         gauge = fringe_modes(self.shape.phase(y, x), np.asarray(ratio))
         both = np.concatenate([self.shape.modes(y, x), np.stack(gauge)])
-        return np.asarray(both / np.hypot(*self.vector(tile)))
+        return np.asarray(both / np.hypot(*self.shape.vector(*_middle(tile))))
 
     def _map(self, name: str, tile: Tile) -> F64:
         return ArrayReader(self.folder / name).read(*tile).astype(float)

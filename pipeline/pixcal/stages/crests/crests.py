@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.fringes import find_fringe_vector
+from pixcal.kernels.optics import interfringe
 from pixcal.model.arrays import F64, I64, Mask
 from pixcal.model.errors import InputError
 from pixcal.stages.crests.windows import (
@@ -64,7 +65,7 @@ class CrestPaths:
     @property
     def interfringe(self) -> float:
         """At the frame's centre, px."""
-        return float(2 * np.pi / np.hypot(*self.vector))
+        return interfringe(self.vector)
 
     @property
     def sigma_px(self) -> F64:
@@ -97,7 +98,7 @@ def seed_vector(patch: NDArray[Any], good: Mask, nominal: Vector) -> Vector:
     maps = np.where(good, patch, level).astype(np.float64)[None] / level - 1
     k = find_fringe_vector(maps, good, nominal)
     if np.hypot(k[0] - nominal[0], k[1] - nominal[1]) > MAX_AWAY * np.hypot(*nominal):
-        measured, expected = (2 * np.pi / np.hypot(*v) for v in (k, nominal))
+        measured, expected = interfringe(k), interfringe(nominal)
         raise InputError(
             f"no fringes found near the nominal ones: the strongest period is {measured:.1f} px, "
             f"at {np.degrees(np.arctan2(k[1], k[0])):.0f} degrees from x, where baseline_mm gives "

@@ -14,7 +14,6 @@ from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.fringe_fit.combine import axes_span_plane, combine_parallel, combine_sets
 from pixcal.estimators.fringe_fit.fringes import wrapped
-from pixcal.estimators.fringe_fit.models import FringeShape
 from pixcal.estimators.fringe_fit.tile_sums import local_modes
 from pixcal.model.arrays import F32, F64, U8
 from pixcal.stages.fit.fringe_set import FittedSet
@@ -62,7 +61,7 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
     """Write ``fit.zarr``: the maps of each set, and those that all sets give together."""
     source = fitted[0].source
     ny, nx = source.shape
-    both = axes_span_plane([axis(f.shape, ny / 2, nx / 2) for f in fitted])
+    both = axes_span_plane([f.shape.axis(ny / 2, nx / 2) for f in fitted])
     outputs = outputs_of(both)
     create_group(group)
     writers = _create_joint(group, fitted[0], outputs)
@@ -177,7 +176,7 @@ def _maps_of_tile(
     )
     masks = np.stack([m.flags for m in found])
     # Hyperbolic fringes turn over the window: each tile has its own axes.
-    axes = [axis(f.shape, (y[0] + y[1] - 1) / 2, (x[0] + x[1] - 1) / 2) for f in fitted]
+    axes = [f.shape.axis((y[0] + y[1] - 1) / 2, (x[0] + x[1] - 1) / 2) for f in fitted]
     value, error, chi2 = (combine_sets if both else combine_parallel)(axes, delta, sigma)
     values, errors = (v.reshape(-1, *chi2.shape).astype(np.float32) for v in (value, error))
     missing = ~np.isfinite(values).all(axis=0)
@@ -300,10 +299,3 @@ def outputs_of(both: bool) -> tuple[str, ...]:
 def _some(values: F32, number: int) -> F32:
     """About a number of many values, evenly; a copy, lest they all stay in memory."""
     return values[:: max(1, len(values) // number)].copy()
-
-
-def axis(shape: FringeShape, y: float, x: float) -> tuple[float, float]:
-    """Unit vector (x, y) along which a set measures at a point."""
-    kx, ky = shape.vector(y, x)
-    k = float(np.hypot(kx, ky))
-    return kx / k, ky / k

@@ -5,8 +5,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels import optics, synthesis
 from pixcal.kernels.scene import DetectorMaps, Rows, geometry
@@ -67,7 +65,7 @@ def _set_truth(bench: Bench, effects: Effects, recording: Recording) -> dict[str
         "baseline_mm": [g.baseline_x, g.baseline_y, g.baseline_z],
         "distance_mm": g.distance,
         "wavelength_nm": bench.optics.wavelength_nm,
-        "interfringe_px": float(2 * np.pi / np.hypot(kx, ky)),
+        "interfringe_px": optics.interfringe((float(kx), float(ky))),
         "kx": float(kx),
         "ky": float(ky),
         "electrons": recording.electrons,

@@ -72,6 +72,12 @@ class FringeShape(ABC):
     def vector(self, y: float, x: float) -> tuple[float, float]:
         """Local fringe vector (kx, ky), rad/px."""
 
+    def axis(self, y: float, x: float) -> tuple[float, float]:
+        """Unit vector (x, y) along which offsets are measured at a point."""
+        kx, ky = self.vector(y, x)
+        k = float(np.hypot(kx, ky))
+        return kx / k, ky / k
+
     def facts(self, covariance: F64) -> dict[str, Any]:
         """Parameters with 1-sigma errors in natural units, for ``fit.json``.
 
