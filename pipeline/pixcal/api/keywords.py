@@ -40,17 +40,12 @@ def function_of(
 
     Parameters
     ----------
-    kind : type
-        Of the options; its docstring says what the command does.
-    name : str
-        Of the function.
-    body : callable
-        Called by keywords, ``options`` and ``runtime`` among them. Parameters after ``options``
-        can only be given by name.
-    fails : str
-        When the function raises InputError.
-    returns : str
-        What it returns, where that is not simply the run.
+    kind : of the options; its docstring says what the command does
+    name : of the function
+    body : called by keywords, ``options`` and ``runtime`` among them; parameters after ``options``
+        can only be given by name
+    fails : when the function raises InputError
+    returns : what it returns, where that is not simply the run
     """
     declared, hints = inspect.signature(body), get_type_hints(kind)
     options, names = {f.name: f for f in fields(kind)}, list(declared.parameters)

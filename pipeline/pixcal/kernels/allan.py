@@ -30,8 +30,7 @@ def allan_deviation(series: NDArray[np.floating], lengths: Sequence[int]) -> F64
 
     Parameters
     ----------
-    series : (batch, pixel) float
-        Evenly spaced in time; NaN where there is no batch.
+    series : (batch, pixel) evenly spaced in time; NaN where there is no batch
     lengths : averaging lengths, batches
 
     Returns

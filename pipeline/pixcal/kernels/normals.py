@@ -41,21 +41,10 @@ _TURN = np.float32(2 * math.pi / 2**32)
 
 
 def pixel_normals(key: Key, frame: int, rows: tuple[int, int], columns: int) -> F32:
-    """Two independent arrays of standard normals for some rows of the window.
+    """Two independent arrays (2, y, x) of standard normals for some rows of the window.
 
-    Parameters
-    ----------
-    key : (int, int)
-        Other keys give other numbers.
-    frame : int
-    rows : (int, int)
-        First row and the one after the last; any rows give the same numbers.
-    columns : int
-        Width of the window.
-
-    Returns
-    -------
-    (2, y, x) float32
+    Other keys give other numbers. ``rows``: the first and the one after the last; a row has the
+    same numbers whatever the others are. ``columns``: width of the window.
     """
     first, last = rows[0] // 2, -(-rows[1] // 2)
     pairs = np.empty((2, last - first, 2, columns), np.float32)

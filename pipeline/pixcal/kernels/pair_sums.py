@@ -27,13 +27,10 @@ def pair_sums(
 
     Parameters
     ----------
-    residual, variance, charge : (t, y, x) float32
-        Pairs of which one residual is zero have no weight.
-    shared : two (t, y, x) float32
-        At the first pixel of each pair.
-    covariance, of_place : (t, j, j) float32, (j, y, x) float32
-        Of the functions of place that each frame was free to have: what they took off the product
-        of two residuals is put back.
+    residual, variance, charge : (t, y, x) float32; pairs of which a residual is zero have no weight
+    shared : two (t, y, x) float32, at the first pixel of each pair
+    covariance, of_place : (t, j, j), (j, y, x) float32 of the functions of place that each frame
+        was free to have: what they took off the product of two residuals is put back
     step : rows (not negative) and columns to the second pixel
     margin : pixels along the edges that are not used
     """

@@ -103,19 +103,13 @@ def encode(
 
     Parameters
     ----------
-    raw : (t, y, at least x0 + x) real
-        ADU; the tile's columns begin at ``x0``: a copy of them
-        would take as long as this.
-    slope, start, dark : (y, x) float32
-        From `coefficients`.
-    exptime : (t,) float32
-        Seconds.
-    saturation : float32
-        ADU; samples at or above it get `FILL`, as do those out of range.
-    codes : (t, y, x) uint16
-        Written.
-    saturated, lost : (y, x) uint32
-        Added to: saturated samples; others without weight.
+    raw : (t, y, at least x0 + x) samples, ADU; the tile's columns begin at ``x0``: a copy of them
+        would take as long as this
+    slope, start, dark : (y, x) float32 from `coefficients`
+    exptime : (t,) float32 exposure times, s
+    saturation : level (ADU, float32) at or above which samples get `FILL`, as do those out of range
+    codes : (t, y, x) uint16, written
+    saturated, lost : (y, x) uint32, added to: saturated samples; others without weight
     """
     total = 0
     nx = codes.shape[2]

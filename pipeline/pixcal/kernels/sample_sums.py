@@ -26,12 +26,9 @@ def calm_residuals(
 
     Returns
     -------
-    calm, kept : (t, y, x) float32
-        Zero for outliers, for NaN and in pixels that are not good.
-    variance : (t,) float64
-        Mean over the good pixels.
-    beyond : (2, n) float64
-        How many residuals of good pixels are below and above each limit.
+    calm, kept : (t, y, x) float32, zero for outliers, for NaN and in pixels that are not good
+    variance : (t,) float64 mean over the good pixels
+    beyond : (2, n) float64 residuals of good pixels that are below and above each limit
     """
     # Not in compiled code, where large arrays come without huge pages: that takes as long again.
     calm, kept = np.empty_like(samples), np.empty_like(samples)

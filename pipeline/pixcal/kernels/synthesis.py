@@ -94,13 +94,11 @@ def illuminate(
 
     Parameters
     ----------
-    iota, alpha_sin, alpha_cos : (y, x) float32
-        e-; alpha times sin psi and cos psi.
+    iota, alpha_sin, alpha_cos : (y, x) float32 mean; alpha times sin psi and cos psi, e-
     level, amplitude : B and A of the frame
     column_turn, row_turn : (2, x), (2, y) float32, cos and sin of the frame's phase: phi and what
         grows along y in the rows, what grows along x in the columns
-    out : (y, x) float32
-        e-.
+    out : (y, x) float32 electrons, written
     """
     b, a = np.float32(level), np.float32(amplitude)
     for i in range(out.shape[0]):

@@ -70,10 +70,8 @@ def tabulate(
 
     Returns
     -------
-    list of Frame
-        In the order of time.
-    list of str
-        Sentences on what is odd about the times.
+    frames, in the order of time
+    sentences on what is odd about the times
     """
     ordered, stamped, warnings = _order(files)
     # No frame is over before its exposure: darks are longer than the pace of the fringes.

@@ -28,12 +28,9 @@ def combine_sets(
 
     Returns
     -------
-    xy : (2, ...) float64
-        delta_x and delta_y, px; NaN where the sets left do not give both.
-    sigma_xy : (2, ...) float64
-        Their errors.
-    chi2 : (...) float64
-        Disagreement of the sets, for ``sets - 2`` degrees of freedom (0 with two).
+    (2, ...) float64 delta_x and delta_y, px; NaN where the sets left do not give both
+    (2, ...) float64 their errors, px
+    (...) float64 disagreement of the sets, for ``sets - 2`` degrees of freedom (0 with two)
     """
     a = np.asarray(axes, float).reshape(len(delta), 2, *([1] * (delta.ndim - 1)))
     good = np.isfinite(delta) & np.isfinite(sigma) & (sigma > 0)
