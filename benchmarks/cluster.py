@@ -38,21 +38,11 @@ PREFIX = "pixcal"
 
 @dataclass
 class Host:
-    """One machine of the cluster.
+    """One machine of the cluster."""
 
-    Attributes
-    ----------
-    address : str
-        Where it listens.
-    prefix : sequence of str
-        What runs a command there.
-    unplug : callable
-        Takes it off the network.
-    """
-
-    address: str
-    prefix: Sequence[str] = ()
-    unplug: Callable[[], object] = lambda: None
+    address: str  # where it listens
+    prefix: Sequence[str] = ()  # what runs a command there
+    unplug: Callable[[], object] = lambda: None  # takes it off the network
     processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     def start(self, *command: str, quiet: bool = True) -> subprocess.Popen[bytes]:

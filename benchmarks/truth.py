@@ -17,21 +17,11 @@ PLANE = 3
 
 @dataclass(frozen=True)
 class Truth:
-    """What the simulator knows of the offsets along a set's fringe axis.
+    """What the simulator knows of the offsets along a set's fringe axis."""
 
-    Attributes
-    ----------
-    delta : (y, x) float64
-        Offsets along the fringe axis, px.
-    vector : (float, float)
-        True fringe vector (kx, ky), rad/px.
-    bound : float
-        Cramér-Rao bound of an offset, px, rms over the pixels.
-    """
-
-    delta: F64
-    vector: tuple[float, float]
-    bound: float
+    delta: F64  # (y, x) offsets along the fringe axis, px
+    vector: tuple[float, float]  # true fringe vector (kx, ky), rad/px
+    bound: float  # Cramér-Rao bound of an offset, px, rms over the pixels
 
     @classmethod
     def read(cls, folder: Path, name: str) -> "Truth":
@@ -79,11 +69,9 @@ class Truth:
 
         Parameters
         ----------
-        offsets : (y, x) float64
-            Offsets along the fringe axis, px; NaN where there are none.
-        modes : int, optional
-            How many of the seven modes of the physics note's section 2 are taken off: the first
-            ``PLANE``, or all.
+        offsets : (y, x) offsets along the fringe axis, px; NaN where there are none
+        modes : how many of the seven modes of the physics note's section 2 are taken off: the first
+            ``PLANE``, or all
         """
         good = np.isfinite(offsets)
         y, x = np.nonzero(good)
@@ -103,18 +91,12 @@ def phase_bound(
 
     Parameters
     ----------
-    iota : (p,) float64
-        Mean light, e-.
-    visibility : float
-        alpha / iota.
-    psi : (p,) float64
-        Phase, rad.
-    level, amplitude : (t,) float64
-        B and A of the frames.
-    turn : (p, t) float64
-        phi of the frames at the pixels, rad.
-    noise : (p,) float64
-        Variance without the shot noise of the light, e-².
+    iota : (p,) mean light, e-
+    visibility : alpha / iota
+    psi : (p,) phase, rad
+    level, amplitude : (t,) B and A of the frames
+    turn : (p, t) phi of the frames at the pixels, rad
+    noise : (p,) variance without the shot noise of the light, e-²
     """
     wave, slope = np.sin(psi[:, None] + turn), np.cos(psi[:, None] + turn)
     alpha = visibility * iota[:, None]

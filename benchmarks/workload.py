@@ -63,20 +63,11 @@ def weighted_sums(source: ReducedSet) -> Callable[[NDArray[np.uint16]], None]:
 
 @dataclass(frozen=True)
 class Workload:
-    """A simulated acquisition of one or two sets, and the run made from it.
+    """A simulated acquisition of one or two sets, and the run made from it."""
 
-    Attributes
-    ----------
-    folder : Path
-        Its own; holds ``acq`` and ``run``.
-    shape : (int, int)
-        Rows and columns.
-    frames, sets : int
-        Frames of each set; one set or two, of crossed axes.
-    """
-
-    folder: Path
-    shape: tuple[int, int]
+    folder: Path  # its own; holds ``acq`` and ``run``
+    shape: tuple[int, int]  # rows and columns
+    # frames, sets: frames of each set; one set or two, of crossed axes
     frames: int
     sets: int = 1
 
@@ -145,10 +136,8 @@ class Workload:
 
         Parameters
         ----------
-        threads : int
-        weighted : bool
-            Add them as the fit does, each sample with its weight, by the fit's own kernel: what no
-            fit can do without.
+        weighted : add them as the fit does, each sample with its weight, by the fit's own kernel:
+            what no fit can do without
         """
 
         def part(number: int) -> None:

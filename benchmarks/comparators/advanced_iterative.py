@@ -33,12 +33,8 @@ def fit_phases(
 
     Parameters
     ----------
-    cube : (t, y, x) float64
-        Frames, e-.
-    vector : (float, float)
-        Nominal fringe vector (kx, ky), rad/px.
-    tolerance_rad : float
-    max_iterations : int
+    cube : (t, y, x) frames, e-
+    vector : nominal fringe vector (kx, ky), rad/px
 
     Returns
     -------

@@ -28,13 +28,10 @@ def fit_phases(
 
     Parameters
     ----------
-    cube : (t, y, x) float64
-        Frames, e-.
-    vector : (float, float)
-        Nominal fringe vector (kx, ky), rad/px; right to a fraction of a fringe across the window.
-    constant : bool
-        Set B and A to their means from the second iteration on.
-    iterations : int
+    cube : (t, y, x) frames, e-
+    vector : nominal fringe vector (kx, ky), rad/px; right to a fraction of a fringe across the
+        window
+    constant : set B and A to their means from the second iteration on
 
     Returns
     -------

@@ -22,10 +22,8 @@ def demodulate(cube: F64, vector: tuple[float, float]) -> F64:
 
     Parameters
     ----------
-    cube : (t, y, x) float64
-        Frames, e-.
-    vector : (float, float)
-        Nominal fringe vector (kx, ky), rad/px.
+    cube : (t, y, x) frames, e-
+    vector : nominal fringe vector (kx, ky), rad/px
 
     Returns
     -------
@@ -63,16 +61,11 @@ def fit_phases(
 
     Parameters
     ----------
-    cube : (t, y, x) float64
-        Frames, e-.
-    vector : (float, float)
-        Nominal fringe vector (kx, ky), rad/px.
-    frames : (3, t) float64
-        From `demodulate`.
-    chosen : (y, x) bool
-        Pixels to fit.
-    read_noise : float
-        e- rms.
+    cube : (t, y, x) frames, e-
+    vector : nominal fringe vector (kx, ky), rad/px
+    frames : (3, t) from `demodulate`
+    chosen : (y, x) pixels to fit
+    read_noise : e- rms
 
     Returns
     -------

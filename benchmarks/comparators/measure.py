@@ -30,55 +30,30 @@ PIXCAL = "pixcal fit"
 
 @dataclass(frozen=True)
 class Task:
-    """What a method is given.
+    """What a method is given."""
 
-    Attributes
-    ----------
-    run : Path
-        A run that has been reduced.
-    name : str
-        Of the fringe set.
-    vector : (float, float)
-        Nominal fringe vector, rad/px.
-    read_noise : float
-        e- rms.
-    pixels : int
-        How many pixels are fitted by the method that takes them one by one.
-    """
-
-    run: Path
-    name: str
-    vector: tuple[float, float]
-    read_noise: float
-    pixels: int
+    run: Path  # that has been reduced
+    name: str  # of the fringe set
+    vector: tuple[float, float]  # nominal fringe vector, rad/px
+    read_noise: float  # e- rms
+    pixels: int  # how many pixels are fitted by the method that takes them one by one
 
 
 @dataclass(frozen=True)
 class Result:
-    """One go of a method.
+    """One go of a method."""
 
-    Attributes
-    ----------
-    seconds : float
-        From the reduced cube on disk to the phases of all pixels.
-    reading : float
-        Of it, until all frames are in memory as float64; 0 where a method reads as it goes.
-    phase : (y, x) float64, optional
-        rad, NaN where not fitted; None where the run's products have the map.
-    """
-
-    seconds: float
+    seconds: float  # from the reduced cube on disk to the phases of all pixels
+    # of it, until all frames are in memory as float64; 0 where a method reads as it goes
     reading: float
+    # (y, x) rad, NaN where not fitted; None where the run's products have the map
     phase: F64 | None
 
 
 def read_cube(task: Task) -> F64:
     """Frames (t, y, x) in electrons, as a user of zarr reads them.
 
-    Raises
-    ------
-    ValueError
-        If samples are missing, which the comparators know nothing of.
+    Raises ValueError if samples are missing, which the comparators know nothing of.
     """
     stored = zarr.open_array(task.run / "reduce" / "reduced.zarr" / task.name / "signal", mode="r")
     codes, attrs = np.asarray(stored[:]), dict[str, Any](stored.attrs)

@@ -11,18 +11,10 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Outcome:
-    """What came of one kind of fault.
+    """What came of one kind of fault."""
 
-    Attributes
-    ----------
-    fault : str
-        What was done, without the step or the artefact that it was done to.
-    ends : Counter
-        How often it ended how.
-    """
-
-    fault: str
-    ends: Counter[str] = field(default_factory=Counter)
+    fault: str  # what was done, without the step or the artefact that it was done to
+    ends: Counter[str] = field(default_factory=Counter)  # how often it ended how
 
     @property
     def tried(self) -> int:

@@ -25,23 +25,12 @@ OF_A_MANIFEST = frozenset({"files", "seal", "acquisition"})
 
 @dataclass(frozen=True)
 class Bench:
-    """An acquisition and a run made from it without a fault.
+    """An acquisition and a run made from it without a fault."""
 
-    Attributes
-    ----------
-    folder : Path
-        Where runs may be made.
-    acquisition : Path
-    reference : Path
-        The undisturbed run: ingest, reduce, fit and allan.
-    seconds : dict
-        How long each command took.
-    """
-
-    folder: Path
+    folder: Path  # where runs may be made
     acquisition: Path
-    reference: Path
-    seconds: dict[str, float]
+    reference: Path  # the undisturbed run: ingest, reduce, fit and allan
+    seconds: dict[str, float]  # how long each command took
 
     def copy(self, name: str, *stages: str) -> Path:
         """A new run with some stages of the reference.

@@ -69,8 +69,7 @@ def metadata(bench: Bench, artefact: str, damage: Damage, times: int | None, see
 
     Parameters
     ----------
-    times : int, optional
-        How many of the files; None for each.
+    times : how many of the files; None for each
     """
     outcome = Outcome(_fault(damage, "metadata file"))
     rng = random.Random(f"{artefact} {_name(damage)} {seed}")

@@ -24,22 +24,13 @@ PATIENCE_S = 120.0
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended.
+    """How a command ended."""
 
-    Attributes
-    ----------
-    code : int
-        Exit code, or minus the number of the signal.
-    out, err : str
-        What it printed.
-    seconds : float
-        Time that it took.
-    """
-
-    code: int
+    code: int  # exit code, or minus the number of the signal
+    # out, err: what it printed
     out: str
     err: str
-    seconds: float
+    seconds: float  # time that it took
 
     def succeeded(self) -> "Ended":
         """Itself, when all is well."""

@@ -27,8 +27,7 @@ def at_writes(bench: Bench, stage: str, times: int | None, seed: int) -> Outcome
 
     Parameters
     ----------
-    times : int, optional
-        How many of the writes; None for all, one after the other.
+    times : how many of the writes; None for all, one after the other
     """
     outcome = Outcome("disk full at the n-th write")
     earlier = STAGES[: STAGES.index(stage)]

@@ -56,21 +56,11 @@ class Hang(BaseException):
 
 @dataclass(frozen=True)
 class Case:
-    """One bad input.
+    """One bad input."""
 
-    Attributes
-    ----------
-    number : int
-        Of the case among its kind; kinds that count through a list take it from there.
-    rng : numpy.random.Generator
-        For everything that is drawn; from the kind and the number alone.
-    folder : Path
-        An empty directory of its own.
-    """
-
-    number: int
-    rng: np.random.Generator
-    folder: Path
+    number: int  # of the case among its kind; kinds that count through a list take it from there
+    rng: np.random.Generator  # for everything that is drawn; from the kind and the number alone
+    folder: Path  # an empty directory of its own
 
     def pick(self, *choices: object) -> object:
         """One of some values."""
@@ -162,20 +152,14 @@ def pixcal(*args: str | Path, names: Sequence[str] = ()) -> int:
 
     Parameters
     ----------
-    args : str or Path
-        The command line.
-    names : sequence of str
-        A refusal must name one of these: the file, the key or the option that is bad.
+    args : the command line
+    names : a refusal must name one of these: the file, the key or the option that is bad
 
     Returns
     -------
-    int
-        0 or 2.
+    0 or 2
 
-    Raises
-    ------
-    Broken
-        For any other exit code, a traceback, not one line, or a line that does not help.
+    Raises Broken for any other exit code, a traceback, not one line, or a line that does not help.
     """
     # As the interpreter makes its own: what cannot be encoded is an error on stdout only.
     out = io.TextIOWrapper(io.BytesIO(), "utf-8", "strict")
@@ -248,11 +232,8 @@ def calibrate(acquisition: Path, run: Path, names: Sequence[str] = (), *more: st
 
     Parameters
     ----------
-    acquisition, run : Path
-    names : sequence of str
-        What a refusal of ingest must name one of; those of later steps name the set or the run.
-    more : str
-        Further commands, e.g. ``report``.
+    names : what a refusal of ingest must name one of; those of later steps name the set or the run
+    more : further commands, e.g. ``report``
     """
     if pixcal("ingest", acquisition, "--out", run, *RUNTIME, names=names) == 2:
         return "refused"

@@ -133,11 +133,8 @@ class Night:
     def check(self, run: Path) -> None:
         """Hold the products of a run against the truth.
 
-        Raises
-        ------
-        Broken
-            Where flags, NaN and SIGMA do not belong together, a pixel that is spoilt has a value,
-            or an error is beyond `WITHIN` of its SIGMA, the modes that no data tell removed.
+        Raises Broken where flags, NaN and SIGMA do not belong together, a pixel that is spoilt has
+        a value, or an error is beyond `WITHIN` of its SIGMA, the modes that no data tell removed.
         """
         told = json.loads((run / "products" / "fit.json").read_text())
         for name in told["outputs"]:

@@ -25,24 +25,12 @@ SHAPES = ("straight", "exact")
 
 @dataclass(frozen=True)
 class Edge:
-    """Columns at one side of the detector.
+    """Columns at one side of the detector."""
 
-    Attributes
-    ----------
-    first : int
-        The first of them on the detector.
-    frames : dict
-        Samples (y, x) of a frame by shape of the fringes.
-    bend : (y,) float64
-        How far the exact fringes lie from the straight ones, px.
-    expected : (y,) float64
-        The same from the leading order of the optical path, px.
-    """
-
-    first: int
-    frames: dict[str, NDArray[Any]]
-    bend: F64
-    expected: F64
+    first: int  # the first of them on the detector
+    frames: dict[str, NDArray[Any]]  # samples (y, x) of a frame by shape of the fringes
+    bend: F64  # (y,) how far the exact fringes lie from the straight ones, px
+    expected: F64  # (y,) the same from the leading order of the optical path, px
 
 
 def row_phases(frame: NDArray[Any], k: float) -> F64:

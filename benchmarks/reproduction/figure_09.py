@@ -32,16 +32,10 @@ COLOURS = (BLUE, GREEN, MARKS[2], RED)
 
 @dataclass(frozen=True)
 class Point:
-    """Error of a map of some frames.
-
-    Attributes
-    ----------
-    frames : int
-    error, bound : float
-        rms against the truth, and the Cramér-Rao bound, px.
-    """
+    """Error of a map of some frames."""
 
     frames: int
+    # error, bound: rms against the truth, and the Cramér-Rao bound, px
     error: float
     bound: float
 

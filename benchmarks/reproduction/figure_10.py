@@ -26,39 +26,25 @@ QUICK_SIDE = 128
 
 @dataclass(frozen=True)
 class Estimates:
-    """Maps (y, x) of a fit and their errors, and those of its frames.
+    """Maps (y, x) of a fit and their errors, and those of its frames."""
 
-    Attributes
-    ----------
-    iota, alpha : (y, x) float64
-        e-.
-    delta : (y, x) float64
-        px.
-    iota_error, alpha_error : (y, x) float64
-        Relative, less the modes that free intensities leave open.
-    delta_error, sigma : (y, x) float64
-        px; error less the modes, and what the fit says of it.
-    phi : (t,) float64
-        rad.
-    phi_error, level_error : (t,) float64
-        rad, and relative; less the modes that free intensities leave open.
-    response : float
-        Correlation of iota, less its smooth part, with the true response.
-    bound, phi_bound : float
-        Cramér-Rao bounds of an offset, px, and of a frame's phase, rad.
-    """
-
+    # iota, alpha: (y, x) e-
     iota: F64
     alpha: F64
-    delta: F64
+    delta: F64  # (y, x) px
+    # iota_error, alpha_error: (y, x) relative, less the modes that free intensities leave open
     iota_error: F64
     alpha_error: F64
+    # delta_error, sigma: (y, x) px; error less the modes, and what the fit says of it
     delta_error: F64
     sigma: F64
-    phi: F64
+    phi: F64  # (t,) rad
+    # phi_error, level_error: (t,) rad, and relative; less the modes that free intensities leave
+    # open
     phi_error: F64
     level_error: F64
-    response: float
+    response: float  # correlation of iota, less its smooth part, with the true response
+    # bound, phi_bound: Cramér-Rao bounds of an offset, px, and of a frame's phase, rad
     bound: float
     phi_bound: float
 

@@ -24,26 +24,15 @@ FINER_PX = 5.0
 
 @dataclass(frozen=True)
 class Stability:
-    """One set.
-
-    Attributes
-    ----------
-    name : str
-    allan : dict
-        Its part of ``allan.json``.
-    frames : int
-    error, bound : float
-        Of the map of all frames, against the truth, px.
-    interfringe : float
-        px.
-    """
+    """One set."""
 
     name: str
-    allan: dict[str, Any]
+    allan: dict[str, Any]  # its part of ``allan.json``
     frames: int
+    # error, bound: of the map of all frames, against the truth, px
     error: float
     bound: float
-    interfringe: float
+    interfringe: float  # px
 
     def at(self, frames: int) -> float:
         """Deviation of so many frames, px, by the square-root law through the first point."""

@@ -38,10 +38,8 @@ def predicted_teeth(couplings: Sequence[Coupling], vector: tuple[float, float]) 
 
     Parameters
     ----------
-    couplings : sequence of Coupling
-        That do not depend on the column.
-    vector : (float, float)
-        Fringe vector (kx, ky), rad/px.
+    couplings : that do not depend on the column
+    vector : fringe vector (kx, ky), rad/px
     """
     if any(c.every_columns > 1 for c in couplings):
         raise ValueError("couplings depend on the column: teeth of rows are not all of it")
@@ -65,28 +63,16 @@ def period_of(couplings: Sequence[Coupling]) -> int:
 
 @dataclass(frozen=True)
 class Teeth:
-    """One set of one acquisition.
+    """One set of one acquisition."""
 
-    Attributes
-    ----------
-    delta : (y, x) float64
-        As fitted, px.
-    kernel : (row,) float64
-        What the kernel feigns in the rows of a period, px.
-    found, expected : (row,) float64
-        Mean error of these rows, and of the kernel's, each less the modes that a fit leaves open.
-    sigma : float
-        Error of the means, px.
-    rest : float
-        rms of the errors that are neither teeth nor modes, px.
-    """
-
-    delta: F64
-    kernel: F64
+    delta: F64  # (y, x) as fitted, px
+    kernel: F64  # (row,) what the kernel feigns in the rows of a period, px
+    # found, expected: (row,) mean error of these rows, and of the kernel's, each less the modes
+    # that a fit leaves open
     found: F64
     expected: F64
-    sigma: float
-    rest: float
+    sigma: float  # error of the means, px
+    rest: float  # rms of the errors that are neither teeth nor modes, px
 
     @property
     def height(self) -> float:

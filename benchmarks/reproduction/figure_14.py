@@ -29,38 +29,23 @@ OFFSET = {"horizontal": "δy", "vertical": "δx"}
 
 @dataclass(frozen=True)
 class Bent:
-    """One set fitted as straight fringes and by evidence.
+    """One set fitted as straight fringes and by evidence."""
 
-    Attributes
-    ----------
-    straight, auto : (y, x) float64
-        Offsets, px.
-    crest, left : Crest
-        Of their errors.
-    expected : Crest
-        Of the exact fringes themselves.
-    offset, seen, fitted : (float, float)
-        Of the fibres from the window's middle (x, y), mm: true, read off the crest, and as the
-        hyperbolic fit has it.
-    fitted_sigma : (float, float)
-        mm.
-    model : str
-        That the evidence chose.
-    error : float
-        rms of the errors of ``auto``, less the modes, px.
-    """
-
+    # straight, auto: (y, x) offsets, px
     straight: F64
     auto: F64
+    # crest, left: of their errors
     crest: Crest
     left: Crest
-    expected: Crest
+    expected: Crest  # of the exact fringes themselves
+    # offset, seen, fitted: of the fibres from the window's middle (x, y), mm: true, read off the
+    # crest, and as the hyperbolic fit has it
     offset: tuple[float, float]
     seen: tuple[float, float]
     fitted: tuple[float, float]
-    fitted_sigma: tuple[float, float]
-    model: str
-    error: float
+    fitted_sigma: tuple[float, float]  # mm
+    model: str  # that the evidence chose
+    error: float  # rms of the errors of ``auto``, less the modes, px
 
 
 def measure(scene: Scene) -> dict[str, Bent]:
@@ -99,23 +84,15 @@ def measure(scene: Scene) -> dict[str, Bent]:
 
 @dataclass(frozen=True)
 class Mixed:
-    """A set of figure 14: what the paper's iterations leave in its map, px.
+    """A set of figure 14: what the paper's iterations leave in its map, px."""
 
-    Attributes
-    ----------
-    delta, auto : (y, x) float64
-        By the paper's iterations, and by pixcal.
-    teeth, expected_teeth : float
-        Peak to peak, measured and of the kernel.
-    fringes, auto_fringes : float
-        rms of the fringe and its second harmonic in the errors of both.
-    crest : Crest
-    """
-
+    # delta, auto: (y, x) by the paper's iterations, and by pixcal
     delta: F64
     auto: F64
+    # teeth, expected_teeth: peak to peak, measured and of the kernel
     teeth: float
     expected_teeth: float
+    # fringes, auto_fringes: rms of the fringe and its second harmonic in the errors of both
     fringes: float
     auto_fringes: float
     crest: Crest

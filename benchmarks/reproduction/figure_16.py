@@ -15,20 +15,11 @@ from reproduction.outcome import Outcome, Row
 
 @dataclass(frozen=True)
 class Paths:
-    """What the crests of a set say of its fibres.
+    """What the crests of a set say of its fibres."""
 
-    Attributes
-    ----------
-    facts : dict
-        The set's part of ``crests.json``.
-    truth : Geometry
-    picture : bytes
-        PNG.
-    """
-
-    facts: dict[str, Any]
+    facts: dict[str, Any]  # the set's part of ``crests.json``
     truth: Geometry
-    picture: bytes
+    picture: bytes  # PNG
 
     def value(self, name: str) -> tuple[float, float, float]:
         """A parameter of the geometry as fitted, its error, and its truth, mm."""

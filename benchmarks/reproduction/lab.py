@@ -34,17 +34,9 @@ def resized(bench: Bench, *, side: int | None = None, frames: int | None = None)
 
 @dataclass(frozen=True)
 class Scene:
-    """A simulated acquisition, its truth, and the runs made from it.
+    """A simulated acquisition, its truth, and the runs made from it."""
 
-    Attributes
-    ----------
-    folder : Path
-        Its own.
-    bench : Bench
-    runtime : Runtime
-    """
-
-    folder: Path
+    folder: Path  # its own
     bench: Bench
     runtime: Runtime
 
@@ -145,19 +137,11 @@ def nominal_vector(run: Path, name: str) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Lab:
-    """Where scenes are kept, and how large they are.
-
-    Attributes
-    ----------
-    work : Path
-    runtime : Runtime
-    full : bool
-        The paper's own sizes, rather than those of some minutes.
-    """
+    """Where scenes are kept, and how large they are."""
 
     work: Path
     runtime: Runtime
-    full: bool = False
+    full: bool = False  # the paper's own sizes, rather than those of some minutes
 
     def bench(self, name: str) -> Bench:
         """A bench of ``configs/paper``."""

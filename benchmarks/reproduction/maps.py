@@ -42,11 +42,9 @@ def teeth(values: F64, period: int, edge: int = 2) -> F64:
 
     Parameters
     ----------
-    values : (y, x) float64
-    period : int
-        Rows.
-    edge : int
-        Rows and columns at the window's edges that are left out.
+    values : (y, x)
+    period : rows
+    edge : rows and columns at the window's edges that are left out
     """
     inner = values[edge:-edge, edge:-edge]
     row = (np.arange(len(inner)) + edge) % period
@@ -56,20 +54,13 @@ def teeth(values: F64, period: int, edge: int = 2) -> F64:
 
 @dataclass(frozen=True)
 class Crest:
-    """Second-order surface of a map about the window's middle.
+    """Second-order surface of a map about the window's middle."""
 
-    Attributes
-    ----------
-    xx, xy, yy : float
-        px per px²: the surface is ``xx u² + xy u v + yy v²``, u and v along x and y.
-    reach : float
-        Peak to peak of the surface over the window, less a plane, px.
-    """
-
+    # xx, xy, yy: px per px²: the surface is ``xx u² + xy u v + yy v²``, u and v along x and y
     xx: float
     xy: float
     yy: float
-    reach: float
+    reach: float  # peak to peak of the surface over the window, less a plane, px
 
     @classmethod
     def of(cls, values: F64) -> "Crest":
@@ -101,10 +92,8 @@ class Crest:
 
         Parameters
         ----------
-        distance, pitch : float
-            mm.
-        axis : int
-            0 where the fringe vector is along x, 1 along y.
+        distance, pitch : mm
+        axis : 0 where the fringe vector is along x, 1 along y
         """
         scale = pitch / (2 * distance**2)
         along, across = (self.xx, self.yy) if axis == 0 else (self.yy, self.xx)
@@ -114,23 +103,15 @@ class Crest:
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Whether a map of errors is chance alone; each in units of its own chance deviation.
+    """Whether a map of errors is chance alone; each in units of its own chance deviation."""
 
-    Attributes
-    ----------
-    neighbours_x, neighbours_y : float
-        Correlation of neighbours.
-    rows, columns : float
-        Scatter of the means of rows and of columns, above what pixels let expect.
-    peak : float
-        Chance of a peak as high as the highest of the power spectrum.
-    """
-
+    # neighbours_x, neighbours_y: correlation of neighbours
     neighbours_x: float
     neighbours_y: float
+    # rows, columns: scatter of the means of rows and of columns, above what pixels let expect
     rows: float
     columns: float
-    peak: float
+    peak: float  # chance of a peak as high as the highest of the power spectrum
 
     @classmethod
     def of(cls, errors: F64) -> "Whiteness":

@@ -6,52 +6,25 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Row:
-    """One line of a figure's table.
-
-    Attributes
-    ----------
-    quantity : str
-    here : str
-        What this run measured, with its unit.
-    paper : str
-        Key of `paper.STATEMENTS`; empty where the paper says nothing of it.
-    """
+    """One line of a figure's table."""
 
     quantity: str
-    here: str
-    paper: str = ""
+    here: str  # what this run measured, with its unit
+    paper: str = ""  # key of `paper.STATEMENTS`; empty where the paper says nothing of it
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A figure made again.
+    """A figure made again."""
 
-    Attributes
-    ----------
-    figure : str
-        Number or numbers in the paper.
-    title : str
-    run : str
-        What was simulated, and how it differs from the paper's own size.
-    caption : str
-        What the picture shows.
-    rows : tuple of Row
-    difference : str
-        Why the numbers differ from the paper's, or do not.
-    numbers : dict
-        Everything measured, for programs.
-    picture : bytes
-        PNG.
-    """
-
-    figure: str
+    figure: str  # number or numbers in the paper
     title: str
-    run: str
-    caption: str
+    run: str  # what was simulated, and how it differs from the paper's own size
+    caption: str  # what the picture shows
     rows: tuple[Row, ...]
-    difference: str
-    numbers: dict[str, Any]
-    picture: bytes
+    difference: str  # why the numbers differ from the paper's, or do not
+    numbers: dict[str, Any]  # everything measured, for programs
+    picture: bytes  # PNG
 
     def plain(self) -> dict[str, Any]:
         """All but the picture, for JSON."""

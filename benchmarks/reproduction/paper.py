@@ -16,18 +16,10 @@ STABLE_S = 1800.0
 
 @dataclass(frozen=True)
 class Statement:
-    """A sentence or number of the paper.
+    """A sentence or number of the paper."""
 
-    Attributes
-    ----------
-    text : str
-        In short.
-    place : str
-        Section, figure or table.
-    """
-
-    text: str
-    place: str
+    text: str  # in short
+    place: str  # section, figure or table
 
 
 STATEMENTS = {
