@@ -19,7 +19,7 @@ from astropy.io import fits
 
 from pixcal.engine.run import Runtime
 from pixcal.stages import allan, crests, fit, ingest, reduce, simulate
-from pixcal.stages.reduced_set import STRIP
+from pixcal.stages.tiles import STRIP
 
 HOW_IT_RAN = {"chunks_read", "passes"}
 """What differs with the runtime: other processes do not share what the scout keeps in memory."""

@@ -8,11 +8,10 @@ import numpy as np
 
 from pixcal.estimators.fringe_fit.tile_fit import Coding, Tile
 from pixcal.model.arrays import F64, U8, U16
+from pixcal.stages.tiles import STRIP, Index, Strip, extent, grid, indices, map_chunk, strips
 from pixcal.storage.cube import ArrayReader, CachedReader
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.place import Local, Place
-
-STRIP = 4  # tiles side by side whose maps are in one chunk: a file costs more than what is in it
 
 
 @dataclass
@@ -66,25 +65,20 @@ class ReducedSet:
     @property
     def grid(self) -> tuple[int, int]:
         """Rows and columns of tiles (columns of chunks)."""
-        (_, cy, cx), (ny, nx) = self.signal.chunks, self.shape
-        return -(-ny // cy), -(-nx // cx)
+        return grid(self.shape)
 
-    def tiles(self) -> list[tuple[int, int]]:
+    def tiles(self) -> list[Index]:
         """Row and column of every tile, row by row."""
-        rows, columns = self.grid
-        return [(i, j) for i in range(rows) for j in range(columns)]
+        return indices(self.shape)
 
-    def strips(self) -> list[list[tuple[int, int]]]:
+    def strips(self) -> list[Strip]:
         """The same in groups: neighbours in a row whose maps share a chunk."""
-        rows, columns = self.grid
-        starts = [(i, j) for i in range(rows) for j in range(0, columns, STRIP)]
-        return [[(i, n) for n in range(j, min(j + STRIP, columns))] for i, j in starts]
+        return strips(self.tiles(), STRIP)
 
     @property
     def map_chunks(self) -> tuple[int, int]:
         """Rows and columns of a chunk of maps (y, x)."""
-        _, cy, cx = self.signal.chunks
-        return cy, cx * min(STRIP, self.grid[1])
+        return map_chunk(self.shape)
 
     @property
     def coding(self) -> Coding:
@@ -98,13 +92,11 @@ class ReducedSet:
         """Time of each frame, s."""
         return ArrayReader(self.place / "time").read().astype(float)
 
-    def ranges(self, tile: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
+    def ranges(self, tile: Index) -> tuple[tuple[int, int], tuple[int, int]]:
         """((y0, y1), (x0, x1)) of a tile, given its row and column."""
-        (_, cy, cx), (ny, nx) = self.signal.chunks, self.shape
-        i, j = tile
-        return (i * cy, min((i + 1) * cy, ny)), (j * cx, min((j + 1) * cx, nx))
+        return extent(self.shape, tile)
 
-    def tile(self, tile: tuple[int, int]) -> Tile:
+    def tile(self, tile: Index) -> Tile:
         """Variance and good pixels of a tile."""
         y, x = self.ranges(tile)
         return Tile(
@@ -115,25 +107,25 @@ class ReducedSet:
             self.mask(tile) == 0,
         )
 
-    def mask(self, tile: tuple[int, int]) -> U8:
+    def mask(self, tile: Index) -> U8:
         """Flags of a tile's pixels."""
         y, x = self.ranges(tile)
         return self._maps["mask"].read(y, x).astype(np.uint8)
 
-    def codes(self, tile: tuple[int, int], block: int, *, keep: bool = False) -> U16:
+    def codes(self, tile: Index, block: int, *, keep: bool = False) -> U16:
         """Codes (t, y, x) of one block of frames of a tile."""
         index = (block, *tile)
         chunk = self.signal.keep(index) if keep else self.signal.read_chunk(index)
         return self._inside(chunk, tile, block)
 
-    def blocks(self, tile: tuple[int, int]) -> Iterator[U16]:
+    def blocks(self, tile: Index) -> Iterator[U16]:
         """Codes of a tile, block after block; each is overwritten by the next."""
         # Fresh memory for every chunk would cost more than decoding it.
         buffer = np.empty(self.signal.chunks, self.signal.dtype)
         for block in range(self.n_blocks):
             yield self._inside(self.signal.read_chunk((block, *tile), buffer), tile, block)
 
-    def _inside(self, chunk: U16, tile: tuple[int, int], block: int) -> U16:
+    def _inside(self, chunk: U16, tile: Index, block: int) -> U16:
         """The part of a chunk that lies in the window and the run."""
         y, x = self.ranges(tile)
         n = min(self.block, self.n_frames - block * self.block)

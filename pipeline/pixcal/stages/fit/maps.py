@@ -19,7 +19,7 @@ from pixcal.model.arrays import F32, F64, U8
 from pixcal.stages.fit.fringe_set import FittedSet
 from pixcal.stages.fit.scouting import read_frames
 from pixcal.stages.fit.sweep import BATCH_MAPS, DIGITS, rounded
-from pixcal.stages.reduced_set import STRIP
+from pixcal.stages.tiles import STRIP, span
 from pixcal.storage.cube import (
     ArrayReader,
     ArrayWriter,
@@ -135,8 +135,7 @@ def _write_strip(
     fitted: list[FittedSet], writers: Writers, both: bool, strip: Sequence[Job]
 ) -> list[_Told]:
     """Write the maps of tiles side by side."""
-    (y0, y1), (x0, _) = fitted[0].source.ranges(strip[0][0])
-    _, (_, x1) = fitted[0].source.ranges(strip[-1][0])
+    (y0, y1), (x0, x1) = span(fitted[0].source.shape, [at for at, _ in strip])
     swept: list[Swept] = []
     for f in fitted:
         names = ("phase", "sigma", *SAME_AS_SWEPT, *(BATCH_MAPS if f.n_batches else ()))

@@ -58,7 +58,7 @@ def scout_set(
     source: ReducedSet, nominal: tuple[float, float], folder: Local, runtime: Runtime, name: str
 ) -> None:
     """Find the frame parameters of a set, near the nominal vector (rad/px), and write them."""
-    n_tiles = source.grid[0] * source.grid[1]
+    n_tiles = len(source.tiles())
     chunk_bytes = int(np.prod(source.signal.chunks)) * source.signal.dtype.itemsize
     tile_bytes = source.n_blocks * chunk_bytes
     number = max(1, round(SCOUT_SHARE * n_tiles), min(SCOUT_TILES, CACHE_BYTES // tile_bytes))

@@ -4,6 +4,7 @@ What it leaves, ``RUN/sweep``, holds for every model of the fringes' geometry, w
 the phases afterwards: trying another model does not read the cube again.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -29,8 +30,9 @@ from pixcal.model.errors import InputError, naming
 from pixcal.model.options import Sweep as Config
 from pixcal.stages.fit.scouting import CACHE_BYTES, read_frames, scout_set
 from pixcal.stages.fitted_shape import nominal_vector
-from pixcal.stages.reduced_set import STRIP, ReducedSet
+from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.steps import run_steps
+from pixcal.stages.tiles import STRIP
 from pixcal.storage.artefact import Build, Workspace
 from pixcal.storage.cube import (
     ArrayReader,
@@ -183,13 +185,11 @@ def _create_maps(folder: Local, source: ReducedSet, n_batches: int) -> dict[str,
 
 def _bound_pixels(source: ReducedSet) -> int:
     """Pixels of each tile for the bound: some hundreds in all, whatever the number of tiles."""
-    rows, columns = source.grid
-    return max(4, min(BOUND_PIXELS, 512 // (rows * columns)))
+    return max(4, min(BOUND_PIXELS, 512 // math.prod(source.grid)))
 
 
 def _chi2_pixels(source: ReducedSet) -> int:
-    rows, columns = source.grid
-    return max(MIN_SAMPLES, CHI2_SAMPLES // (rows * columns))
+    return max(MIN_SAMPLES, CHI2_SAMPLES // math.prod(source.grid))
 
 
 def _sweep_strip(job: _Job, strip: Sequence[tuple[int, int]]) -> None:

@@ -17,7 +17,9 @@ from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.arrays import F32, F64, U8
 from pixcal.model.flags import PixelFlag
 from pixcal.model.options import Reduce
-from pixcal.stages.reduce.columns import (
+from pixcal.stages.reduce.frame_statistics import STATISTICS, Measuring
+from pixcal.stages.tiles import (
+    STRIP,
     Index,
     Strip,
     by_column,
@@ -27,8 +29,6 @@ from pixcal.stages.reduce.columns import (
     span,
     strips,
 )
-from pixcal.stages.reduce.frame_statistics import STATISTICS, Measuring
-from pixcal.stages.reduced_set import STRIP
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group
 from pixcal.storage.place import Place
 

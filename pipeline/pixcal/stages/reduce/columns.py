@@ -12,61 +12,14 @@ from numpy.typing import NDArray
 
 from pixcal.engine.plan import Plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.stages.reduced_set import STRIP
+from pixcal.stages.tiles import STRIP, Index, Strip, grid, span, strips
 from pixcal.storage.artefact import Workspace
-from pixcal.storage.cube import CHUNK, ArrayReader
+from pixcal.storage.cube import ArrayReader
 from pixcal.storage.frame_reader import Reader
 from pixcal.storage.place import UrlPath
 
-Index = tuple[int, int]
-Strip = tuple[Index, ...]
-
 SHARE = 0.8  # of the memory allowed, that strips may be made wide for
 CAUTIOUS = 4  # tasks that share as much memory as this process may use, on a cluster
-
-
-def grid(shape: tuple[int, int]) -> tuple[int, int]:
-    """Rows and columns of columns of chunks of a window (y, x)."""
-    return -(-shape[0] // CHUNK[1]), -(-shape[1] // CHUNK[2])
-
-
-def indices(shape: tuple[int, int]) -> list[Index]:
-    """All columns of chunks, in order."""
-    rows, columns = grid(shape)
-    return [(i, j) for i in range(rows) for j in range(columns)]
-
-
-def extent(shape: tuple[int, int], index: Index) -> tuple[tuple[int, int], tuple[int, int]]:
-    """((y0, y1), (x0, x1)) of a column of chunks."""
-    (i, j), (_, cy, cx), (ny, nx) = index, CHUNK, shape
-    return (i * cy, min((i + 1) * cy, ny)), (j * cx, min((j + 1) * cx, nx))
-
-
-def map_chunk(shape: tuple[int, int]) -> tuple[int, int]:
-    """Rows and columns of a chunk of maps (y, x)."""
-    return CHUNK[1], CHUNK[2] * min(STRIP, grid(shape)[1])
-
-
-def span(shape: tuple[int, int], strip: Sequence[Index]) -> tuple[tuple[int, int], tuple[int, int]]:
-    """((y0, y1), (x0, x1)) of a strip."""
-    (rows, (x0, _)), (_, (_, x1)) = extent(shape, strip[0]), extent(shape, strip[-1])
-    return rows, (x0, x1)
-
-
-def by_column(block: NDArray[Any]) -> list[NDArray[Any]]:
-    """Views of a strip's samples or maps (..., y, x), column of chunks by column."""
-    return np.split(block, range(CHUNK[2], block.shape[-1], CHUNK[2]), axis=-1)
-
-
-def strips(todo: Sequence[Index], width: int) -> list[Strip]:
-    """Columns side by side, so many at most in a strip."""
-    found: list[list[Index]] = []
-    for i, j in todo:
-        if found and len(found[-1]) < width and found[-1][-1] == (i, j - 1):
-            found[-1].append((i, j))
-        else:
-            found.append([(i, j)])
-    return [tuple(strip) for strip in found]
 
 
 def strip_width(readers: Iterable[Reader], need: Callable[[int], int], runtime: Runtime) -> int:

@@ -16,7 +16,6 @@ from pixcal.model.acquisition import Detector
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
 from pixcal.stages.reduce.calibration import Usual, usual
-from pixcal.stages.reduce.columns import grid
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.read_noise import (
     bias_wander,
@@ -27,6 +26,7 @@ from pixcal.stages.reduce.read_noise import (
     of_variance,
     read_noise,
 )
+from pixcal.stages.tiles import grid
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.place import Place
 

@@ -11,10 +11,11 @@ from pixcal.kernels.quantise import FILL, Scale, coefficients, encode, extremes
 from pixcal.model.arrays import F32
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.calibration import FLAG_ATTRS
-from pixcal.stages.reduce.columns import (
+from pixcal.stages.reduce.columns import blocks
+from pixcal.stages.tiles import (
+    STRIP,
     Index,
     Strip,
-    blocks,
     by_column,
     extent,
     grid,
@@ -22,7 +23,6 @@ from pixcal.stages.reduce.columns import (
     span,
     strips,
 )
-from pixcal.stages.reduced_set import STRIP
 from pixcal.storage.cube import (
     CHUNK,
     ArrayReader,
@@ -58,13 +58,14 @@ class FringeSet:
         """Number of frames."""
         return len(self.exptime)
 
-    def extent(self, index: Index) -> tuple[tuple[int, int], tuple[int, int]]:
-        """((y0, y1), (x0, x1)) of a column of chunks."""
-        return extent((self.raw.shape[1], self.raw.shape[2]), index)
+    @property
+    def window(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.raw.shape[1], self.raw.shape[2]
 
     def maps(self, strip: Strip) -> list[dict[str, NDArray[Any]]]:
         """Calibration maps of each column of chunks."""
-        ranges = span((self.raw.shape[1], self.raw.shape[2]), strip)
+        ranges = span(self.window, strip)
         names = ("bias", "dark_rate", "flat", "read_noise", "mask")
         found = [by_column(ArrayReader(self.calibration / name).read(*ranges)) for name in names]
         return [dict(zip(names, of_column, strict=True)) for of_column in zip(*found, strict=True)]
@@ -183,7 +184,7 @@ class _Column:
             np.float32(fringes.saturation), self.codes[at:held], self.saturated, self.lost, begin,
         )  # fmt: skip
         if held == CHUNK[0] or last == fringes.frames:
-            (y0, _), (x0, _) = fringes.extent(self.index)
+            (y0, _), (x0, _) = extent(fringes.window, self.index)
             self.job.writers["signal"].write((last - held, y0, x0), self.codes[:held])
 
     def result(self) -> dict[str, NDArray[Any]]:
@@ -217,7 +218,7 @@ def convert(job: Converting, parts: Sequence[Strip]) -> None:
                 column.largest = max(column.largest, largest)
         found |= {column.index: column.result() for column in columns}
     for strip in strips(list(found), STRIP):
-        (y0, _), (x0, _) = job.fringes.extent(strip[0])
+        (y0, _), (x0, _) = extent(job.fringes.window, strip[0])
         for name in found[strip[0]]:
             writer = job.writers[name]
             data = np.concatenate([found[index][name] for index in strip], axis=1)

@@ -32,7 +32,10 @@ from pixcal.kernels.rounding import SHEPPARD
 from pixcal.model.arrays import F32, F64
 from pixcal.model.flags import PixelFlag
 from pixcal.model.options import Reduce
-from pixcal.stages.reduce.columns import (
+from pixcal.stages.reduce.exposures import Group
+from pixcal.stages.reduce.ingested import MOST_ADU
+from pixcal.stages.tiles import (
+    STRIP,
     Index,
     Strip,
     by_column,
@@ -42,9 +45,6 @@ from pixcal.stages.reduce.columns import (
     span,
     strips,
 )
-from pixcal.stages.reduce.exposures import Group
-from pixcal.stages.reduce.ingested import MOST_ADU
-from pixcal.stages.reduced_set import STRIP
 from pixcal.storage.cube import CHUNK, ArrayWriter, create_array, create_group
 from pixcal.storage.frame_reader import Reader
 from pixcal.storage.place import Place

@@ -8,7 +8,7 @@ from typing import Any
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels.quantise import Scale, choose_scale
 from pixcal.model.arrays import I64
-from pixcal.stages.reduce.columns import indices, run_noted, strip_width, strips
+from pixcal.stages.reduce.columns import run_noted, strip_width
 from pixcal.stages.reduce.electrons import (
     Converting,
     FringeSet,
@@ -19,6 +19,7 @@ from pixcal.stages.reduce.electrons import (
     write_coordinates,
 )
 from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.tiles import indices, strips
 from pixcal.storage.artefact import Workspace
 from pixcal.storage.cube import ArrayReader
 

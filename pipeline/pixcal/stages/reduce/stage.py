@@ -21,7 +21,7 @@ from pixcal.model.errors import InputError
 from pixcal.model.flags import PixelFlag
 from pixcal.model.options import Reduce
 from pixcal.stages.reduce.calibration import Finishing, calibration_writers, finish
-from pixcal.stages.reduce.columns import indices, run_noted, span, strip_width, strips
+from pixcal.stages.reduce.columns import run_noted, strip_width
 from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
 from pixcal.stages.reduce.detector_warnings import detector_warnings
 from pixcal.stages.reduce.electrons import convert_bytes
@@ -35,7 +35,7 @@ from pixcal.stages.reduce.frame_statistics import (
 )
 from pixcal.stages.reduce.fringe_sets import Bounds, set_warnings, share_at_mean, write_set
 from pixcal.stages.reduce.ingested import Ingested
-from pixcal.stages.reduced_set import STRIP
+from pixcal.stages.tiles import STRIP, indices, span, strips
 from pixcal.storage.artefact import Build, Workspace
 from pixcal.storage.cube import ArrayReader, create_group
 from pixcal.storage.cube_place import base_of, chosen_base
