@@ -19,7 +19,7 @@ from pixcal.report import diagnosis_maps as maps
 from pixcal.report import page as page_module
 from pixcal.report.contents import Contents, DiagnosisContents, StageRecord
 from pixcal.report.curve_places import place, places
-from pixcal.report.diagnosis_figures import Bar, Closed, curves_figure, gap_figure
+from pixcal.report.diagnosis_figures import Bar, curves_figure, gap_figure
 from pixcal.report.diagnosis_words import percent, with_interval
 from pixcal.report.drawing import png
 from pixcal.report.page import render, section
@@ -519,7 +519,8 @@ def test_any_curve_becomes_a_picture(changes: dict[str, Any]) -> None:
 def test_bars_are_as_long_as_their_shares() -> None:
     def lengths(before: float, after: float) -> tuple[int, int]:
         bars = [Bar("all", 1.0, 0.0), Bar(NASTY, before, after)]
-        drawn = picture(gap_figure(bars, [Closed(NASTY, 0.5, (0.4, 0.6), 0.2)])).astype(int)
+        closed = {"gap_closed": 0.5, "gap_closed_interval": [0.4, 0.6], "gain_over_rest": 0.2}
+        drawn = picture(gap_figure(bars, {NASTY: closed})).astype(int)
         left = drawn[:, : drawn.shape[1] // 2]
         half = left[left.shape[0] // 3 :][: left.shape[0] // 3]  # the lower row of bars
         red, blue = half[..., 0] - half[..., 2] > 40, half[..., 2] - half[..., 0] > 90

@@ -154,9 +154,11 @@ def test_no_good_pixel_has_no_spectrum() -> None:
 
 def test_the_detail_is_the_middle_pixel_by_pixel() -> None:
     values = holed((501, 233))
-    made, (y0, x0) = detail(ArraySource(values))
-    assert made.block == 1
-    np.testing.assert_array_equal(made.image, values[y0 : y0 + 96, x0 : x0 + 96])
+    made = detail(ArraySource(values), ArraySource(-values))
+    y0, x0 = made.start
+    assert made.delta.block == 1
+    for shown, whole in ((made.delta, values), (made.sigma, -values)):
+        np.testing.assert_array_equal(shown.image, whole[y0 : y0 + 96, x0 : x0 + 96])
     assert abs(y0 + 48 - 250.5) <= 0.5
     assert abs(x0 + 48 - 116.5) <= 0.5
 

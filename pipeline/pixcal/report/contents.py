@@ -7,16 +7,7 @@ from typing import Any
 import numpy as np
 
 from pixcal.model.arrays import F64
-from pixcal.report.summary import FlagSummary, MapSummary, Spectrum
-
-
-@dataclass(frozen=True)
-class Detail:
-    """The middle of a map, pixel by pixel."""
-
-    start: tuple[int, int]  # first row and column
-    delta: MapSummary
-    sigma: MapSummary
+from pixcal.report.summary import Detail, FlagSummary, MapSummary, Spectrum
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Figures of a diagnosis: the gap by domain, what each cause closes, statistics as three curves."""
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,16 +34,6 @@ class Bar:
     interval: tuple[float, float] | None = None
 
 
-@dataclass(frozen=True)
-class Closed:
-    """Share of the gap that a cause closes alone, with its interval, and its unique share."""
-
-    name: str
-    alone: float
-    interval: tuple[float, float]
-    over_rest: float
-
-
 def gap(result: DiagnosisContents) -> Figure:
     """The gap by domain, what differs only with the causes, and the share of each cause."""
     facts, causes = result.facts["gap"], result.facts["causes"]
@@ -53,15 +43,12 @@ def gap(result: DiagnosisContents) -> Figure:
     rest = facts["after"] - sum(b.after for b in parts)
     if causes and parts and rest > 0.001:
         parts.append(Bar("introduced by the causes", 0.0, rest))
-    closed = []
-    for c in causes:
-        name, ends = effect_title(result, c["effect"]), tuple(c["gap_closed_interval"])
-        closed.append(Closed(name, c["gap_closed"], ends, c["gain_over_rest"]))
-    return gap_figure([whole, *sorted(parts, key=lambda b: -b.before)], closed)
+    titles = {effect_title(result, cause["effect"]): cause for cause in causes}
+    return gap_figure([whole, *sorted(parts, key=lambda b: -b.before)], titles)
 
 
-def gap_figure(bars: Sequence[Bar], causes: Sequence[Closed]) -> Figure:
-    """The gap by domain, before and after, and beside it what each cause closes."""
+def gap_figure(bars: Sequence[Bar], causes: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """The gap by domain, before and after, and beside it what each cause closes, by its title."""
     size = WIDE, 1.6 + 0.5 * max(len(bars), len(causes))
     margin = _room(_domain_names(bars))
     if not causes:
@@ -110,19 +97,22 @@ def _share_axes(axes: Axes, rows: int) -> None:
     axes.grid(visible=False, axis="y")
 
 
-def _causes(axes: Axes, causes: Sequence[Closed]) -> None:
-    for y, cause in enumerate(causes):
-        low, high = (100 * v for v in cause.interval)
-        axes.plot([low, high], [y, y], color=BLUE, lw=3, solid_capstyle="butt")
+def _causes(axes: Axes, causes: Mapping[str, Mapping[str, Any]]) -> None:
+    low, high, alone, unique = shares = (
+        100
+        * np.array(
+            [
+                (*c["gap_closed_interval"], c["gap_closed"], c["gain_over_rest"])
+                for c in causes.values()
+            ]
+        ).T
+    )
     rows = range(len(causes))
-    axes.plot([100 * c.alone for c in causes], rows, "o", color=BLUE, ms=8, label="gap closed")
-    axes.plot(
-        [100 * c.over_rest for c in causes], rows, "D", color=INK, ms=7, fillstyle="none",
-        label="unique share",
-    )  # fmt: skip
+    axes.plot([low, high], [rows, rows], color=BLUE, lw=3, solid_capstyle="butt")
+    axes.plot(alone, rows, "o", color=BLUE, ms=8, label="gap closed")
+    axes.plot(unique, rows, "D", color=INK, ms=7, fillstyle="none", label="unique share")
     axes.set_yticks(rows, _cause_names(causes))
-    ends = [100 * v for c in causes for v in (*c.interval, c.over_rest, c.alone)]
-    axes.set_xlim(min(-3.0, *ends) - 2, max(103.0, *ends) + 2)
+    axes.set_xlim(min(-3.0, shares.min()) - 2, max(103.0, shares.max()) + 2)
     axes.set_title("what each cause closes", **TITLE)
     _share_axes(axes, len(causes))
 
@@ -131,8 +121,8 @@ def _domain_names(bars: Sequence[Bar]) -> list[str]:
     return [_plain(b.name, 24) for b in bars]
 
 
-def _cause_names(causes: Sequence[Closed]) -> list[str]:
-    return ["\n".join(textwrap.wrap(_plain(c.name, 60), 22)[:3]) for c in causes]
+def _cause_names(titles: Iterable[str]) -> list[str]:
+    return ["\n".join(textwrap.wrap(_plain(title, 60), 22)[:3]) for title in titles]
 
 
 def _room(names: Sequence[str]) -> float:

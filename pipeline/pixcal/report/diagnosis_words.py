@@ -54,7 +54,7 @@ def answer(diagnosis: DiagnosisContents) -> str:
     facts = diagnosis.facts
     gap, verdict = facts["gap"], facts["verdict"]
     tested = facts.get("statistics", len(diagnosis.curves))
-    count = differing(diagnosis)
+    count = sum(bool(c["in_gap"]) for c in diagnosis.curves)
     if verdict == "no gap":
         return (
             f"No gap: on held-out frames, none of {tested} statistics differs significantly from "
@@ -81,11 +81,6 @@ def answer(diagnosis: DiagnosisContents) -> str:
         f"{percent(1 - gap['after'])} of the gap between the data and the nominal simulation. The "
         f"{left}{_main_domain(gap, residual=True)}, measured on held-out frames."
     )
-
-
-def differing(diagnosis: DiagnosisContents) -> int:
-    """Statistics in which data and nominal simulation differ."""
-    return sum(bool(c["in_gap"]) for c in diagnosis.curves)
 
 
 def _main_domain(gap: Mapping[str, Any], *, residual: bool) -> str:

@@ -256,13 +256,22 @@ def _starts(size: int, window: int) -> list[int]:
     return [round(v) for v in np.linspace(0, size - window, number)]
 
 
-def detail(source: Source) -> tuple[MapSummary, tuple[int, int]]:
-    """The middle of a map pixel by pixel, and its first (row, column)."""
-    ny, nx = source.shape
+@dataclass(frozen=True)
+class Detail:
+    """The middle of a map, pixel by pixel."""
+
+    start: tuple[int, int]  # first row and column
+    delta: MapSummary
+    sigma: MapSummary
+
+
+def detail(delta: Source, sigma: Source) -> Detail:
+    """The middle of a map and of its errors."""
+    ny, nx = delta.shape
     my, mx = min(DETAIL, ny), min(DETAIL, nx)
     y0, x0 = (ny - my) // 2, (nx - mx) // 2
-    values = source.read((y0, y0 + my), (x0, x0 + mx))
-    return summarise(ArraySource(values), DETAIL), (y0, x0)
+    parts = (source.read((y0, y0 + my), (x0, x0 + mx)) for source in (delta, sigma))
+    return Detail((y0, x0), *(summarise(ArraySource(part), DETAIL) for part in parts))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from pixcal.model.options import Report as Config
 from pixcal.report.contents import (
     DETECTOR_MAPS,
     Contents,
-    Detail,
     DetectorContents,
     DiagnosisContents,
     FrameHistory,
@@ -132,7 +131,7 @@ def _jobs(
         for key, path in outputs.items():
             both = ArrayReader(path), ArrayReader(path.with_name(f"{path.name}_sigma"))
             maps |= {f"{key}/delta": both[0], f"{key}/sigma": both[1]}
-            jobs[f"{key}/detail"] = partial(_detail, *both)
+            jobs[f"{key}/detail"] = partial(detail, *both)
             if path.parent == group:
                 jobs[f"{key}/spectrum"] = partial(spectrum, *both)
         masks["products"] = ArrayReader(group / "mask")
@@ -155,11 +154,6 @@ def _summaries(jobs: Mapping[str, partial[Any]], runtime: Runtime) -> dict[str, 
     runtime = within_memory("the report", per_task, FIGURE_BYTES, runtime)
     results = run_tasks(call, list(jobs.values()), runtime, label="report maps")
     return dict(zip(jobs, results, strict=True))
-
-
-def _detail(delta: Source, sigma: Source) -> Detail:
-    summary, start = detail(delta)
-    return Detail(start, summary, detail(sigma)[0])
 
 
 def _offset(key: str, results: Mapping[str, Any]) -> MapContents:
