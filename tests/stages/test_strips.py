@@ -14,6 +14,7 @@ from pixcal.model.errors import InputError
 from pixcal.stages import ingest, reduce, simulate
 from pixcal.stages.ingest import stage as ingest_stage
 from pixcal.stages.reduce import columns
+from pixcal.stages.tiles import indices, strips
 from pixcal.storage.manifest import list_files, read_manifest, write_manifest
 
 SYNC = Runtime(cluster="sync")
@@ -70,11 +71,11 @@ def test_neither_source_nor_width_matters(
 
 
 def test_strips_are_neighbours_within_a_row() -> None:
-    every = columns.indices(SHAPE)
-    assert columns.strips(every, 2) == [
+    every = indices(SHAPE)
+    assert strips(every, 2) == [
         ((0, 0), (0, 1)), ((0, 2),), ((1, 0), (1, 1)), ((1, 2),)
     ]  # fmt: skip
-    assert columns.strips([(0, 0), (0, 2), (1, 0)], 9) == [((0, 0),), ((0, 2),), ((1, 0),)]
+    assert strips([(0, 0), (0, 2), (1, 0)], 9) == [((0, 0),), ((0, 2),), ((1, 0),)]
 
 
 @pytest.mark.parametrize("kind", ["bias", "vertical"])

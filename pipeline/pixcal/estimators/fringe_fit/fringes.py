@@ -165,13 +165,24 @@ def _refined(light: F64, start: F64) -> F64:
     return np.asarray(k)
 
 
+def powers(degree: int) -> list[tuple[int, int]]:
+    """Powers (of x, of y) of the terms of a polynomial."""
+    return [(n - j, j) for n in range(degree + 1) for j in range(n + 1)]
+
+
+def monomials(y: F64, x: F64, degree: int) -> F64:
+    """The terms (term, ...) at coordinates that broadcast."""
+    # Columns and rows are small: their powers cost nothing, the products all.
+    xs, ys = ([np.asarray(v**n) for n in range(degree + 1)] for v in (x, y))
+    return np.stack([xs[i] * ys[j] for i, j in powers(degree)])
+
+
 @lru_cache(maxsize=8)
 def polynomial_basis(shape: tuple[int, int], degree: int, step: int = 1) -> F64:
     """Terms x^i y^j, i + j up to ``degree``, on ±1, of every ``step``-th pixel: (y * x, terms)."""
     y, x = grid(shape)
-    y, x = y / max(1.0, shape[0] / 2), x / max(1.0, shape[1] / 2)
-    terms = [x**i * y**j for n in range(degree + 1) for i in range(n, -1, -1) for j in (n - i,)]
-    return np.stack([np.broadcast_to(t, shape).ravel()[::step] for t in terms], axis=1)
+    terms = monomials(y / max(1.0, shape[0] / 2), x / max(1.0, shape[1] / 2), degree)
+    return np.ascontiguousarray(terms.reshape(len(terms), -1)[:, ::step].T)
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ from pixcal.estimators.fringe_fit.geometry import TilePlane
 from pixcal.estimators.fringe_fit.models import FringeShape
 from pixcal.estimators.fringe_fit.tile_sums import (
     N_LOCAL,
+    POWERS,
     SCALE_PX,
     Carrier,
     TileSums,
     expand,
-    powers,
 )
 from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
 from pixcal.model.arrays import F64
@@ -43,7 +43,7 @@ class ModeBasis:
         The phase is relative to each tile's plane.
         """
         centres = np.array([p.centre for p in planes])
-        n_poly, n_own = len(powers()), len(self.shape.names)
+        n_poly, n_own = len(POWERS), len(self.shape.names)
         modes = np.zeros((len(planes), len(self.names), N_LOCAL))
         modes[:, :n_own, :n_poly] = expand(self.shape.modes, centres)
         modes[:, n_own:, n_poly:] = np.eye(len(FRINGE_MODES))
@@ -51,7 +51,7 @@ class ModeBasis:
         phase[:, :n_poly] = expand(
             lambda y, x: self.shape.phase(y, x) - self.carrier.phase(y, x), centres
         )
-        at = {p: n for n, p in enumerate(powers())}
+        at = {p: n for n, p in enumerate(POWERS)}
         phase[:, at[0, 0]] -= [p.phase for p in planes]
         phase[:, at[1, 0]] -= [p.kx * SCALE_PX for p in planes]
         phase[:, at[0, 1]] -= [p.ky * SCALE_PX for p in planes]

@@ -5,8 +5,9 @@ from typing import Self
 
 import numpy as np
 
+from pixcal.estimators.fringe_fit.fringes import monomials
 from pixcal.estimators.fringe_fit.models import FringeShape, Start
-from pixcal.estimators.fringe_fit.tile_sums import DEGREE, powers
+from pixcal.estimators.fringe_fit.tile_sums import DEGREE, POWERS
 from pixcal.model.arrays import F64
 
 
@@ -25,11 +26,11 @@ class Polynomial(FringeShape):
     @classmethod
     def start(cls, start: Start) -> Self:
         """The carrier alone."""
-        return cls((0.0,) * len(powers()), start.k, start.reference, start.scale)
+        return cls((0.0,) * len(POWERS), start.k, start.reference, start.scale)
 
     @property
     def names(self) -> tuple[str, ...]:
-        return tuple(f"x^{i} y^{j}" for i, j in powers())
+        return tuple(f"x^{i} y^{j}" for i, j in POWERS)
 
     def phase(self, y: F64, x: F64) -> F64:
         ry, rx = self.reference
@@ -39,10 +40,7 @@ class Polynomial(FringeShape):
     def modes(self, y: F64, x: F64) -> F64:
         """The powers, on the scale of the window."""
         ry, rx = self.reference
-        # Columns and rows are small: their powers cost nothing, the products all.
-        xs = [np.asarray((x - rx) / self.scale) ** n for n in range(DEGREE + 1)]
-        ys = [np.asarray((y - ry) / self.scale) ** n for n in range(DEGREE + 1)]
-        return np.stack([xs[i] * ys[j] for i, j in powers()])
+        return monomials((y - ry) / self.scale, (x - rx) / self.scale, DEGREE)
 
     def moved(self, step: F64) -> Self:
         moved = tuple(float(a + b) for a, b in zip(self.coefficients, step, strict=True))

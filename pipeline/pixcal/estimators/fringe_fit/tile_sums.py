@@ -11,7 +11,7 @@ from functools import cache, lru_cache
 
 import numpy as np
 
-from pixcal.estimators.fringe_fit.fringes import grid, plane_wave, wrapped
+from pixcal.estimators.fringe_fit.fringes import grid, monomials, plane_wave, powers, wrapped
 from pixcal.estimators.fringe_fit.gauge import FRINGE_MODES
 from pixcal.estimators.fringe_fit.geometry import TilePlane
 from pixcal.model.arrays import F32, F64, Mask
@@ -19,22 +19,15 @@ from pixcal.model.arrays import F32, F64, Mask
 # as the polynomial that shapes are judged by, which a window of one tile must hold as well
 DEGREE = 5
 SCALE_PX = 64.0  # coordinates from the tile's centre are counted in these: half a tile
+POWERS = powers(DEGREE)
 NODES = 6  # points along each axis at which functions are looked at
-
-
-def powers() -> list[tuple[int, int]]:
-    """Powers (of x, of y) of the terms."""
-    return [(n - j, j) for n in range(DEGREE + 1) for j in range(n + 1)]
 
 
 @lru_cache(maxsize=8)
 def polynomials(shape: tuple[int, int]) -> F64:
     """The terms (term, y * x) on the pixels of a tile."""
     y, x = grid(shape)
-    # Columns and rows are small: their powers cost nothing, the products all.
-    xs = [(x / SCALE_PX) ** n for n in range(DEGREE + 1)]
-    ys = [(y / SCALE_PX) ** n for n in range(DEGREE + 1)]
-    return np.stack([(xs[i] * ys[j]).ravel() for i, j in powers()])
+    return monomials(y / SCALE_PX, x / SCALE_PX, DEGREE).reshape(len(POWERS), -1)
 
 
 @cache
@@ -42,8 +35,7 @@ def _nodes() -> tuple[F64, F64, F64]:
     """Points (y, x) in units of `SCALE_PX`, and the matrix from values there to coefficients."""
     t = np.cos((2 * np.arange(NODES) + 1) * np.pi / (2 * NODES))
     y, x = (v.ravel() for v in np.meshgrid(t, t, indexing="ij"))
-    terms = np.stack([x**i * y**j for i, j in powers()], axis=1)
-    return y, x, np.linalg.pinv(terms)
+    return y, x, np.asarray(np.linalg.pinv(monomials(y, x, DEGREE).T), float)
 
 
 def expand(function: Callable[[F64, F64], F64], centres: F64) -> F64:
@@ -63,7 +55,7 @@ def expand(function: Callable[[F64, F64], F64], centres: F64) -> F64:
 
 
 # modes of a tile: the polynomials, then the fringes that free intensities leave open
-N_LOCAL = len(powers()) + len(FRINGE_MODES)
+N_LOCAL = len(POWERS) + len(FRINGE_MODES)
 _PLANE = 7
 
 
