@@ -17,29 +17,29 @@ Strip = tuple[Index, ...]
 STRIP = 4  # tiles side by side whose maps are in one chunk: a file costs more than what is in it
 
 
-def grid(shape: tuple[int, int]) -> tuple[int, int]:
+def grid(shape: tuple[int, ...]) -> tuple[int, int]:
     """Rows and columns of columns of chunks of a window (y, x)."""
     return -(-shape[0] // CHUNK[1]), -(-shape[1] // CHUNK[2])
 
 
-def indices(shape: tuple[int, int]) -> list[Index]:
+def indices(shape: tuple[int, ...]) -> list[Index]:
     """All columns of chunks, in order."""
     rows, columns = grid(shape)
     return [(i, j) for i in range(rows) for j in range(columns)]
 
 
-def extent(shape: tuple[int, int], index: Index) -> tuple[tuple[int, int], tuple[int, int]]:
+def extent(shape: tuple[int, ...], index: Index) -> tuple[tuple[int, int], tuple[int, int]]:
     """((y0, y1), (x0, x1)) of a column of chunks."""
     (i, j), (_, cy, cx), (ny, nx) = index, CHUNK, shape
     return (i * cy, min((i + 1) * cy, ny)), (j * cx, min((j + 1) * cx, nx))
 
 
-def map_chunk(shape: tuple[int, int]) -> tuple[int, int]:
+def map_chunk(shape: tuple[int, ...]) -> tuple[int, int]:
     """Rows and columns of a chunk of maps (y, x)."""
     return CHUNK[1], CHUNK[2] * min(STRIP, grid(shape)[1])
 
 
-def span(shape: tuple[int, int], strip: Sequence[Index]) -> tuple[tuple[int, int], tuple[int, int]]:
+def span(shape: tuple[int, ...], strip: Sequence[Index]) -> tuple[tuple[int, int], tuple[int, int]]:
     """((y0, y1), (x0, x1)) of a strip."""
     (rows, (x0, _)), (_, (_, x1)) = extent(shape, strip[0]), extent(shape, strip[-1])
     return rows, (x0, x1)

@@ -67,7 +67,7 @@ class FrameParameters:
         return np.arctan2(self.g[:, 2], self.g[:, 1])
 
 
-def grid(shape: tuple[int, int]) -> tuple[F64, F64]:
+def grid(shape: tuple[int, ...]) -> tuple[F64, F64]:
     """Pixel coordinates (y, 1) and (1, x) relative to the centre of a tile."""
     ny, nx = shape
     y = np.arange(ny, dtype=float)[:, None] - (ny - 1) / 2
@@ -94,7 +94,7 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
     shape = maps.shape[1:]
     window = np.hanning(shape[0] + 2)[1:-1, None] * np.hanning(shape[1] + 2)[None, 1:-1]
     weight = window * good
-    y, x = grid((shape[0], shape[1]))
+    y, x = grid(shape)
     # A plane is taken off each map: what is left of the illumination must not win.
     basis = np.stack(np.broadcast_arrays(1.0, x, y), axis=-1).reshape(-1, 3) * weight.reshape(-1, 1)
     flat = np.where(good, maps, 0.0).reshape(len(maps), -1) * weight.reshape(1, -1)
@@ -146,7 +146,7 @@ def _refined(light: F64, start: F64) -> F64:
 
     By Newton's method: derivatives of the spectrum are those of the maps times powers of y and x.
     """
-    y, x = grid((light.shape[1], light.shape[2]))
+    y, x = grid(light.shape[1:])
     orders, k = np.arange(3)[:, None], start
     for _ in range(MOST_STEPS):
         across = (-1j * x) ** orders * np.exp(-1j * k[0] * x)
@@ -178,7 +178,7 @@ def monomials(y: F64, x: F64, degree: int) -> F64:
 
 
 @lru_cache(maxsize=8)
-def polynomial_basis(shape: tuple[int, int], degree: int, step: int = 1) -> F64:
+def polynomial_basis(shape: tuple[int, ...], degree: int, step: int = 1) -> F64:
     """Terms x^i y^j, i + j up to ``degree``, on ±1, of every ``step``-th pixel: (y * x, terms)."""
     y, x = grid(shape)
     terms = monomials(y / max(1.0, shape[0] / 2), x / max(1.0, shape[1] / 2), degree)
@@ -202,8 +202,7 @@ def smooth_phasor(
     a complex polynomial, of a lower degree for tiles of few pixels, is fitted to the map turned
     back by it, leaving outliers out.
     """
-    shape = (phasor.shape[0], phasor.shape[1])
-    kx, ky = k
+    shape, (kx, ky) = phasor.shape, k
     turned = np.where(good, phasor, 0) * plane_wave(shape, (-kx, -ky))
     if shape[1] > 1:
         kx += float(np.angle(np.vdot(turned[:, :-1], turned[:, 1:])))
@@ -241,7 +240,7 @@ def smooth_phasor(
     return SmoothPhasor((every @ fit).view(complex).reshape(shape) * carrier, (kx, ky))
 
 
-def plane_wave(shape: tuple[int, int], k: tuple[float, float], phase: float = 0.0) -> C128:
+def plane_wave(shape: tuple[int, ...], k: tuple[float, float], phase: float = 0.0) -> C128:
     """``exp(i (phase + k . r))`` over a tile (y, x), r from its centre: a product of two sides."""
     y, x = grid(shape)
     return np.asarray(np.exp(1j * (phase + k[1] * y)) * np.exp(1j * k[0] * x))

@@ -22,7 +22,7 @@ class TilePlane:
     sigma: float  # 1-sigma error of `phase`; infinite without good pixels
     ratio: float  # median of iota / alpha
 
-    def on(self, shape: tuple[int, int]) -> F64:
+    def on(self, shape: tuple[int, ...]) -> F64:
         """The plane on the tile's pixels."""
         y, x = grid(shape)
         return np.asarray(self.phase + self.kx * x + self.ky * y)
@@ -51,7 +51,7 @@ def tile_plane(
     error = float(np.median(sigma.ravel()[picked]) / np.sqrt(len(picked)))
     picked = picked[:: -(-len(picked) // MAX_PIXELS)]
     rows, columns = np.divmod(picked, phase.shape[1])
-    y, x = (grid((phase.shape[0], phase.shape[1]))[n].ravel() for n in (0, 1))
+    y, x = (grid(phase.shape)[n].ravel() for n in (0, 1))
     y, x = y[rows], x[columns]
     phasor = np.exp(1j * (phase[rows, columns] - slope[0] * x - slope[1] * y))
     middle = np.angle(phasor.sum())

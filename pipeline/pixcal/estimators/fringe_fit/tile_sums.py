@@ -24,7 +24,7 @@ NODES = 6  # points along each axis at which functions are looked at
 
 
 @lru_cache(maxsize=8)
-def polynomials(shape: tuple[int, int]) -> F64:
+def polynomials(shape: tuple[int, ...]) -> F64:
     """The terms (term, y * x) on the pixels of a tile."""
     y, x = grid(shape)
     return monomials(y / SCALE_PX, x / SCALE_PX, DEGREE).reshape(len(POWERS), -1)
@@ -106,7 +106,7 @@ class TileSums:
         return TileSums(list(planes), self.normal, self.right, self.square, self.pixels)
 
 
-def local_modes(carrier: Carrier, plane: TilePlane, shape: tuple[int, int]) -> F64:
+def local_modes(carrier: Carrier, plane: TilePlane, shape: tuple[int, ...]) -> F64:
     """The modes (mode, y * x) of a tile."""
     cy, cx = plane.centre
     at_centre = float(carrier.phase(np.asarray(cy), np.asarray(cx))) + plane.phase
@@ -132,11 +132,10 @@ def sum_row(
         gaps
     plane : smooth phase of the tile
     """
-    shape = (phase.shape[0], phase.shape[1])
-    modes = local_modes(carrier, plane, shape)
+    modes = local_modes(carrier, plane, phase.shape)
     usable = (good & np.isfinite(phase)).ravel()
     weight = np.where(usable, 1 / np.where(usable, sigma.ravel(), 1.0).astype(float) ** 2, 0.0)
-    rest = np.where(usable, wrapped(phase - plane.on(shape)).ravel(), 0.0)
+    rest = np.where(usable, wrapped(phase - plane.on(phase.shape)).ravel(), 0.0)
     root = np.sqrt(weight)
     modes *= root
     normal, right = modes @ modes.T, np.empty((N_LOCAL, 1 + len(batches)))

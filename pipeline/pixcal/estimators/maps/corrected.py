@@ -26,7 +26,7 @@ def straight_modes(theta: F64, k: tuple[float, float]) -> F64:
     1, x, y, and the fringes of theta (3, y, x) at the fringe frequency k (rad/px) and twice it
     (physics note, section 2).
     """
-    shape = (theta.shape[1], theta.shape[2])
+    shape = theta.shape[1:]
     y, x = np.broadcast_arrays(*grid(shape))
     carrier = k[0] * x + k[1] * y
     phasor = (theta[2] + 1j * theta[1]) * np.exp(-1j * carrier)

@@ -122,14 +122,13 @@ def gauge_terms(fringes: FringeEvidence) -> F64:
 
 def polynomial(shape: tuple[int, ...], degree: int) -> F64:
     """Polynomials (term, y, x) up to a degree."""
-    basis = polynomial_basis((shape[0], shape[1]), degree)
+    basis = polynomial_basis(shape, degree)
     return np.ascontiguousarray(basis.T).reshape(-1, *shape)
 
 
 def centred(shape: tuple[int, ...]) -> tuple[F64, F64]:
     """Coordinates y (y, 1) and x (1, x) of the pixels from the middle of a map."""
-    ny, nx = shape
-    return grid((ny, nx))
+    return grid(shape)
 
 
 def without(columns: F64, free: F64) -> F64:

@@ -32,7 +32,7 @@ def strip_width(readers: Iterable[Reader], need: Callable[[int], int], runtime: 
     for reader in readers:
         if isinstance(reader, ArrayReader) and isinstance(reader.path, UrlPath):
             return 1
-        width = grid((reader.shape[1], reader.shape[2]))[1]
+        width = grid(reader.shape[1:])[1]
     # Nobody knows here what the workers of a cluster may use.
     at_once = CAUTIOUS if runtime.remote else runtime.n_workers
     while width > 1 and Plan(need(width), 0, at_once).total > SHARE * runtime.memory:
@@ -43,7 +43,7 @@ def strip_width(readers: Iterable[Reader], need: Callable[[int], int], runtime: 
 
 def blocks(reader: Reader, strip: Strip) -> Iterator[tuple[int, NDArray[Any]]]:
     """First frame and samples (t, y, x) of a strip, a few frames at a time in the same memory."""
-    rows, (x0, x1) = span((reader.shape[1], reader.shape[2]), strip)
+    rows, (x0, x1) = span(reader.shape[1:], strip)
     frames, step = reader.shape[0], reader.chunks[0]
     buffer = np.empty((min(step, frames), rows[1] - rows[0], x1 - x0), reader.dtype)
     for first in range(0, frames, step):

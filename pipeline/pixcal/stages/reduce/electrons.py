@@ -58,14 +58,9 @@ class FringeSet:
         """Number of frames."""
         return len(self.exptime)
 
-    @property
-    def window(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return self.raw.shape[1], self.raw.shape[2]
-
     def maps(self, strip: Strip) -> list[dict[str, NDArray[Any]]]:
         """Calibration maps of each column of chunks."""
-        ranges = span(self.window, strip)
+        ranges = span(self.raw.shape[1:], strip)
         names = ("bias", "dark_rate", "flat", "read_noise", "mask")
         found = [by_column(ArrayReader(self.calibration / name).read(*ranges)) for name in names]
         return [dict(zip(names, of_column, strict=True)) for of_column in zip(*found, strict=True)]
@@ -184,7 +179,7 @@ class _Column:
             np.float32(fringes.saturation), self.codes[at:held], self.saturated, self.lost, begin,
         )  # fmt: skip
         if held == CHUNK[0] or last == fringes.frames:
-            (y0, _), (x0, _) = extent(fringes.window, self.index)
+            (y0, _), (x0, _) = extent(fringes.raw.shape[1:], self.index)
             self.job.writers["signal"].write((last - held, y0, x0), self.codes[:held])
 
     def result(self) -> dict[str, NDArray[Any]]:
@@ -218,7 +213,7 @@ def convert(job: Converting, parts: Sequence[Strip]) -> None:
                 column.largest = max(column.largest, largest)
         found |= {column.index: column.result() for column in columns}
     for strip in strips(list(found), STRIP):
-        (y0, _), (x0, _) = extent(job.fringes.window, strip[0])
+        (y0, _), (x0, _) = extent(job.fringes.raw.shape[1:], strip[0])
         for name in found[strip[0]]:
             writer = job.writers[name]
             data = np.concatenate([found[index][name] for index in strip], axis=1)
