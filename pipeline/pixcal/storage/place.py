@@ -64,14 +64,6 @@ class UrlPath:
             content: bytes = system.cat_file(path, start=None if most is None else 0, end=most)
         return content
 
-    def exists(self) -> bool:
-        """Whether there is such a file. It is read: no listing, which may be stale, is asked."""
-        try:
-            self.read_bytes()
-        except FileNotFoundError:
-            return False
-        return True
-
 
 Local = Path | MemoryPath  # a file or folder of this process or machine
 Place = Local | UrlPath  # a file or folder, here or at a URL
