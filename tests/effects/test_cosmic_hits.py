@@ -126,6 +126,7 @@ def test_rate_and_charge_are_found(
     assert abs(off) < 4 * found.errors["electrons_per_um"] < 0.5 * charge
     assert found.errors["rate_cm2_s"] < 0.35 * rate
     assert found.significance > 10
+    assert not found.refused
 
 
 @pytest.mark.long
@@ -183,6 +184,25 @@ def test_what_comes_again_in_a_pixel_is_no_hit(acquired: Callable[..., Evidence]
     found = CosmicHits.estimate(acquired(None, effects))
     assert found is not None
     assert found.significance < 4
+
+
+@pytest.mark.parametrize("places", [12, 400])
+def test_hits_that_come_back_to_the_same_pixels_are_none(
+    acquired: Callable[..., Evidence], places: int
+) -> None:
+    """As of pixels that are rarely in the upper of two levels, unlike many that are hit once."""
+    evidence, rng = acquired(), np.random.default_rng(4)
+    fringes = {}
+    pixels = rng.permutation(np.argwhere(evidence.good))[:places]
+    for name, one in evidence.fringes.items():
+        electrons = one.electrons.copy()
+        for y, x in pixels[rng.integers(0, places, 16)]:
+            electrons[rng.integers(len(electrons)), y, x] += 3000
+        fringes[name] = replace(one, electrons=electrons)
+    found = CosmicHits.estimate(replace(evidence, fringes=fringes, stacks=()))
+    assert found is not None
+    assert found.significance > 4
+    assert bool(found.refused) == (places == 12)
 
 
 def test_without_darks_and_fringes_nothing_is_said(acquired: Callable[..., Evidence]) -> None:

@@ -12,6 +12,7 @@ from pixcal.engine.run import Runtime
 from pixcal.estimators.diagnosis.test_statistics import Curve
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose import trial
+from pixcal.stages.diagnose.search import LEAST_SIMULATIONS, SEARCH_S, SIMULATIONS, affordable
 from pixcal.stages.diagnose.trial import Trials
 
 LAG, ROWS = Lag(share=0.002), RowNoise()
@@ -27,8 +28,9 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[tuple[Effect, ...], int,
         items.append(item)
         effects, seed, window = item
         if any(isinstance(e, Lag) and e.share > 0.0021 for e in effects):
-            return "too much lag"
-        return {("lines", "detector"): Curve(np.zeros(1), np.array([float(seed + 10 * window)]))}
+            return "too much lag", 2.0
+        value = np.array([float(seed + 10 * window)])
+        return {("lines", "detector"): Curve(np.zeros(1), value)}, 2.0 + seed % 3
 
     monkeypatch.setattr(trial, "_kept_or_made", simulated)
     return items
@@ -51,6 +53,15 @@ def test_the_first_are_exact_and_the_others_moved(tmp_path: Path, made: list[Any
     assert all(first[seed] == 0.002 for seed in range(3))
     assert len({first[seed] for seed in range(3, 8)}) == 5
     assert all(ROWS in effects for effects, *_ in made)
+
+
+def test_time_is_that_of_all_windows_of_a_simulation(tmp_path: Path, made: list[Any]) -> None:
+    some = trials(tmp_path, windows=3)
+    assert affordable(some.seconds) == SIMULATIONS  # None is made yet.
+    some.curves([(ROWS,)], 6, "test")
+    assert some.seconds == pytest.approx(9.0)
+    assert affordable(some.seconds) == LEAST_SIMULATIONS
+    assert affordable(2.0) == SEARCH_S / 2
 
 
 def test_what_is_refused_as_moved_is_taken_as_it_was(tmp_path: Path, made: list[Any]) -> None:

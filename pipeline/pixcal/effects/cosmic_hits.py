@@ -1,7 +1,7 @@
 """Particles that leave their charge in one frame: muons, and electrons of radioactive decay."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import ndimage
@@ -11,7 +11,7 @@ from scipy.special import ndtr
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_count
 from pixcal.kernels.tracks import add_tracks, draw_tracks
-from pixcal.model.arrays import F32, F64, Mask
+from pixcal.model.arrays import F32, F64, I64, Mask
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.numbers import numbers
@@ -45,6 +45,9 @@ _RARE = 0.01
 _BRIGHTEST = 16
 # outliers of the noise itself over those of a Gaussian: shot noise of faint light is skewed
 _SKEW = 5.0
+# Hits of parts of the frames on the same pixels, over those by chance, and as a share of all hits
+_AGAIN, _SHARE_AGAIN = 2.0, 0.1
+_NOISY_PIXELS = "the hits come back to the same pixels: these are noisy, as by telegraph noise"
 _STEPS = 300  # of the maximisation
 _FEWEST = 1e-6
 
@@ -157,6 +160,7 @@ class CosmicHits(Effect):
             "samples in single frames far above the pixel's other frames",
             {"hits": count, "expected_by_chance": chance, "seen_cm2_s": seen},
             (*({n: error} for n, error in errors.items()), step) if step else (),
+            refused=_NOISY_PIXELS if _come_back(searches) else "",
         )
 
     @classmethod
@@ -199,6 +203,9 @@ class _Hits:
     peaks: F64  # brightest sample, e-
     sizes: F64  # samples that stand out, and how many of them are no more than a pixel from that
     near: F64
+    # frames and pixels of the brightest samples, where these are known
+    frames: F64 = field(default_factory=lambda: np.zeros(0))
+    pixels: F64 = field(default_factory=lambda: np.zeros(0))
 
     def classes(self, faintest: float) -> tuple[F64, F64]:
         """Number of hits of each size and brightness, and of each size and width."""
@@ -220,6 +227,7 @@ class _Search:
     samples: int
     limit: float  # from how many sigmas on a sample is an outlier
     hits: _Hits  # upwards
+    struck: tuple[I64, I64]  # hits on each pixel (y x) in either half of the frames
     downwards: int  # number of those downwards
     sigma: F32  # (t, y, x) noise of the samples, e-; NaN where they do not count
     faintest: float  # usual charge from which a sample is an outlier, e-
@@ -252,13 +260,15 @@ def _search(residual: F32, sigma: F32, seconds: float, area: float) -> _Search:
     up &= ~often
     down &= ~often
     least = limit * np.float32(JOINED / THRESHOLD)
+    hits = _hits(up, ratio > least, residual)
     n = int(np.count_nonzero(usable))
     return _Search(
         seconds,
         area * ratio.size,
         n,
         float(limit),
-        _hits(up, ratio > least, residual),
+        hits,
+        _struck(hits, residual.shape),
         len(_hits(down, ratio < -least, -residual).peaks),
         np.where(usable, sigma, np.float32(np.nan)),
         float(limit * np.median(sigma)),
@@ -287,8 +297,30 @@ def _hits(outliers: Mask, joined: Mask, residual: F32) -> _Hits:
             charge = residual[frame, y, x]
             at = int(charge.argmax())
             near = (abs(y - y[at]) <= 1) & (abs(x - x[at]) <= 1)
-            found.append((float(charge[at]), len(y), np.count_nonzero(near)))
-    return _Hits(*np.array(found, float).reshape(-1, 3).T)
+            pixel = y[at] * residual.shape[2] + x[at]
+            found.append((float(charge[at]), len(y), np.count_nonzero(near), frame, pixel))
+    return _Hits(*np.array(found, float).reshape(-1, 5).T)
+
+
+def _struck(hits: _Hits, shape: tuple[int, ...]) -> tuple[I64, I64]:
+    """Hits on each pixel in the first and the second half of frames (t, y, x)."""
+    count, pixels = shape[0], hits.pixels.astype(np.int64)
+    late = 2 * hits.frames >= count
+    size = shape[1] * shape[2]
+    return np.bincount(pixels[~late], minlength=size), np.bincount(pixels[late], minlength=size)
+
+
+def _come_back(searches: Sequence[_Search]) -> bool:
+    """Whether different frames have hits on the same pixels, far more often than by chance."""
+    parts = np.stack([part for s in searches for part in s.struck]).astype(float)
+
+    def pairs(counts: F64) -> F64:
+        return np.asarray((counts.sum(axis=0) ** 2 - (counts**2).sum(axis=0)) / 2)
+
+    seen, hits = float(pairs(parts).sum()), float(parts.sum())
+    by_chance = float(pairs(parts.sum(axis=1))) / parts.shape[1]
+    more, chance = seen - _AGAIN * by_chance, np.sqrt(_AGAIN * by_chance + 1)
+    return bool(more > SIGNIFICANT * chance and more > _SHARE_AGAIN * hits)
 
 
 class _Drawn:

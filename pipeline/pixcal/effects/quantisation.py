@@ -12,6 +12,7 @@ from pixcal.estimators.detector.code_density import (
     code_widths,
     converter_counts,
     histogram,
+    moved_by_bits,
     step_of,
 )
 from pixcal.estimators.diagnosis.evidence import Evidence
@@ -40,7 +41,8 @@ class Quantisation(Effect):
     One converter, or one ramp, for all columns. Displacements that are independent leave the
     response straight: codes differ in width, by chance and by a ripple, and one of no width is
     missing. A bit whose weight is off makes codes wide or narrow wherever the bit changes, and
-    bends the response. The round-off itself is no more than noise of step²/12 as long as the noise
+    bends the response. Codes of any widths, as counts tell them, are a replay of what any converter
+    does. The round-off itself is no more than noise of step²/12 as long as the noise
     before it spans half a step; so maps do not show it, unless read noise is lower than that.
     """
 
@@ -49,7 +51,7 @@ class Quantisation(Effect):
     acts_at = Stage.CONVERTER
     order = 2
     domains = ("noise", "intensity")
-    strengths = ("coarse_adu", "dnl_rms", "ripple", "bits")
+    strengths = ("coarse_adu", "dnl_rms", "ripple", "bits", "widths")
     left_because = "rounding adds noise of some hundredths of the bound"
     frames_needed = ("ladder",)
     sources = (
@@ -87,6 +89,20 @@ class Quantisation(Effect):
         high=1000,
         doc="error of the weight of each bit, lowest bit first",
     )
+    below: float = quantity(
+        0.0,
+        low=0,
+        high=1,
+        doc="share of a threshold that the level of the code below sets; 0: a bit is taken if it "
+        "fits; 0.5: the nearest level is taken",
+    )
+    widths: tuple[float, ...] = quantity(
+        (),
+        unit="codes",
+        low=-1,
+        high=100,
+        doc="width of each code minus 1 code, from code 0 on, as measured",
+    )
 
     @property
     def step_adu(self) -> float:
@@ -112,7 +128,10 @@ class Quantisation(Effect):
         phase = turn * (number - 0.5) + self.ripple_phase_rad
         shift += self.ripple * np.sin(phase) / (2 * np.sin(turn / 2))
         begins = number - 0.5 + np.clip(shift, -FARTHEST, FARTHEST)
-        return np.asarray(begins + (number[:, None] >> np.arange(len(self.bits)) & 1) @ self.bits)
+        begins += moved_by_bits(np.array(self.bits), self.below, codes)
+        wider = np.zeros(codes)
+        wider[1:][: len(self.widths)] = self.widths[: codes - 1]
+        return np.asarray(begins + np.cumsum(wider))
 
     def converted(self, adu: F32, specimen: int, top_adu: float, normals: F32 | None = None) -> F32:
         """Codes in ADU: each sample passes the thresholds that it reaches.
@@ -131,7 +150,7 @@ class Quantisation(Effect):
             Standard normals by which samples are scattered over the meshes of that grid.
         """
         codes = int(top_adu / self.step_adu) + 3
-        if any(self.bits):
+        if any(self.bits) or any(self.widths):
             found = np.searchsorted(_reached(self, specimen, codes), adu / self.step_adu, "right")
             return np.asarray(np.maximum(found - 1, 0) * self.step_adu, np.float32)
         begins = _thresholds(self, specimen, codes)
@@ -179,11 +198,16 @@ class Quantisation(Effect):
                 step = 1.0
             widths = code_widths(converter_counts(counts, step), noise, first, top / step)
         values: dict[str, Any] = {"coarse_adu": step - 1, "dnl_rms": 0.0, "ripple": 0.0}
+        in_full = None
         errors = {"coarse_adu": step_error}
         # A camera that shifts its codes by whole bits is an ordinary one.
         found = [-1.0 if step == evidence.step_adu else min((step - 1) / step_error, 1e6)]
         if widths is not None:
             known, its_errors, chances = _uneven(widths)
+            law = {name: known[name] for name in ("bits", "below") if name in known}
+            rest = widths.without(np.array(law["bits"]), law["below"]) if law else widths
+            if (measured := rest.measured) is not None:
+                in_full = cls(**values, **law, widths=tuple(map(float, measured)))
             values, errors = values | known, errors | its_errors
             found += chances
         elif step == evidence.step_adu:
@@ -194,6 +218,7 @@ class Quantisation(Effect):
             sigmas_of_best(*found),
             "missing codes, and code counts compared with neighbouring codes",
             {"sigmas": found, "codes": 0 if widths is None else len(widths.number)},
+            in_full=in_full,
             refused=_OTHER_GAIN if widths is not None and widths.uneven_above else "",
         )
 
@@ -224,17 +249,17 @@ def _uneven(widths: CodeWidths) -> tuple[dict[str, Any], dict[str, float], list[
     values: dict[str, Any] = {"ripple": 0.0}
     errors = {"ripple": line.amplitude_error}
     # Of displaced thresholds neighbouring widths have up to twice the scatter of the others.
-    bits, covariance = widths.bits(2 * variance)
-    chi2 = float(bits @ np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ bits)
-    wrong = sigmas_of_chi2(chi2, max(int((np.diag(covariance) > 0).sum()), 1))
+    found = widths.wrong_bits(2 * variance)
+    wrong = sigmas_of_chi2(found.chi2, max(int((np.diag(found.covariance) > 0).sum()), 1))
     share = 1.0 if line.period == 2 else 0.5
-    rest = widths.without(bits).scatter()[0]
+    rest = widths.without(found.bits, found.below).scatter()[0]
     # Bits repeat too: the least of them as a ripple of two or four codes.
     clearer = 2 * rest < variance - share * line.amplitude**2
     if wrong > SIGNIFICANT and (wrong > sure or clearer):
-        bits, covariance = widths.bits(2 * rest)
-        values, errors, others = _uneven(widths.without(bits))
-        values["bits"] = tuple(map(float, bits))
+        bits, covariance = widths.bits(2 * rest, found.below)
+        values, errors, others = _uneven(widths.without(bits, found.below))
+        level = widths.level(bits, found.below)
+        values |= {"bits": tuple(map(float, level)), "below": found.below}
         spread = np.sqrt(np.diag(covariance))
         errors |= {f"bits[{n}]": float(e) for n, e in enumerate(spread) if e}
         return values, errors, [wrong, *others]

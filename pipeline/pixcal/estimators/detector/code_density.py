@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 from scipy.optimize import minimize_scalar
+from scipy.sparse import csc_array, csr_array, diags_array
+from scipy.sparse.linalg import spsolve
 from scipy.special import log_ndtr
 
 from pixcal.model.arrays import F64, I64, Mask
@@ -38,6 +40,9 @@ MIN_NOISE = 1.4
 # shares of the codes below which they may be even and above which they may not; how much larger
 # than chance the squares of the widths are then, and how many codes below may be as uneven
 _SPLITS, _CLEAR, _EVEN = (0.03, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75), 25.0, 0.05
+MAX_MEASURED = 1 << 12  # codes whose widths are measured one by one: of a converter of 12 bits
+_WIDTH_FITS = 12  # of widths whose variances are found by the fit before
+BELOW = 0.0, 0.5  # where thresholds may lie between two levels
 LOWEST_RIPPLE = 1 / 16  # turns a code
 
 
@@ -154,6 +159,27 @@ class Ripple:
 
 
 @dataclass(frozen=True)
+class WrongBits:
+    """Weights of bits that are off, and how sure that is."""
+
+    bits: F64  # (n,) by how much, codes, the least bit first
+    below: float  # share of a threshold that the level of the code below sets
+    covariance: F64  # (n, n)
+    chi2: float  # of the bits
+
+
+def moved_by_bits(bits: F64, below: float, codes: int) -> F64:
+    """By how much (codes) wrong weights of bits move where codes 0 to ``codes - 1`` begin.
+
+    A code begins at its own level if a bit is taken where it fits, as in a converter by successive
+    approximation, and half-way from the level below if the nearest level is taken.
+    """
+    number = np.arange(codes)
+    level = (number[:, None] >> np.arange(len(bits)) & 1) @ bits
+    return np.asarray(level + below * (level[np.maximum(number - 1, 0)] - level))
+
+
+@dataclass(frozen=True)
 class CodeWidths:
     """Relative widths of codes, less one and less what a local fit takes."""
 
@@ -189,6 +215,36 @@ class CodeWidths:
         return size / more, error / more, sigmas
 
     @property
+    def measured(self) -> F64 | None:
+        """The true width of every code from 0 on, less one; None where codes are too many.
+
+        What a local fit takes of the widths is given back as far as few codes explain it: each
+        width has a variance of its own, which is as large as it is found to be (Tipping 2001,
+        sparse Bayesian learning, without the posterior variances).
+        """
+        top = int(self.number[-1]) + 1
+        if top > MAX_MEASURED:
+            return None
+        half = len(self.kernel) // 2
+        bands = [self.kernel[half + k] * np.ones(top) for k in range(-half, half + 1)]
+        # The local fit does without codes that are left out.
+        there = diags_array(np.where(self.gap[:top], 0.0, 1.0))
+        gaps = diags_array(np.where(self.gap[:top], 1.0, 0.0))
+        design = diags_array(bands, offsets=range(-half, half + 1), shape=(top, top)) @ there + gaps
+        design = csr_array(design)[self.number]
+        weight = diags_array(1 / self.variance)
+        normal, data = design.T @ weight @ design, self.width
+        own = np.full(top, float(np.mean(data**2)))
+        for _ in range(_WIDTH_FITS):
+            right = design.T @ (weight @ data)
+            found = spsolve(csc_array(normal + diags_array(1 / own)), right)
+            own = found**2 + float(np.median(self.variance))
+            raised = self._raised(np.where(self.gap[:top], 0.0, found))
+            data = self.width * np.where(self.gap[:top], 1.0, raised)[self.number]
+        found[self.number] -= found[self.number].mean()  # a slope is a gain
+        return np.asarray(np.maximum(found, -1))
+
+    @property
     def uneven_above(self) -> bool:
         """Whether codes are uneven from some code on, and even below.
 
@@ -205,20 +261,35 @@ class CodeWidths:
                 return True
         return False
 
-    def bits(self, scatter: float) -> tuple[F64, F64]:
+    def wrong_bits(self, scatter: float) -> WrongBits:
+        """Errors of the bits' weights (codes) and where thresholds lie between levels."""
+        weight = 1 / (self.variance + max(scatter, 0.0))
+        tried = []
+        for below in BELOW:
+            bits, covariance = self.bits(scatter, below)
+            inverse = np.linalg.pinv(covariance, rcond=1e-9, hermitian=True)
+            misfit = float(weight @ self.without(bits, below).width ** 2)
+            tried.append((misfit, WrongBits(bits, below, covariance, float(bits @ inverse @ bits))))
+        return min(tried, key=lambda one: one[0])[1]
+
+    def bits(self, scatter: float, below: float = 0.0) -> tuple[F64, F64]:
         """By how much each bit's weight is off, in codes, the least first; and the covariance.
 
         A bit that does not change within the codes at hand gets nothing. The common factor of all
-        weights, a gain, does not change the local widths: the smallest errors are given. A weight
-        that is more than a code too small leaves several codes out, which is no linear change, so
-        the fit is repeated about what was found, by changes of a code.
+        weights, a gain, does not change the local widths: the smallest errors are given (`level`
+        gives others). A weight that is more than a code too small leaves several codes out, which
+        is no linear change, so the fit is repeated about what was found, by changes of a code.
+        ``below``: share of a threshold that the level of the code below sets.
         """
         number = (len(self.gap) - 1).bit_length()
         weight = 1 / (self.variance + max(scatter, 0.0))
         bits, left = np.zeros(number), self.width
         misfit = float(weight @ left**2)
         for _ in range(_BIT_FITS):
-            slopes = [self._left_out(bits + e) - self._left_out(bits - e) for e in np.eye(number)]
+            slopes = [
+                self._left_out(bits + e, below) - self._left_out(bits - e, below)
+                for e in np.eye(number)
+            ]
             design = np.stack(slopes, 1) / 2
             normal = (design.T * weight) @ design
             scale = 1 / np.sqrt(np.maximum(np.diag(normal), _NO_CHANGE))
@@ -228,7 +299,7 @@ class CodeWidths:
             inverse = np.linalg.pinv(scaled, rcond=1e-6, hermitian=True)
             covariance = inverse * np.outer(scale, scale)
             moved = bits + covariance @ (design.T @ (weight * left))
-            after = self.width - self._left_out(moved)
+            after = self.width - self._left_out(moved, below)
             better = misfit - float(weight @ after**2)
             if better <= 0:
                 break
@@ -237,19 +308,39 @@ class CodeWidths:
                 break
         return bits, covariance
 
-    def _left_out(self, bits: F64) -> F64:
+    def level(self, bits: F64, below: float) -> F64:
+        """Bits with a common factor by which the response has no slope over the codes at hand."""
+        changing = np.ptp(self.number[:, None] >> np.arange(len(bits)) & 1, axis=0) > 0
+        gain = np.where(changing, 2.0 ** np.arange(len(bits)), 0.0)
+        of_bits, of_gain = (
+            np.polyfit(self.number, moved_by_bits(own, below, len(self.gap))[self.number], 1)[0]
+            for own in (bits, gain)
+        )
+        return np.asarray(bits - of_bits / of_gain * gain)
+
+    def _left_out(self, bits: F64, below: float) -> F64:
         """Widths (n,) that wrong weights of bits bring about, less what the local fit takes."""
         codes = np.arange(len(self.gap))
-        begins = codes + (codes[:, None] >> np.arange(len(bits)) & 1) @ bits
+        begins = codes + moved_by_bits(bits, below, len(codes))
         # A code that begins after a higher one is never reached.
         reached = np.minimum.accumulate(begins[::-1])[::-1]
-        width, gap = np.diff(reached) - 1, self.gap[:-1]
-        left = np.convolve(np.where(gap, 0.0, width), self.kernel, "same")
-        return np.asarray((left + np.where(gap, width, 0.0))[self.number])
+        return self._after_fit(np.diff(reached) - 1)[self.number]
 
-    def without(self, bits: F64) -> "CodeWidths":
+    def _after_fit(self, width: F64) -> F64:
+        """Widths of codes 0, 1, ..., less one, as they come out relative to a local fit."""
+        gap = self.gap[: len(width)]
+        there = np.where(gap, 0.0, width)
+        left = np.convolve(there, self.kernel, "same")
+        return np.asarray(np.where(gap, left + width, left / self._raised(there)))
+
+    def _raised(self, width: F64) -> F64:
+        """By what factor widths, less one, raise the counts that a local fit expects."""
+        taken = width - np.convolve(width, self.kernel, "same")
+        return np.asarray(np.maximum(1 + uniform_filter1d(taken, len(self.kernel)), 0.1))
+
+    def without(self, bits: F64, below: float = 0.0) -> "CodeWidths":
         """The rest, once the wrong weights of bits (codes) are taken out."""
-        return replace(self, width=self.width - self._left_out(bits))
+        return replace(self, width=self.width - self._left_out(bits, below))
 
     def ripple(self, scatter: float) -> Ripple:
         """The strongest line, over chance and a scatter of the widths (variance)."""

@@ -23,7 +23,7 @@ from pixcal.stages.diagnose.frames_used import FramesUsed
 from pixcal.stages.diagnose.look import DiagnosisInput, look_at
 from pixcal.stages.diagnose.recommended_frames import MORE
 from pixcal.stages.diagnose.result import by_domain
-from pixcal.stages.diagnose.search import CONFIRM, SCREEN, Search
+from pixcal.stages.diagnose.search import CONFIRM, SCREEN, Search, affordable
 from pixcal.stages.diagnose.trial import (
     OF_ESTIMATE,
     Curves,
@@ -93,7 +93,8 @@ def inquire(
         reference, data = _nominal(trials, look, base, run_dir)
 
     asking = _Asking(look, base, kinds, candidates, trials)
-    search = Search(reference, data, asking.simulate, asking.again)
+    most = affordable(trials.seconds)
+    search = Search(reference, data, asking.simulate, asking.again, most)
     return Inquiry(base, look, trials, reference, data, search, search.run(candidates))
 
 

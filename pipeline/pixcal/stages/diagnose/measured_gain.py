@@ -21,7 +21,7 @@ CHANGE_ERROR = 0.003
 # shot noise over read noise, as variances, of a flat that tells what effects do to the former
 LIT = 4.0
 # steps whose effects change the noise of flats otherwise than a gain does
-OF_NOISE = (Stage.CHARGE, Stage.SIGNAL)
+OF_NOISE = (Stage.CHARGE, Stage.SIGNAL, Stage.CONVERTER)
 
 
 @dataclass(frozen=True)

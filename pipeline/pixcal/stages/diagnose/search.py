@@ -45,8 +45,16 @@ PROMISING = 0.25  # share of the best gain from which a candidate is simulated m
 KNOWN_TO = 3.0  # with its effect known to one part in this: what one simulation leaves open
 MAX_CAUSES = 5  # causes that are accepted at most
 AS_GOOD = 0.1  # by which the gain of a candidate may be less than the best, to count as its equal
-SIMULATIONS = 300  # that a search may use; two causes take some 80
+# simulations that a search may use; two causes take some 80. Where they are slow, as many as this
+# much processor time (s) allows, and so many at least
+SIMULATIONS, SEARCH_S, LEAST_SIMULATIONS = 300, 400.0, 100
 SIMILAR = 0.7  # fraction of a candidate's significance that another effect may produce
+
+
+def affordable(seconds: float) -> int:
+    """Number of simulations that a search may use; each takes ``seconds`` of processor time."""
+    return int(np.clip(SEARCH_S / max(seconds, 1e-3), LEAST_SIMULATIONS, SIMULATIONS))
+
 
 Simulate = Callable[[Sequence[Effects], int, str, Sequence[str]], Sequence[list[Curves] | str]]
 Estimates = Callable[[Effects, Sequence[str]], Mapping[str, float]]
@@ -195,7 +203,8 @@ class Search:
             left -= SCREEN * (len(candidate.variants(causes.shares.get(name, 1.0))) + 1)
             if left < 0:
                 candidate.reason = (
-                    f"not decided: a search may use {self._most} simulations, and too few are left"
+                    f"not decided: this search may use {self._most} simulations, and too few are "
+                    "left"
                 )
                 del remaining[name]
 

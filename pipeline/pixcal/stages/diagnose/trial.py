@@ -1,6 +1,7 @@
 """The bench taken again: simulations of the windows that are looked at, through the same stages."""
 
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
@@ -77,6 +78,13 @@ class Trials:
     estimates: Mapping[str, Estimate] = field(default_factory=dict)
     exact: int = 0
     _made: dict[tuple[frozenset[Effect], int], list[Curves] | str] = field(default_factory=dict)
+    _seconds: list[float] = field(default_factory=list)
+
+    @property
+    def seconds(self) -> float:
+        """Processor time (s) of a simulation, all windows together: half of them took less."""
+        # A median: the first ones compile kernels.
+        return float(np.median(self._seconds or [0.0])) * len(self.windows)
 
     def curves(
         self,
@@ -127,13 +135,14 @@ class Trials:
         again = [
             n
             for n, (one, other) in enumerate(zip(moved, items, strict=True))
-            if isinstance(results[n], str) and one != other
+            if isinstance(results[n][0], str) and one != other
         ]
         if again:
             exact = run_tasks(work, [items[n] for n in again], self.runtime, label=label)
             for n, result in zip(again, exact, strict=True):
                 results[n] = result
-        return results
+        self._seconds.extend(seconds for _, seconds in results)
+        return [result for result, _ in results]
 
     def _moved(self, effects: Effects, seed: int) -> Effects:
         known = self.estimates if seed >= self.exact else {}
@@ -154,8 +163,11 @@ def _kept_or_made(
     scratch: Path,
     signatures: tuple[Signature, ...],
     item: tuple[Effects, int, int],
-) -> Curves | str:
-    """A simulation that an interrupted run has left, or a new one, which is left in turn."""
+) -> tuple[Curves | str, float]:
+    """A simulation that an interrupted run has left, or a new one, which is left in turn.
+
+    With the processor time (s) that it took when it was made.
+    """
     effects, seed, number = item
     on = sorted((e.name, to_plain(e)) for e in effects)
     name = digest(on, seed, number, windows[number].part, sorted(k.name for k in signatures))
@@ -163,18 +175,21 @@ def _kept_or_made(
     plain = _kept(file)
     if plain is not None:
         if "curves" not in plain:
-            return str(plain["refused"])
+            return str(plain["refused"]), plain["seconds"]
         return {
             (key, of): Curve(np.array(x, float), np.array(value, float))
             for key, of, x, value in plain["curves"]
-        }
+        }, plain["seconds"]
+    begun = time.thread_time()
     made = _made(windows, signatures, item)
+    seconds = time.thread_time() - begun
     if isinstance(made, str):
         plain = {"refused": made}
     else:
         plain = {"curves": [[*key, c.x.tolist(), c.value.tolist()] for key, c in made.items()]}
+    plain["seconds"] = seconds
     write_json(file, plain | {"seal": digest(plain)})
-    return made
+    return made, seconds
 
 
 def _kept(file: Path) -> dict[str, Any] | None:
