@@ -46,6 +46,21 @@ def test_pixels_have_two_levels_and_stay_in_them(
     np.testing.assert_allclose(middle, 9000, atol=1)
 
 
+def test_pixels_are_in_the_upper_level_for_its_share_of_the_time(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    """The mean level stays where it is."""
+    bench = make_effect_bench(LONG)
+    effect = TelegraphNoise(0.1, 400.0, 0.0, upper=0.1)
+    frames = frames_of(bench, bias_of(bench), [effect]).astype(float)
+    series = frames[:, np.ptp(frames, axis=0) > 20]
+    up = series > (series.max(axis=0) + series.min(axis=0)) / 2
+    # Pixels that are never up are not among them.
+    assert up.mean() == pytest.approx(0.1, abs=5 * 0.3 / np.sqrt(up.size) + 0.9 ** len(up))
+    low, high = series.min(axis=0), series.max(axis=0)
+    np.testing.assert_allclose(0.9 * low + 0.1 * high, 9000, atol=1)
+
+
 def test_it_belongs_to_the_pixels_of_the_chip(make_effect_bench: Callable[..., Bench]) -> None:
     chip = {"detector.chip": [150, 300], "frames.bias": 30}
     effect = TelegraphNoise(0.1, 400.0, 0.0)

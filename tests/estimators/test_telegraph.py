@@ -1,6 +1,7 @@
 """Telegraph noise by its moments: unbiased however faint and slow; likelihoods against SciPy."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from scipy.special import logsumexp
 from pixcal.estimators.detector.telegraph.classes import Mixture
 from pixcal.estimators.detector.telegraph.dwell import LitSeries, find_stays
 from pixcal.estimators.detector.telegraph.find import find_telegraph
+from pixcal.estimators.detector.telegraph.levels import find_upper
 from pixcal.estimators.detector.telegraph.moments import QUIET, Series, moments_of, thinned
+from pixcal.model.arrays import Indices
 
 PERIOD_S = 0.14
 
@@ -24,11 +27,12 @@ def jumping(
     n: int = 16_000,
     differ: float = 0.0,
     tail: float = 0.0,
+    upper: float = 0.5,
 ) -> list[Series]:
     """Series of the same pixels, of noise one and jumps with amplitudes about ``amplitude``.
 
     ``differ``: standard deviation of the logarithm of the pixels' own noise. ``tail``: the same of
-    the amplitudes, if they are not exponential.
+    the amplitudes, if they are not exponential. ``upper``: share of the time in the upper level.
     """
     own = rng.lognormal(0, differ, n) if differ else 1.0
     times = switching_s * 10 ** (decades * (rng.random(n) - 0.5)) if decades else switching_s
@@ -37,9 +41,11 @@ def jumping(
     series = []
     for frames in frames_of_series:
         anew = rng.random((frames, n)) < 1 - np.exp(-2 * PERIOD_S / times)
-        turns = np.where(anew & (rng.random((frames, n)) < 0.5), -1.0, 1.0)
-        turns[0] = rng.choice([-1.0, 1.0], n)
-        noise = own * rng.standard_normal((frames, n)) + np.cumprod(turns, axis=0) * jumps / 2
+        anew[0] = True
+        coin, levels = rng.random((frames, n)) < upper, np.empty((frames, n))
+        for t in range(frames):
+            levels[t] = np.where(anew[t], coin[t], levels[t - 1])
+        noise = own * rng.standard_normal((frames, n)) + (levels - upper) * jumps
         series.append(Series(noise, np.arange(frames), np.arange(n), 1.0, PERIOD_S))
     return series
 
@@ -151,6 +157,39 @@ def test_frames_of_fringes_tell_how_long_pixels_stay(time_s: float, decades: flo
     stays, error = found
     assert abs(stays.mean_s - time_s) < 4 * error < 1.6 * time_s
     assert abs(stays.decades - decades) <= 0.5
+
+
+@pytest.mark.parametrize("upper", [0.05, 0.2, 0.5, 0.9])
+def test_frames_of_fringes_tell_how_much_of_the_time_pixels_are_in_the_upper_level(
+    upper: float,
+) -> None:
+    rng = np.random.default_rng(7)
+    (bright,) = jumping(rng, 1.0, 12.0, 0.3, 0.0, (311,), 200, tail=0.3, upper=upper)
+    noisier = rng.uniform(3.0, 9.0, bright.noise.shape)
+    charge = bright.noise + noisier * rng.standard_normal(noisier.shape)
+    charge -= charge.mean(axis=0)
+    lit = LitSeries(charge, 1 / (1 + noisier**2), bright.frame, PERIOD_S)
+    assert find_upper([lit], 1.0) == pytest.approx(upper, rel=0.15)
+    noise = replace(lit, charge=noisier * rng.standard_normal(noisier.shape))
+    assert find_upper([noise], 1.0) == 0.5
+
+
+@pytest.mark.long
+def test_pixels_that_are_rarely_in_the_upper_level_are_counted() -> None:
+    rng = np.random.default_rng(8)
+    shape = {"tail": 0.3, "upper": 0.06}
+    dark, bright = jumping(rng, 0.03, 15.0, 0.5, 0.0, (40, 311), **shape)
+    charge = bright.noise + 6 * rng.standard_normal(bright.noise.shape)
+
+    def lit(pixels: Indices) -> list[LitSeries]:
+        own = charge[:, pixels]
+        return [LitSeries(own, np.full(own.shape, 1 / 37), bright.frame, PERIOD_S)]
+
+    found = find_telegraph([dark], lit)
+    assert found is not None
+    assert found.upper == pytest.approx(0.06, rel=0.2)
+    assert found.share == pytest.approx(0.03, rel=0.3)
+    assert found.amplitude == pytest.approx(15 * np.exp(0.045), rel=0.15)
 
 
 def test_noise_without_jumps_tells_no_stays() -> None:

@@ -34,7 +34,7 @@ _FRAMES_AT_ONCE = 256
 class TelegraphNoise(Effect):
     """Some pixels jump between two levels, as a trap fills and empties.
 
-    Both states are equally likely; the level lies half an amplitude above or below its mean.
+    Both states are equally likely unless ``upper`` says otherwise; the mean level does not change.
     Amplitudes have a gamma distribution, by default an exponential one. Nothing of it is constant
     in time, so maps of the fit neither show it nor can be mended; the pixels are those that
     `reduce` flags as noisy.
@@ -73,6 +73,7 @@ class TelegraphNoise(Effect):
         0.0, low=0, high=6, doc="range of the times from pixel to pixel, even in the logarithm; "
         "switching_s is the geometric mean"
     )  # fmt: skip
+    upper: float = quantity(0.5, above=0, below=1, doc="share of the time in the upper level")
 
     def readout(self, adu: F32, shot: Shot) -> F32:
         found = adu.copy()
@@ -87,9 +88,9 @@ class TelegraphNoise(Effect):
                 continue
             seed = int(recording.pixel_rng(self.name, block).integers(1 << 62))
             keep = np.broadcast_to(stays.kept(recording.period_s, places), len(rows))
-            states = _states(seed, recording.count, keep.tobytes())
+            states = _states(seed, recording.count, keep.tobytes(), self.upper)
             up = np.unpackbits(states[shot.frame], count=len(rows))
-            step = (up - np.float32(0.5)) * amplitudes * np.float32(self.amplitude_e)
+            step = (up - np.float32(self.upper)) * amplitudes * np.float32(self.amplitude_e)
             inside = (rows >= first) & (rows < last)
             at = rows[inside] - first, columns[inside]
             found[at] += step[inside] / np.float32(detector.gain_e_per_adu)
@@ -117,7 +118,14 @@ class TelegraphNoise(Effect):
 
 def _estimate(cls: type[TelegraphNoise], found: Telegraph) -> Estimate:
     return Estimate(
-        cls(found.share, found.amplitude, found.switching_s, found.shape, found.switching_decades),
+        cls(
+            found.share,
+            found.amplitude,
+            found.switching_s,
+            found.shape,
+            found.switching_decades,
+            found.upper,
+        ),
         {
             "share": found.share_error,
             "amplitude_e": found.amplitude_error,
@@ -150,10 +158,11 @@ def _pixels(
 
 
 @lru_cache(maxsize=4)
-def _states(seed: int, frames: int, kept: bytes) -> U8:
+def _states(seed: int, frames: int, kept: bytes, upper: float) -> U8:
     """Whether each pixel is in its upper level, in bits: (frame, pixel / 8).
 
-    Of each pixel, float64, the correlation from frame to frame.
+    ``kept``: of each pixel, float64, the correlation from frame to frame. ``upper``: share of the
+    time in the upper level.
     """
     rng, keep = np.random.default_rng(seed), np.frombuffer(kept)
     pixels = len(keep)
@@ -165,7 +174,7 @@ def _states(seed: int, frames: int, kept: bytes) -> U8:
         states = np.empty((count, pixels), bool)
         for n, (anew, coin) in enumerate(drawn):
             draw = anew >= keep if first + n else np.ones(pixels, bool)
-            up = np.where(draw, coin < 0.5, up)
+            up = np.where(draw, coin < upper, up)
             states[n] = up
         packed.append(np.packbits(states, axis=1))
     return np.concatenate(packed)

@@ -1,7 +1,7 @@
 """Likelihoods of pixels' variances by classes of amplitudes, and mixtures of the classes.
 
 A pixel that jumps by A between two equally likely levels has A²/4 more variance, or less of that
-where it stays long.
+where it stays long or is rarely in one of them.
 """
 
 from collections.abc import Iterable, Sequence
@@ -47,7 +47,8 @@ class AmplitudeClasses:
         largest = levels.max(axis=1, keepdims=True)
         levels -= largest
         np.exp(levels, out=levels)
-        of_levels = _levels(tuple(stays.kept(m.period_s, PLACES).tolist()), m.frames)
+        kept = tuple(stays.kept(m.period_s, PLACES).tolist())
+        of_levels = _levels(kept, m.frames, stays.upper)
         return cls(levels, largest, quiet, noise, added, *of_levels)
 
     def mixed(self) -> F64:
@@ -74,6 +75,7 @@ class Stays:
 
     mean_s: float  # geometric mean over the pixels; 0: no longer than a frame
     decades: float = 0.0  # range of the pixels' times, even in the logarithm
+    upper: float = 0.5  # share of the time in the upper level
 
     def kept(self, period_s: float, places: F32 | F64) -> F64:
         """Correlation from frame to frame of pixels at places in the range, 0 to 1."""
@@ -84,17 +86,23 @@ class Stays:
 
 
 @lru_cache(maxsize=64)
-def states(keeps: tuple[float, ...], count: int) -> F64:
-    """States (frame, pixel), -1 or 1, less their mean; pixels keep them by turns so well."""
+def states(keeps: tuple[float, ...], count: int, upper: float) -> F64:
+    """States (frame, pixel), -1 or 1, less their mean; pixels keep them by turns so well.
+
+    ``upper``: share of the time that they are 1.
+    """
     rng = np.random.default_rng(0)
     keep = np.resize(keeps, _DRAWN)
-    turns = np.where(rng.random((count, _DRAWN)) < (1 - keep) / 2, -1.0, 1.0)
-    found = np.cumprod(turns, axis=0)
+    anew, up = rng.random((count, _DRAWN)) >= keep, rng.random((count, _DRAWN)) < upper
+    anew[0] = True
+    # Each frame has the state that was last drawn anew.
+    drawn = np.maximum.accumulate(np.where(anew, np.arange(count)[:, None], 0), axis=0)
+    found = np.where(np.take_along_axis(up, drawn, 0), 1.0, -1.0)
     return np.asarray(found - found.mean(axis=0))
 
 
 @lru_cache(maxsize=64)
-def _levels(keeps: tuple[float, ...], count: int) -> tuple[F64, F64]:
+def _levels(keeps: tuple[float, ...], count: int, upper: float) -> tuple[F64, F64]:
     """What a pixel of an amplitude shows in a number of frames, by its stays.
 
     One that stays long shows more or less of its two levels, or only one: it looks as if it had
@@ -107,7 +115,7 @@ def _levels(keeps: tuple[float, ...], count: int) -> tuple[F64, F64]:
     products : (lag, level, class) float64
         That chance, times the products of frames apart it then has over its full variance.
     """
-    shown = states(keeps, count)
+    shown = states(keeps, count, upper)
     seen = (shown**2).sum(axis=0) / (count - 1)
     near = np.zeros((len(LAGS), _DRAWN))
     for own, lag in zip(near, LAGS, strict=True):

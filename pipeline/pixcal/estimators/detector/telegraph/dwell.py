@@ -37,11 +37,14 @@ class LitSeries:
     period_s: float
 
 
-def find_stays(lit: Sequence[LitSeries], seen: Moments) -> tuple[Stays, float] | None:
+def find_stays(
+    lit: Sequence[LitSeries], seen: Moments, upper: float = 0.5
+) -> tuple[Stays, float] | None:
     """Stays of the pixels, and the error (s) of their mean; None where the frames do not tell.
 
-    ``seen``: of the frames by which the pixels were chosen. Pixels that stayed in one level there
-    were not chosen, and this is allowed for.
+    ``upper``: share of the time that they are in the upper level. ``seen``: of the frames by which
+    the pixels were chosen. Pixels that stayed in one level there were not chosen, and this is
+    allowed for.
     """
     lit = [s for s in lit if s.charge.shape[1] >= FEWEST_PIXELS and s.period_s > 0]
     products = [_products(s) for s in lit]
@@ -60,10 +63,11 @@ def find_stays(lit: Sequence[LitSeries], seen: Moments) -> tuple[Stays, float] |
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def expected(log_time: float, decades: float) -> F64:
-        stays = Stays(float(np.exp(log_time)), decades)
+        stays = Stays(float(np.exp(log_time)), decades, upper)
         kept = np.broadcast_to(stays.kept(period, PLACES), PLACES.shape)
         chosen, shown = _chosen(stays, seen)
         variance = _excess(seen) * seen.sigma**2 * chosen.sum() / max(float(chosen @ shown), 1e-9)
+        variance *= 4 * upper * (1 - upper)
         powers = kept ** LAGS[used, None] - _of_mean(kept, count)
         return np.asarray(variance * (powers @ chosen) / max(chosen.sum(), 1e-9))
 
@@ -91,7 +95,7 @@ def find_stays(lit: Sequence[LitSeries], seen: Moments) -> tuple[Stays, float] |
     if not np.isfinite(chi2):
         return None
     time = float(np.exp(log_time))
-    return Stays(time, decades), float(min(error, 1.0)) * time
+    return Stays(time, decades, upper), float(min(error, 1.0)) * time
 
 
 def _products(series: LitSeries) -> tuple[F64, F64]:
@@ -127,7 +131,7 @@ def _chosen(stays: Stays, seen: Moments) -> tuple[F64, F64]:
     """
     limit = NOISY * np.sqrt(2 / seen.dof) / max(_excess(seen), 1e-9)
     kept = np.broadcast_to(stays.kept(seen.period_s, PLACES), PLACES.shape)
-    shown = states(tuple(kept.tolist()), seen.frames)
+    shown = states(tuple(kept.tolist()), seen.frames, stays.upper)
     variance = ((shown**2).sum(axis=0) / (seen.frames - 1)).reshape(-1, len(PLACES))
     chosen = variance > limit
     return chosen.mean(axis=0), np.where(chosen, variance, 0).sum(axis=0) / np.maximum(

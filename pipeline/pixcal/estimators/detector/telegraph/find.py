@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from pixcal.estimators.detector.telegraph.classes import Stays
 from pixcal.estimators.detector.telegraph.dwell import LitSeries, find_stays
+from pixcal.estimators.detector.telegraph.levels import find_upper
 from pixcal.estimators.detector.telegraph.moments import Moments, Series, moments_of, signs, thinned
 from pixcal.estimators.detector.telegraph.population import (
     Population,
@@ -33,6 +34,7 @@ class Telegraph:
     shape: float
     switching_s: float
     switching_decades: float  # range of the pixels' times, even in the logarithm
+    upper: float  # share of the time in the upper level
     share_error: float
     amplitude_error: float
     shape_error: float
@@ -57,7 +59,17 @@ def find_telegraph(
     significance = sigmas_of_best(flat_top, staying)
     longest = max(parts, key=lambda m: m.frames)
     chosen = longest.pixel[longest.excess > 0]
-    known = find_stays(lit(chosen), longest) if significance > SIGNIFICANT and noisy else None
+    known = None
+    if significance > SIGNIFICANT and noisy:
+        of_fringes = lit(chosen)
+        upper = find_upper(of_fringes, longest.sigma)
+        if upper != 0.5:
+            # What looks like a hit is the rarer level.
+            parts = [m for s in series if (m := moments_of(s, hits=True)) is not None]
+            longest = max(parts, key=lambda m: m.frames)
+            of_fringes = lit(longest.pixel[longest.excess > 0])
+            upper = find_upper(of_fringes, longest.sigma)
+        known = find_stays(of_fringes, longest, upper)
     parts = thinned(parts)
     if known is not None:
         found = _Found(find_population(parts, known[0]), *known, 0.0)
@@ -65,7 +77,7 @@ def find_telegraph(
         found = _likeliest(parts)
     p = found.population
     return Telegraph(
-        p.share, p.amplitude, p.shape, found.stays.mean_s, found.stays.decades,
+        p.share, p.amplitude, p.shape, found.stays.mean_s, found.stays.decades, found.stays.upper,
         p.share_error, p.amplitude_error, p.shape_error, found.error,
         significance, flat_top, staying, noisy,
     )  # fmt: skip

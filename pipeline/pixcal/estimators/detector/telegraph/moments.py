@@ -71,10 +71,14 @@ class Moments:
         return np.where(excess > NOISY * np.sqrt(2 / self.dof), excess, 0)
 
 
-def moments_of(series: Series) -> Moments | None:
-    """Moments of the noise of each pixel; None where there are too few frames."""
+def moments_of(series: Series, *, hits: bool = False) -> Moments | None:
+    """Moments of the noise of each pixel; None where there are too few frames.
+
+    ``hits``: whether samples far beyond all others of their pixel count.
+    """
     x = series.noise - np.nanmedian(series.noise, axis=0)
-    x[_particles(x)] = np.nan
+    if not hits:
+        x[_particles(x)] = np.nan
     n = np.isfinite(x).sum(axis=0).astype(float)
     used = n > _MIN_FRAMES
     if not used.any():

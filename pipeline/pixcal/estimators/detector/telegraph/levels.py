@@ -1,0 +1,61 @@
+"""How much of the time pixels are in their upper level, from frames of which there are many.
+
+The charge that fringes leave of a pixel has a normal distribution about either level. Its mean is
+taken off, so the rarer level lies further from zero.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import logit, logsumexp
+
+from pixcal.estimators.detector.telegraph.dwell import FEWEST_PIXELS, LitSeries
+from pixcal.model.arrays import F64
+
+_RARER = np.array([0.02, 0.035, 0.06, 0.1, 0.17, 0.28])
+SHARES = np.concatenate([_RARER, [0.5], 1 - _RARER[::-1]])  # of the time in the upper level
+AMPLITUDES = np.geomspace(1.0, 60.0, 14)  # over the noise of dark frames
+# by which the log-likelihood of unequal levels must be higher, a pixel: frames near each other are
+# alike, so it rises by more than of independent ones
+CLEAR, CLEAR_A_PIXEL = 10.0, 0.1
+MOST_PIXELS = 400
+_QUIET = np.array([0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0])  # shares of pixels that may not jump at all
+
+
+def find_upper(lit: Sequence[LitSeries], noise: float) -> float:
+    """Share of the time in the upper level that all pixels have in common; 0.5 unless it is clear.
+
+    Parameters
+    ----------
+    lit : frames of fringes of the same pixels
+    noise : of dark frames, e-
+    """
+    used = [s for s in lit if s.charge.shape[1] >= FEWEST_PIXELS]
+    if not used:
+        return 0.5
+    each = -(-used[0].charge.shape[1] // MOST_PIXELS)
+    charge = np.concatenate([s.charge[:, ::each] for s in used])
+    weight = np.concatenate([s.weight[:, ::each] for s in used])
+    likely = np.array([_log_likelihood(charge, weight, p, noise * AMPLITUDES) for p in SHARES])
+    best, even = int(np.argmax(likely)), int(np.flatnonzero(SHARES == 0.5)[0])
+    if likely[best] - likely[even] < CLEAR + CLEAR_A_PIXEL * charge.shape[1]:
+        return 0.5
+    # The top of a parabola through it and its neighbours.
+    near = np.clip(np.arange(best - 1, best + 2), 0, len(SHARES) - 1)
+    if len(set(near.tolist())) < 3:
+        return float(SHARES[best])
+    curve = np.polyfit(logit(SHARES[near]), likely[near] - likely[best], 2)
+    return float(1 / (1 + np.exp(curve[1] / (2 * curve[0]))))
+
+
+def _log_likelihood(charge: F64, weight: F64, upper: float, amplitudes: F64) -> float:
+    """Of all pixels (t, n), each of which has any of the amplitudes or none; over that of none."""
+    total = np.empty((len(amplitudes), charge.shape[1]))
+    for own, amplitude in zip(total, amplitudes, strict=True):
+        levels = -upper * amplitude, (1 - upper) * amplitude
+        low, high = ((level * charge - level**2 / 2) * weight for level in levels)
+        own[:] = np.logaddexp(np.log1p(-upper) + low, np.log(upper) + high).sum(axis=0)
+    jumps = logsumexp(total, axis=0) - np.log(len(amplitudes))
+    with np.errstate(divide="ignore"):  # none jumps
+        either = np.logaddexp(np.log(_QUIET)[:, None], np.log1p(-_QUIET)[:, None] + jumps)
+    return float(either.sum(axis=1).max())
