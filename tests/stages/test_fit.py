@@ -26,15 +26,45 @@ def fitted(make_bench, write_reduced, tmp_path_factory):
     )
     run = write_reduced(bench, tmp_path_factory.mktemp("fit") / "run")
     fit.run(run, fit.Config(), Runtime())
-    return bench, run, json.loads((run / "products" / "fit.json").read_text())
+    return bench, run, fit_json(run)
+
+
+@pytest.fixture
+def copied(fitted, tmp_path):
+    """The run of `fitted` once more."""
+    return shutil.copytree(fitted[1], tmp_path / "run")
+
+
+@pytest.fixture
+def unfitted(copied):
+    """The same before the fit."""
+    for stage in ("sweep", "fit", "products"):
+        shutil.rmtree(copied / stage)
+    return copied
+
+
+def fit_json(run):
+    return json.loads((run / "products" / "fit.json").read_text())
+
+
+def error_of(bench, run, name, product="delta_fringe", **options):
+    """Error of a set's map, and the errors and flags that it comes with."""
+    data, sigma, flags, _ = read_map(run / "products" / f"{product}.fits")
+    truth = bench.delta_y if name == "horizontal" else bench.delta_x
+    return bench.without_modes(data - truth, name, **options), sigma, flags
+
+
+def remask(run, name, mask, reseal):
+    group = run / "reduce" / "reduced.zarr" / name
+    shutil.rmtree(group / "mask")
+    write_array(group / "mask", mask, dims=("y", "x"), chunks=(128, 128))
+    reseal(run / "reduce")
 
 
 @pytest.mark.parametrize("name", SETS)
 def test_maps_are_at_the_bound_and_their_errors_honest(fitted, name):
     bench, run, result = fitted
-    data, sigma, mask, _ = read_map(run / "products" / f"{SETS[name]}.fits")
-    truth = bench.delta_x if name == "vertical" else bench.delta_y
-    error = bench.without_modes(data - truth, name)
+    error, sigma, mask = error_of(bench, run, name, SETS[name])
     bound = bench.bound(name)
     # 20 550 pixels: the rms is known to half a percent.
     assert np.nanstd(error) / bound < 1.03
@@ -47,8 +77,7 @@ def test_maps_are_at_the_bound_and_their_errors_honest(fitted, name):
 def test_the_error_holds_no_fringes(fitted):
     """Power at the fringe frequency and twice it is what noise alone gives."""
     bench, run, _ = fitted
-    data, *_ = read_map(run / "products" / "delta_x.fits")
-    error = bench.without_modes(data - bench.delta_x, "vertical")
+    error, *_ = error_of(bench, run, "vertical", "delta_x")
     k = bench.wave_number("vertical")
     x = np.arange(bench.shape[1])
     for harmonic in (1, 2):
@@ -116,52 +145,39 @@ def bench_batches(result):
 @pytest.mark.parametrize(
     "runtime", [Runtime("sync"), Runtime("threads", workers=3), Runtime("processes", workers=2)]
 )
-def test_the_same_bits_however_it_runs(fitted, tmp_path, runtime):
-    _, run, _ = fitted
-    again = tmp_path / "run"
-    for part in ("ingest", "reduce"):
-        shutil.copytree(run / part, again / part)
-    fit.run(again, fit.Config(), runtime)
+def test_the_same_bits_however_it_runs(fitted, unfitted, runtime):
+    fit.run(unfitted, fit.Config(), runtime)
     for name in SETS.values():
-        paths = (folder / "products" / f"{name}.fits" for folder in (run, again))
+        paths = (folder / "products" / f"{name}.fits" for folder in (fitted[1], unfitted))
         with fits.open(next(paths)) as a, fits.open(next(paths)) as b:
             for n in range(3):
                 np.testing.assert_array_equal(a[n].data, b[n].data)
 
 
-def test_up_to_date_work_is_skipped_and_another_model_sweeps_no_more(fitted, tmp_path):
-    _, run, _ = fitted
-    again = tmp_path / "run"
-    shutil.copytree(run, again)
-    first = fit.run(again, fit.Config(), Runtime())
-    before = (again / "fit" / "manifest.json").stat().st_mtime_ns
-    assert fit.run(again, fit.Config(), Runtime()) == first
-    assert (again / "fit" / "manifest.json").stat().st_mtime_ns == before
-    (again / "products" / "delta_x.fits").unlink()
-    fit.run(again, fit.Config(), Runtime())
-    assert (again / "products" / "delta_x.fits").exists()
-    swept = (again / "sweep" / "manifest.json").stat().st_mtime_ns
-    other = fit.run(again, fit.Config(model="hyperbolic"), Runtime())
+def test_up_to_date_work_is_skipped_and_another_model_sweeps_no_more(copied):
+    first = fit.run(copied, fit.Config(), Runtime())
+    before = (copied / "fit" / "manifest.json").stat().st_mtime_ns
+    assert fit.run(copied, fit.Config(), Runtime()) == first
+    assert (copied / "fit" / "manifest.json").stat().st_mtime_ns == before
+    (copied / "products" / "delta_x.fits").unlink()
+    fit.run(copied, fit.Config(), Runtime())
+    assert (copied / "products" / "delta_x.fits").exists()
+    swept = (copied / "sweep" / "manifest.json").stat().st_mtime_ns
+    other = fit.run(copied, fit.Config(model="hyperbolic"), Runtime())
     assert other.summary["sets"]["vertical"]["model"] == "hyperbolic"
-    assert (again / "sweep" / "manifest.json").stat().st_mtime_ns == swept
+    assert (copied / "sweep" / "manifest.json").stat().st_mtime_ns == swept
 
 
-def test_products_that_were_removed_are_published_again(fitted, tmp_path):
-    _, run, _ = fitted
-    again = tmp_path / "run"
-    shutil.copytree(run, again)
-    first = fit.run(again, fit.Config(), Runtime())
-    shutil.rmtree(again / "products")
-    assert fit.run(again, fit.Config(), Runtime()) == first
+def test_products_that_were_removed_are_published_again(fitted, copied):
+    first = fit.run(copied, fit.Config(), Runtime())
+    shutil.rmtree(copied / "products")
+    assert fit.run(copied, fit.Config(), Runtime()) == first
     for name in ("delta_x.fits", "delta_y.fits"):
-        assert (again / "products" / name).read_bytes() == (run / "products" / name).read_bytes()
+        before, after = (run / "products" / name for run in (fitted[1], copied))
+        assert after.read_bytes() == before.read_bytes()
 
 
-def test_a_killed_fit_resumes_to_the_same_bits(fitted, tmp_path, monkeypatch):
-    _, run, _ = fitted
-    again = tmp_path / "run"
-    for part in ("ingest", "reduce"):
-        shutil.copytree(run / part, again / part)
+def test_a_killed_fit_resumes_to_the_same_bits(fitted, unfitted, monkeypatch):
     from pixcal.stages.fit import sweep
 
     calls = []
@@ -175,39 +191,32 @@ def test_a_killed_fit_resumes_to_the_same_bits(fitted, tmp_path, monkeypatch):
     real = sweep._sweep_strip
     monkeypatch.setattr(sweep, "_sweep_strip", breaking)
     with pytest.raises(KeyboardInterrupt):
-        fit.run(again, fit.Config(), Runtime("sync"))
-    assert not (again / "sweep").exists()
-    fit.run(again, fit.Config(), Runtime("sync"))
+        fit.run(unfitted, fit.Config(), Runtime("sync"))
+    assert not (unfitted / "sweep").exists()
+    fit.run(unfitted, fit.Config(), Runtime("sync"))
     # A strip of tiles was noted as done before the kill; it is not done again.
     assert calls[0] not in calls[2:3]
     assert len(calls) == 2 + 1 + 2
-    a, *_ = read_map(run / "products" / "delta_y.fits")
-    b, *_ = read_map(again / "products" / "delta_y.fits")
+    a, *_ = read_map(fitted[1] / "products" / "delta_y.fits")
+    b, *_ = read_map(unfitted / "products" / "delta_y.fits")
     np.testing.assert_array_equal(a, b)
 
 
-def test_a_damaged_chunk_is_named(fitted, tmp_path):
-    _, run, _ = fitted
-    again = tmp_path / "run"
-    for part in ("ingest", "reduce"):
-        shutil.copytree(run / part, again / part)
-    chunk = again / "reduce" / "reduced.zarr" / "horizontal" / "signal" / "c" / "1" / "0" / "1"
+def test_a_damaged_chunk_is_named(unfitted):
+    chunk = unfitted / "reduce" / "reduced.zarr" / "horizontal" / "signal" / "c" / "1" / "0" / "1"
     raw = bytearray(chunk.read_bytes())
     raw[len(raw) // 2] ^= 4
     chunk.write_bytes(raw)
     with pytest.raises(DamagedError, match="c/1/0/1"):
-        fit.run(again, fit.Config(), Runtime())
+        fit.run(unfitted, fit.Config(), Runtime())
 
 
 def test_masked_pixels_are_nan_with_their_flag(make_bench, write_reduced, reseal, tmp_path):
     bench = make_bench(shape=(40, 45), frames=100, sets={"only": (4.0, 4.0)}, interfringe=6.0)
     run = write_reduced(bench, tmp_path / "run")
-    group = run / "reduce" / "reduced.zarr" / "only"
     mask = np.zeros(bench.shape, np.uint8)
     mask[3, 4], mask[10, 11] = PixelFlag.HOT, PixelFlag.DEAD
-    shutil.rmtree(group / "mask")
-    write_array(group / "mask", mask, dims=("y", "x"), chunks=(128, 128))
-    reseal(run / "reduce")
+    remask(run, "only", mask, reseal)
     fit.run(run, fit.Config(), Runtime())
     data, sigma, flags, header = read_map(run / "products" / "delta_fringe.fits")
     np.testing.assert_array_equal(flags, mask)
@@ -233,7 +242,7 @@ def test_hyperbolic_fringes_are_seen_and_fitted(make_bench, write_reduced, resea
     config.write_text(json.dumps(acquisition))
     reseal(run / "ingest")
     fit.run(run, fit.Config(), Runtime())
-    result = json.loads((run / "products" / "fit.json").read_text())
+    result = fit_json(run)
     for name, product in SETS.items():
         facts = result["sets"][name]
         assert facts["model"] == "hyperbolic"
@@ -241,14 +250,11 @@ def test_hyperbolic_fringes_are_seen_and_fitted(make_bench, write_reduced, resea
             middle = (bench.shape[1 if axis == "x" else 0] - 1) / 2 * bench.pitch
             value = facts["geometry"][f"centre_{axis}_mm"] - middle
             assert abs(value - wanted) < 4 * facts["geometry"][f"centre_{axis}_sigma_mm"]
-        data, sigma, _, _ = read_map(run / "products" / f"{product}.fits")
-        truth = bench.delta_x if name == "vertical" else bench.delta_y
-        error = bench.without_modes(data - truth, name, quadratic=True)
+        error, sigma, _ = error_of(bench, run, name, product, quadratic=True)
         assert np.nanstd(error) / bench.bound(name) < 1.03
         assert 0.97 < np.nanstd(error / sigma) < 1.03
     fit.run(run, fit.Config(model="paraxial"), Runtime())
-    data, *_ = read_map(run / "products" / "delta_x.fits")
-    crest = bench.without_modes(data - bench.delta_x, "vertical")
+    crest, *_ = error_of(bench, run, "vertical", "delta_x")
     assert np.nanstd(crest) / bench.bound("vertical") > 1.5
 
 
@@ -259,7 +265,7 @@ def test_three_sets_are_consistent(make_bench, write_reduced, tmp_path):
     )  # fmt: skip
     run = write_reduced(bench, tmp_path / "run")
     fit.run(run, fit.Config(), Runtime())
-    result = json.loads((run / "products" / "fit.json").read_text())
+    result = fit_json(run)
     # The sets' own removed modes differ: what one set lost, another keeps; some chi-square is left.
     assert 0.8 < result["sets_chi2_reduced"] < 1.3
     _data, sigma, _, _ = read_map(run / "products" / "delta_x.fits")
@@ -280,7 +286,7 @@ def test_a_baseline_wrong_by_a_factor_is_pointed_out(make_bench, write_reduced, 
     file.write_text(json.dumps(listed))
     reseal(run / "ingest")
     fit.run(run, fit.Config(), Runtime())
-    found = json.loads((run / "products" / "fit.json").read_text())["sets"]
+    found = fit_json(run)["sets"]
     assert "period is 5 px, but baseline_mm" in found["vertical"]["period_note"]
     assert "give 15 px" in found["vertical"]["period_note"]
     assert found["horizontal"]["period_note"] == ""
@@ -305,12 +311,6 @@ def test_stitches_are_not_taken_for_hyperbolic_fringes(make_bench, write_reduced
         assert result["sets"][name]["model"] == "paraxial", result["sets"][name]["evidence"]
 
 
-def remask(run, name, mask):
-    group = run / "reduce" / "reduced.zarr" / name
-    shutil.rmtree(group / "mask")
-    write_array(group / "mask", mask, dims=("y", "x"), chunks=(128, 128))
-
-
 @pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("shape", "masked"),
@@ -327,37 +327,33 @@ def test_tiles_of_few_good_pixels(make_bench, write_reduced, reseal, tmp_path, s
     run = write_reduced(bench, tmp_path / "run")
     mask = np.zeros(shape, np.uint8)
     mask[masked] = PixelFlag.DEAD
-    remask(run, name, mask)
-    reseal(run / "reduce")
+    remask(run, name, mask, reseal)
     fit.run(run, fit.Config(), Runtime())
-    data, sigma, flags, _ = read_map(run / "products" / "delta_fringe.fits")
+    error, sigma, flags = error_of(bench, run, name)
     np.testing.assert_array_equal(flags > 0, mask > 0)
-    np.testing.assert_array_equal(np.isnan(data), mask > 0)
-    truth = bench.delta_x if name == "vertical" else bench.delta_y
-    error = bench.without_modes(data - truth, name)
+    np.testing.assert_array_equal(np.isnan(error), mask > 0)
     assert 0.85 < np.nanstd(error / sigma) < 1.15
-    result = json.loads((run / "products" / "fit.json").read_text())["sets"][name]
+    result = fit_json(run)["sets"][name]
     assert result["pixels_masked"] == np.count_nonzero(mask)
     assert result["sigma_median_px"] == pytest.approx(np.nanmedian(sigma), rel=0.02)
 
 
-def test_a_frame_of_saturated_samples_costs_no_more_than_itself(
-    make_bench, write_reduced, tmp_path
-):
-    bench = make_bench(shape=(40, 45), frames=90, sets={"only": (6.0, 0.0)})
+@pytest.mark.parametrize("lost", ["two frames", "crests"])
+def test_saturated_samples_cost_no_more_than_themselves(make_bench, write_reduced, tmp_path, lost):
+    """Be it all samples of some frames, or a third of the samples of all."""
+    bench = make_bench(shape=(40, 45), frames=120, sets={"only": (6.0, 0.0)})
     read_out = bench.read_out
 
     def saturated(electrons):
         codes = read_out(electrons)
-        codes[[5, 70]] = 65535
+        codes[[5, 70] if lost == "two frames" else codes > 36_000] = 65535
         return codes
 
     bench.read_out = saturated
     run = write_reduced(bench, tmp_path / "run")
     fit.run(run, fit.Config(), Runtime())
-    data, sigma, flags, _ = read_map(run / "products" / "delta_fringe.fits")
+    error, sigma, flags = error_of(bench, run, "only")
     assert not flags.any()
-    error = bench.without_modes(data - bench.delta_x, "only")
     assert 0.93 < np.nanstd(error / sigma) < 1.07
 
 
@@ -371,21 +367,16 @@ def test_a_slow_scan_is_looked_at_all_along(make_bench, write_reduced, tmp_path,
     run = write_reduced(bench, tmp_path / "run")
     monkeypatch.setattr(scouting, "PRIME_BYTES", 1)
     fit.run(run, fit.Config(), Runtime())
-    data, sigma, _, _ = read_map(run / "products" / "delta_fringe.fits")
-    error = bench.without_modes(data - bench.delta_x, "only")
+    error, sigma, _ = error_of(bench, run, "only")
     assert 0.93 < np.nanstd(error / sigma) < 1.07
-    result = json.loads((run / "products" / "fit.json").read_text())
+    result = fit_json(run)
     assert result["sets"]["only"]["chi2_reduced"] == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_set_without_a_pixel_that_can_be_fitted_is_named(fitted, tmp_path, monkeypatch):
-    _, run, _ = fitted
-    again = tmp_path / "run"
-    for part in ("ingest", "reduce"):
-        shutil.copytree(run / part, again / part)
+def test_a_set_without_a_pixel_that_can_be_fitted_is_named(unfitted, monkeypatch):
     monkeypatch.setattr(fit_flags, "MAX_SIGMA_RAD", 0.0)
     with pytest.raises(InputError, match="'vertical': no pixel"):
-        fit.run(again, fit.Config(), Runtime())
+        fit.run(unfitted, fit.Config(), Runtime())
 
 
 def test_the_consistency_of_sets_counts_pixels_that_one_set_lacks(
@@ -398,27 +389,8 @@ def test_the_consistency_of_sets_counts_pixels_that_one_set_lacks(
     run = write_reduced(bench, tmp_path / "run")
     mask = np.zeros(bench.shape, np.uint8)
     mask[5:] = PixelFlag.DEAD
-    remask(run, "c", mask)
-    reseal(run / "reduce")
+    remask(run, "c", mask, reseal)
     fit.run(run, fit.Config(), Runtime())
-    result = json.loads((run / "products" / "fit.json").read_text())
+    result = fit_json(run)
     # Nine pixels of ten have two sets, which cannot disagree.
     assert 0.5 < result["sets_chi2_reduced"] < 1.5
-
-
-def test_crests_that_saturate_do_not_hide_the_fringes(make_bench, write_reduced, tmp_path):
-    """A third of the samples has no weight."""
-    bench = make_bench(shape=(40, 47), frames=150, sets={"only": (6.0, 0.0)})
-    read_out = bench.read_out
-
-    def saturated(electrons):
-        codes = read_out(electrons)
-        return np.where(codes > 36_000, np.uint16(65535), codes)
-
-    bench.read_out = saturated
-    run = write_reduced(bench, tmp_path / "run")
-    fit.run(run, fit.Config(), Runtime())
-    data, sigma, flags, _ = read_map(run / "products" / "delta_fringe.fits")
-    assert not flags.any()
-    error = bench.without_modes(data - bench.delta_x, "only")
-    assert 0.9 < np.nanstd(error / sigma) < 1.1

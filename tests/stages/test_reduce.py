@@ -674,10 +674,11 @@ def test_saturated_flats_are_left_out(tmp_path: Path) -> None:
 MEMORY = """
 import sys
 from pathlib import Path
+from pixcal.engine import plan
 from pixcal.engine.run import Runtime
 from pixcal.stages.reduce import stage as reduce
-plans, make_plan = [], reduce.make_plan
-reduce.make_plan = lambda *a: plans.append(make_plan(*a)) or plans[-1]
+plans, make_plan = [], plan.make_plan
+plan.make_plan = lambda *a: plans.append(make_plan(*a)) or plans[-1]
 reduce.run(Path(sys.argv[1]), reduce.Config(), Runtime(workers=2))
 status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
 print(int(status["VmHWM"].split()[0]) * 1024, plans[0].total)
