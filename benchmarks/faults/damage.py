@@ -76,13 +76,12 @@ def metadata(bench: Bench, artefact: str, damage: Damage, times: int | None, see
     for name in _some(stored(bench, artefact, chunks=False), times, rng):
         run = _ready(bench, artefact)
         damage(run / artefact / name, rng)
+        told = name.removesuffix("/chunks.npy").removesuffix("/zarr.json")
         if name == "manifest.json" and damage is remove:
-            expected, words = 2, ("not there yet; run '",)
-        else:
-            expected, words = 2, (name.removesuffix("/chunks.npy").removesuffix("/zarr.json"),)
+            told = "not there yet; run '"
         if artefact != "sweep":  # made and read by one command, which mends it at once
-            reader = bench.command(READERS[artefact], run)
-            pixcal(*reader).refused(expected, f"pixcal {OWNERS[artefact]}", *words)
+            ended = pixcal(*bench.command(READERS[artefact], run))
+            ended.refused(2, f"pixcal {OWNERS[artefact]}", told)
         _mended(bench, run, artefact)
         outcome.ends["refused by name; rebuilt by its command"] += 1
     return outcome
