@@ -82,8 +82,9 @@ bench: $(INSTALLED) ## speed against a bare scan, and beside other methods (6 mi
 	$(BIN)/python benchmarks/throughput.py
 	$(BIN)/python benchmarks/comparison.py
 
-bench-run: $(INSTALLED) ## time and peak memory of `pixcal run` on two benches that pixcal did not write (4 minutes)
-	$(BIN)/python benchmarks/run_cost.py ordinary:5 lag/traps:6
+CASES = ordinary:5 lag/traps:6
+bench-run: $(INSTALLED) ## time and peak memory of `pixcal run` on two benches that pixcal did not write (4 minutes); CASES=all:7 for all
+	$(BIN)/python benchmarks/run_cost.py $(CASES)
 
 bench-full: $(INSTALLED) ## the same for 46 Mpix: time and memory (20 minutes, 60 GB of disk)
 	$(BIN)/python benchmarks/throughput.py --full

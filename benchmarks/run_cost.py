@@ -5,6 +5,9 @@ time passes that of the longest run allowed: 120 s on two cores.
 
     python benchmarks/run_cost.py ordinary:5 lag/traps:6 --strength 0.7
     python benchmarks/run_cost.py path/to/acq another/acq
+    python benchmarks/run_cost.py all:7
+
+``all:SEED`` is the ordinary bench and every effect of the second bench, known to pixcal or not.
 """
 
 import argparse
@@ -29,6 +32,17 @@ def made(case: str, strength: str, place: Path) -> Path:
     command += ["--out", str(place / "acq"), "--truth", str(place / "truth.json")]
     subprocess.run(command, cwd=BENCH, check=True)
     return place / "acq"
+
+
+def named(case: str) -> list[str]:
+    """Cases of an argument."""
+    name, _, seed = case.rpartition(":")
+    if name != "all":
+        return [case]
+    command = [sys.executable, "-m", "second_bench", "--list", "--json"]
+    listed = subprocess.run(command, cwd=BENCH, check=True, capture_output=True).stdout
+    laws = [f"{law['effect']}/{law['name']}" for law in json.loads(listed)["laws"]]
+    return [f"{one}:{seed}" for one in ("ordinary", *laws)]
 
 
 def cost(case: str, strength: str) -> bool:
@@ -58,10 +72,11 @@ def cost(case: str, strength: str) -> bool:
 def main() -> int:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("cases", nargs="+", metavar="CASE:SEED|ACQ")
+    parser.add_argument("cases", nargs="+", metavar="CASE:SEED|all:SEED|ACQ")
     parser.add_argument("--strength", default="0.7")
     asked = parser.parse_args()
-    beyond = sum(not cost(case, asked.strength) for case in asked.cases)
+    cases = [one for case in asked.cases for one in named(case)]
+    beyond = sum(not cost(case, asked.strength) for case in cases)
     return 1 if beyond else 0
 
 
