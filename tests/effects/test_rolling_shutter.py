@@ -120,11 +120,15 @@ def test_a_modulator_that_settles_is_found(
 ) -> None:
     """A straight profile too, which the fit's free fringe vectors take up."""
     on = {"line_time_us": 0.0, "settling": [float(v) for v in share], "origin_rad": origin}
-    found = RollingShutter.estimate(acquired(None, {"rolling_shutter": on}))
+    evidence = acquired(None, {"rolling_shutter": on})
+    found = RollingShutter.estimate(evidence)
     assert found is not None
     assert isinstance(found.effect, RollingShutter)
     assert found.effect.of_step == "last"
     assert found.significance > 10
+    assert found.again is not None
+    again = found.again.detect(evidence)
+    assert again == pytest.approx(found.significance, rel=0.05)  # one way was tried, not all
     at = np.linspace(0, 1, len(share))
     apart = profile(found.effect.settling, at) - (np.array(share) - np.mean(share))
     # But for the mean, which is the frames' own phase. One row tells of the spline's first end.

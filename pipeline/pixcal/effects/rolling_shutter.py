@@ -2,12 +2,18 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.row_ramp import RowRamp
-from pixcal.estimators.frame_series.row_settling import find_settling, profile, steps_of
+from pixcal.estimators.frame_series.row_settling import (
+    find_settling,
+    profile,
+    settling_sigmas,
+    steps_of,
+)
 from pixcal.estimators.frame_series.row_sums import RowSums, enough_frames
 from pixcal.estimators.maps.imprint import imprint, left_in_samples
 from pixcal.kernels.synthesis import illuminate
@@ -15,7 +21,7 @@ from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
-from pixcal.simulation.effect import Effect, Estimate, FittedFrames, FringeMaps, Stage
+from pixcal.simulation.effect import Again, Effect, Estimate, FittedFrames, FringeMaps, Stage
 from pixcal.simulation.shot import Shot
 
 FEWEST = 4  # rows at which a profile of the settling is given
@@ -204,17 +210,19 @@ class RollingShutter(Effect):
         settled = find_settling(many)
         which = "from the last" if settled.way < 0 else "to the next"
         law = "phase error of the rows in proportion to the phase step, with any profile"
+        effect = cls(
+            0.0,
+            settling=tuple(float(v) for v in np.clip(settled.share, -1, 1)),
+            of_step="last" if settled.way < 0 else "next",
+            origin_rad=settled.origin_rad,
+        )
         settling = Estimate(
-            cls(
-                0.0,
-                settling=tuple(float(v) for v in np.clip(settled.share, -1, 1)),
-                of_step="last" if settled.way < 0 else "next",
-                origin_rad=settled.origin_rad,
-            ),
+            effect,
             {f"settling[{n}]": float(e) for n, e in enumerate(settled.error)},
             settled.significance,
             f"the phase of the rows depends on the step {which} frame",
             law=law,
+            again=Again(effect, partial(_settling_again, settled.way, settled.origin_rad)),
         )
         mixed = cls._mixed(sets) if sets else settling
         return max(mixed, settling, key=lambda e: e.significance)
@@ -245,3 +253,9 @@ class RollingShutter(Effect):
             },
             law="rows exposed one after the other",
         )
+
+
+def _settling_again(way: int, origin: float | None, evidence: Evidence) -> float | None:
+    """Significance of a profile of the same steps in other frames."""
+    many = [RowSums.of(f) for f in evidence.fringes.values() if enough_frames(f)]
+    return settling_sigmas(many, way, origin) if many else None

@@ -69,13 +69,23 @@ def find_settling(sets: Sequence[RowSums]) -> Settling:
     while True:
         way, origin = max(found, key=lambda one: found[one][0])
         gain, share, error = found[way, origin]
-        chance = sigmas_of_chi2(max(gain - 2 * np.log(len(ways)), 1e-9), KNOTS - 1)
+        chance = _significance(gain, len(ways))
         if origin is None or chance < CLEAR or width < FINEST:
             return Settling(way, origin, share, error, chance)
         # A frame whose step is taken around the wrong way is off by the share of a turn.
         for near in (origin - width / 2, origin + width / 2):
             found[way, near] = _fit(sets, way, near)
         width /= 2
+
+
+def settling_sigmas(sets: Sequence[RowSums], way: int, origin: float | None) -> float:
+    """Significance of a profile of steps that way, whatever the others."""
+    return _significance(_fit(sets, way, origin)[0], 1)
+
+
+def _significance(gain: float, tried: int) -> float:
+    """Of the best gain in chi-square of so many."""
+    return sigmas_of_chi2(max(gain - 2 * np.log(tried), 1e-9), KNOTS - 1)
 
 
 def _fit(sets: Sequence[RowSums], way: int, origin: float | None) -> tuple[float, F64, F64]:
