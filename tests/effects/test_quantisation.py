@@ -260,6 +260,10 @@ def test_wrong_bits_are_found_where_only_shot_noise_spans_a_step(
         error = found.errors[f"bits[{bit}]"]
         assert abs(off[bit] - off[:bit].sum()) < max(4 * error, 0.02), bit
         assert error < 0.03
+    # Bits hang together: moved within their errors, codes stay about as wide.
+    moved = np.array([found.scattered(found.effect, seed).bits for seed in range(20)])
+    wide = (moved - found.effect.bits)[:, 5] - (moved - found.effect.bits)[:, :5].sum(axis=1)
+    assert 0 < np.std(wide) < 0.03
     even = Quantisation.estimate(acquired({"detector.gain_e_per_adu": 40.0}))
     assert even is not None
     assert even.significance < 4

@@ -199,11 +199,12 @@ class Quantisation(Effect):
             widths = code_widths(converter_counts(counts, step), noise, first, top / step)
         values: dict[str, Any] = {"coarse_adu": step - 1, "dnl_rms": 0.0, "ripple": 0.0}
         in_full = None
+        together: tuple[dict[str, float], ...] = ()
         errors = {"coarse_adu": step_error}
         # A camera that shifts its codes by whole bits is an ordinary one.
         found = [-1.0 if step == evidence.step_adu else min((step - 1) / step_error, 1e6)]
         if widths is not None:
-            known, its_errors, chances = _uneven(widths)
+            known, its_errors, chances, together = _uneven(widths)
             law = {name: known[name] for name in ("bits", "below") if name in known}
             rest = widths.without(np.array(law["bits"]), law["below"]) if law else widths
             if (measured := rest.measured) is not None:
@@ -218,6 +219,7 @@ class Quantisation(Effect):
             sigmas_of_best(*found),
             "missing codes, and code counts compared with neighbouring codes",
             {"sigmas": found, "codes": 0 if widths is None else len(widths.number)},
+            together=(*together, *({n: e} for n, e in errors.items() if n[:4] != "bits")),
             in_full=in_full,
             refused=_OTHER_GAIN if widths is not None and widths.uneven_above else "",
         )
@@ -241,8 +243,13 @@ def _has_wrong_bits(widths: CodeWidths | None) -> bool:
     return widths is not None and "bits" in _uneven(widths)[0]
 
 
-def _uneven(widths: CodeWidths) -> tuple[dict[str, Any], dict[str, float], list[float]]:
-    """Wrong bits, scatter and ripple of the widths, their errors, and how sure they are."""
+def _uneven(
+    widths: CodeWidths,
+) -> tuple[dict[str, Any], dict[str, float], list[float], tuple[dict[str, float], ...]]:
+    """Wrong bits, scatter and ripple of the widths, their errors, and how sure they are.
+
+    With independent steps of the bits, of one sigma each.
+    """
     variance, error, scatter_sigmas = widths.scatter()
     line = widths.ripple(variance)
     sure = sigmas(line.log_chance)
@@ -257,12 +264,16 @@ def _uneven(widths: CodeWidths) -> tuple[dict[str, Any], dict[str, float], list[
     clearer = 2 * rest < variance - share * line.amplitude**2
     if wrong > SIGNIFICANT and (wrong > sure or clearer):
         bits, covariance = widths.bits(2 * rest, found.below)
-        values, errors, others = _uneven(widths.without(bits, found.below))
-        level = widths.level(bits, found.below)
-        values |= {"bits": tuple(map(float, level)), "below": found.below}
+        values, errors, others, _ = _uneven(widths.without(bits, found.below))
+        levelled = np.stack([widths.level(one, found.below) for one in np.eye(len(bits))], 1)
+        covariance = levelled @ covariance @ levelled.T
+        values |= {"bits": tuple(map(float, levelled @ bits)), "below": found.below}
         spread = np.sqrt(np.diag(covariance))
         errors |= {f"bits[{n}]": float(e) for n, e in enumerate(spread) if e}
-        return values, errors, [wrong, *others]
+        size, ways = np.linalg.eigh(covariance)
+        steps = (ways * np.sqrt(np.maximum(size, 0))).T
+        together = tuple({f"bits[{n}]": float(s) for n, s in enumerate(one) if s} for one in steps)
+        return values, errors, [wrong, *others], together
     if sure > SIGNIFICANT:
         for _ in range(2):
             rest = variance - share * line.amplitude**2
@@ -278,4 +289,4 @@ def _uneven(widths: CodeWidths) -> tuple[dict[str, Any], dict[str, float], list[
     top = max(variance, 0.0)
     values["dnl_rms"] = min(float(np.sqrt(top)), 1.0)
     errors["dnl_rms"] = float(np.sqrt(top + error) - np.sqrt(top))
-    return values, errors, [scatter_sigmas, sure]
+    return values, errors, [scatter_sigmas, sure], ()
