@@ -25,13 +25,22 @@ except RuntimeError:
     atexit.register(shutil.rmtree, numba.config.CACHE_DIR, ignore_errors=True)
 
 
-def inner(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+Decorator = Callable[[Callable[..., Any]], Any]
+
+
+def kernel(**options: Any) -> Decorator:
+    """Compile a function, and keep it; other threads run while it does."""
+    decorate: Decorator = numba.njit(cache=True, nogil=True, **options)
+    return decorate
+
+
+def inner(**options: Any) -> Decorator:
     """Compile a function that only kernels call, as a part of them.
 
     It is neither cached nor callable from Python by itself; compiling large kernels takes a tenth
     less time so.
     """
-    decorate: Callable[[Callable[..., Any]], Any] = numba.njit(
+    decorate: Decorator = numba.njit(
         nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options
     )
     return decorate

@@ -1,12 +1,12 @@
 """Allan deviation of many series at once, with gaps (NIST SP 1065, equation 11)."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from pixcal.kernels import inner
+from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F64
 
 # series whose running sums are held at the same time: they stay in the processor's cache
@@ -42,8 +42,8 @@ def allan_deviation(series: NDArray[np.floating], lengths: Sequence[int]) -> F64
     return out
 
 
-@njit(cache=True, nogil=True)
-def _deviations(series, lengths, out):  # type: ignore[no-untyped-def]
+@kernel()
+def _deviations(series: Any, lengths: Any, out: Any) -> None:
     n, n_pixels = series.shape
     total = np.zeros((n + 1, PIXELS_AT_ONCE))
     missing = np.zeros((n + 1, PIXELS_AT_ONCE))

@@ -16,9 +16,8 @@ Sums are taken of the residual to a start model, so that float32 keeps its digit
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from pixcal.kernels import inner
+from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F32, F64, I64
 
 # sums kept for each pixel: 6 normal, 3 right-hand, weighted square of the residual, samples
@@ -134,7 +133,7 @@ def _pour(part: Any, total: Any) -> None:
 GROUP = 1024  # pixels summed at a time: what is kept of them stays in the first cache
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def frame_sums(
     codes: F32,
     scale: float,
@@ -294,7 +293,7 @@ def solve_pixels(sums: F64) -> tuple[F64, F64, F64]:
     return np.stack([s0, s1, s2]), covariance, square - (s0 * r0 + s1 * r1 + s2 * r2)
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@inner(inline="always")
 def _adjugate(a: float, b: float, c: float, d: float, e: float, f: float) -> Any:
     """Upper triangle of a pixel's inverse normal matrix times the determinant, and that."""
     i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
@@ -302,7 +301,7 @@ def _adjugate(a: float, b: float, c: float, d: float, e: float, f: float) -> Any
     return i00, i01, i02, i11, i12, i22, a * i00 + b * i01 + c * i02
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@inner(inline="always")
 def _fringe(
     n00: float, n01: float, n02: float, n11: float, n12: float, n22: float,
     b0: float, b1: float, b2: float, m1: float, m2: float,
@@ -342,7 +341,7 @@ def _close_pixels(
             turn[i] = np.arctan2(across, along)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def sweep_batches(
     codes: Any,
     scale: float,

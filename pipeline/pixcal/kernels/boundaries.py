@@ -12,9 +12,8 @@ Nothing moves where the charge is the same everywhere, and no charge is lost.
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from pixcal.kernels import inner
+from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F32, F64
 
 REACH = 2  # pixels on either side of a boundary whose charge acts on it
@@ -49,7 +48,7 @@ def area_changes(falloff_px: float) -> F64:
 
 
 # Loops, where a slice could be assigned: that takes seconds to compile.
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def _push(charge: Any, shifts: Any, wide: Any, right: Any, below: Any) -> None:
     """Mean shift of the boundaries on two sides of each pixel of a frame; ``wide`` is scratch."""
     ny, nx = charge.shape
@@ -72,7 +71,7 @@ def _push(charge: Any, shifts: Any, wide: Any, right: Any, below: Any) -> None:
                         out[x] += s * row[x]
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def _move(charge: Any, shifts: Any, along_y: Any, out: Any) -> None:
     """What pixels of frames (t, y, x) gain, added to ``out``."""
     frames, ny, nx = charge.shape
@@ -195,7 +194,7 @@ def _gain(
         )
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def _share(
     charge: Any, push_x: Any, push_y: Any, there: Any, back: Any, dy: int, dx: int, out: Any
 ) -> None:

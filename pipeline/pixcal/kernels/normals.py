@@ -12,10 +12,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from pixcal.kernels import inner
+from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F32
 
 Key = tuple[int, int]  # two words of 32 bits
@@ -54,7 +53,7 @@ def pixel_normals(key: Key, frame: int, rows: tuple[int, int], columns: int) -> 
     return every[:, skip : skip + rows[1] - rows[0]]
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def philox(
     a: np.uint32, b: np.uint32, c: np.uint32, d: np.uint32, key: np.uint32, other: np.uint32
 ) -> Any:
@@ -71,7 +70,7 @@ def philox(
     return a, b, c, d
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def _fill(key: np.uint32, other: np.uint32, frame: np.uint32, first: int, pairs: F32) -> None:
     """Fill (2, pair of rows, 2, x) from a pair of rows on: one counter for each pair and column."""
     words = np.empty((4, pairs.shape[3]), np.uint32)
@@ -81,7 +80,7 @@ def _fill(key: np.uint32, other: np.uint32, frame: np.uint32, first: int, pairs:
         _box_muller(words[2], words[3], pairs[0, i, 1], pairs[1, i, 1])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def _draw(row: np.uint32, frame: np.uint32, key: np.uint32, other: np.uint32, words: U32) -> None:
     """Words (4, x) of a pair of rows; in a loop of its own, of which the compiler makes vectors."""
     for x in range(words.shape[1]):

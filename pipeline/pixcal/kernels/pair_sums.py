@@ -3,8 +3,8 @@
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from pixcal.kernels import kernel
 from pixcal.model.arrays import F32, F64
 
 _TERMS = 4
@@ -41,7 +41,7 @@ def pair_sums(
 
 
 # Sums of a row in any order. Views of rows have no negative index: only then loops are vectorised.
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})  # type: ignore[untyped-decorator]
+@kernel(fastmath={"reassoc", "contract"})
 def _sum(
     residual: Any, variance: Any, charge: Any, shared1: Any, shared2: Any, covariance: Any,
     of_place: Any, dy: int, dx: int, margin: int, sums: Any,

@@ -18,8 +18,8 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from pixcal.kernels import kernel
 from pixcal.kernels.bilinear import FAST
 from pixcal.kernels.robust import (
     clipped_variance_factor,
@@ -50,7 +50,7 @@ _MIN_PIXELS = 32  # fewer do not tell outliers from noise
 _SIGMA_OF_MAD = 1.482602218505602
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel(fastmath=FAST, error_model="numpy")
 def _add_blocks(
     first: F32, second: F32, per_level: float, read_variance: float, quantum: float,
     centre: F32, spread: F32, lags: Any, out: F64,
@@ -99,7 +99,7 @@ def _add_blocks(
                 out[block, 3 + lag] = np.float32(0.5) * product / pairs + variance / n
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def _ratios(first: F32, second: F32, per_level: float, read_variance: float, out: F32) -> None:
     # Differences over their expected noise, by the pixel's place in its block and by block.
     slope, floor = np.float32(per_level), np.float32(read_variance)

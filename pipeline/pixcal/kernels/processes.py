@@ -3,8 +3,8 @@
 from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 
+from pixcal.kernels import kernel
 from pixcal.model.arrays import F64
 
 SPAN = 4  # periods of flicker noise up to so many lengths of the line are there
@@ -61,7 +61,7 @@ def damped_walk(normals: F64, keep: float) -> F64:
 
 
 # Not scipy.signal's filter: it takes most of a second to import, and longer for such short lines.
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def _walk(normals: F64, keep: float, step: float, walk: F64) -> None:
     at = (1 - step) * normals[0]
     for n in range(len(normals)):

@@ -17,11 +17,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy.ndimage import spline_filter
 from scipy.special import j1
 
+from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F64
 
 # knots of the spline in lambda / D: the table is good to 1e-6 of its peak (see the tests)
@@ -92,7 +92,7 @@ def _jinc(z: F64) -> F64:
     return np.where(small, 1.0, 2 * j1(away) / away)
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@inner(inline="always")
 def _spline(t: float) -> tuple[Any, Any]:
     """Weights of the four knots around a place, t beyond the second, and their derivatives."""
     s = 1.0 - t
@@ -100,7 +100,7 @@ def _spline(t: float) -> tuple[Any, Any]:
     return weights, (-s * s / 2, t * (1.5 * t - 2), -s * (1.5 * s - 2), t * t / 2)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def _shares(coefficients: F64, step: float, x: F64, y: F64) -> F64:
     n, out = coefficients.shape[0], np.zeros((3, x.size))
     for place in range(x.size):

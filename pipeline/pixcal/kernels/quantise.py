@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from pixcal.kernels import inner
+from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F32
 
 FILL = 65535  # code of a sample without weight
@@ -82,7 +81,7 @@ def _count_row(raw: Any, saturation: float, codes: Any, saturated: Any, lost: An
                 lost[i] += 1
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def encode(
     raw: Any,
     slope: Any,
@@ -148,7 +147,7 @@ def _extremes_of_row(raw: Any, saturation: float, lowest: Any, highest: Any) -> 
         highest[i] = sample if good & (sample > highest[i]) else highest[i]
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def extremes(raw: Any, saturation: float, lowest: Any, highest: Any, x0: int = 0) -> None:
     """Widen the range of each pixel's samples below saturation by those of more frames.
 

@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pixcal.kernels import kernel
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 
@@ -46,7 +46,7 @@ def residual_sums(
 
 
 # Sums of a row in any order; all that NaN decides is left as it is.
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})  # type: ignore[untyped-decorator]
+@kernel(fastmath={"reassoc", "contract"})
 def _sum(
     rest: Any, model: Any, factor: Any, read: Any, good: Any, of_time: Any, of_pixels: Any,
     taken: Any, steps: Any, limit: Any, sums: Any,

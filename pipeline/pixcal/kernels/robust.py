@@ -19,10 +19,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from pixcal.kernels import inner
+from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F32, F64, Mask
 
 BATCH = 64  # frames that are looked at together
@@ -67,7 +66,7 @@ def _sort_columns(rows: Any) -> None:
         p //= 2
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def median_of_columns(rows: Any, out: Any) -> None:
     """Median of each column of (row, column) float32, NaN not counted; sorts the rows."""
     for x in range(rows.shape[1]):
@@ -84,7 +83,7 @@ def median_of_columns(rows: Any, out: Any) -> None:
         out[x] = 0.5 * (rows[(m - 1) // 2, x] + rows[m // 2, x]) if m > 0 else np.nan
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def deviation_of_sorted(rows: Any, median: Any, out: Any) -> None:
     """Median of the absolute deviations of columns that `median_of_columns` sorted.
 
@@ -129,7 +128,7 @@ def _deviation_of_some(column: Any, median: float) -> float:
     return last if count % 2 else 0.5 * (before + last)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def _medians_around(wide: F32, side: int, out: F32) -> None:
     rows = np.empty((side * side, out.shape[1]), np.float32)
     for y in range(out.shape[0]):
@@ -146,7 +145,7 @@ def median_around(values: NDArray[Any], side: int) -> F32:
     return out
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def _median_and_deviation(frames: Any, median: Any, deviation: Any) -> None:
     rows = np.empty((frames.shape[0], frames.shape[2]), np.float32)
     for y in range(frames.shape[1]):
@@ -184,7 +183,7 @@ def _add_row(
         s4[i] += zz * zz
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def _add_frames(
     frames: Any, offsets: Any, factors: Any, reference: Any, limit: Any, sums: Any
 ) -> None:

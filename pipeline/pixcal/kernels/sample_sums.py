@@ -3,9 +3,8 @@
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from pixcal.kernels import inner
+from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
@@ -37,7 +36,7 @@ def calm_residuals(
     return calm, kept, variance / max(int(np.count_nonzero(good)), 1), beyond
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def _calm(
     samples: F32, model: F32, shot: F32, read: F32, good: Mask, most: float, limits: F64,
     calm: F32, kept: F32, variance: F64, beyond: F64,
@@ -90,7 +89,7 @@ def _count(rest: float, variance: float, limits: F64, beyond: F64) -> None:
             beyond[int(rest > 0), n] += 1
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def count_beyond(rest: F32, variance: F32, good: Mask, limits: F64) -> F64:
     """How many residuals of good pixels are below and above (2, n) ascending limits, in sigmas."""
     beyond = np.zeros((2, len(limits)))
@@ -104,7 +103,7 @@ def count_beyond(rest: F32, variance: F32, good: Mask, limits: F64) -> F64:
     return beyond
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def level_sums(
     level: F32, good: Mask, low: float, step: float, values: F32, squared: F32, sums: F64
 ) -> None:
@@ -124,7 +123,7 @@ def level_sums(
                     sums[n, 2] += np.float64(squared[t, y, x]) ** 2
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def count_remainders(codes: Any, good: Mask, divisor: int) -> Indices:
     """How often whole numbers (t, y, x) of good pixels have each remainder on division by 2ⁿ."""
     count = np.zeros(divisor, np.int64)
@@ -135,7 +134,7 @@ def count_remainders(codes: Any, good: Mask, divisor: int) -> Indices:
     return count
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def pixel_moments(values: F32) -> tuple[F64, F64]:
     """Mean square and mean fourth power (y, x) of the samples (t, y, x) of each pixel."""
     nt, ny, nx = values.shape
@@ -149,7 +148,7 @@ def pixel_moments(values: F32) -> tuple[F64, F64]:
     return second / nt, fourth / nt
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
+@kernel(fastmath=_FAST)
 def frame_means(values: Any, good: Mask) -> F64:
     """Mean (t,) over the good pixels of each frame (t, y, x); what others hold may be NaN."""
     nt, ny, nx = values.shape
@@ -166,7 +165,7 @@ def frame_means(values: Any, good: Mask) -> F64:
     return means
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def neighbour_products(values: F32, pairs: F32, steps: Indices, every: int = 1) -> F64:
     """Sums (step, y) of the products of samples with those some steps on, by their first row.
 
@@ -180,7 +179,7 @@ def neighbour_products(values: F32, pairs: F32, steps: Indices, every: int = 1) 
     return sums
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def products_by_level(
     values: F32, level: F32, middle: float, pairs: F32, steps: Indices, every: int = 1
 ) -> F64:

@@ -16,9 +16,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pixcal.kernels import kernel
 from pixcal.kernels.normals import Key
 from pixcal.model.arrays import F32, U16
 
@@ -71,7 +71,7 @@ class _Seed(np.random.SeedSequence):
         return self.words
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def fill_normal(rng: np.random.Generator, out: F32) -> None:
     """Fill a 2-D array with standard normals: those of ``rng.standard_normal``, rounded."""
     for i in range(out.shape[0]):
@@ -79,7 +79,7 @@ def fill_normal(rng: np.random.Generator, out: F32) -> None:
             out[i, j] = rng.standard_normal()
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def illuminate(
     iota: F32,
     alpha_sin: F32,
@@ -109,7 +109,7 @@ def illuminate(
             out[i, j] = b * iota[i, j] + alpha_sin[i, j] * c + alpha_cos[i, j] * s
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel(error_model="numpy")
 def collect(light: F32, dark: F32, normal: F32, shot: bool, full_well: float, out: F32) -> None:
     """Charge ``out`` of each pixel, (y, x) e-, clipped at the full well; whole with shot noise.
 
@@ -140,7 +140,7 @@ def collect(light: F32, dark: F32, normal: F32, shot: bool, full_well: float, ou
                     out[i, j] = min(np.float32(poisson_quantile(mean, normal[i, j])), well)
 
 
-@njit(cache=True, nogil=True, inline="always")  # type: ignore[untyped-decorator]
+@kernel(inline="always")
 def _poisson_expansion(mean: np.float32, w: np.float32) -> np.float32:
     w2 = w * w
     root = math.sqrt(mean)
@@ -150,7 +150,7 @@ def _poisson_expansion(mean: np.float32, w: np.float32) -> np.float32:
     return np.float32(np.floor(mean + root * w + rest))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def poisson_quantile(mean: float, w: float) -> int:
     """Smallest n whose Poisson distribution function reaches that of a standard normal at ``w``.
 
@@ -170,7 +170,7 @@ def poisson_quantile(mean: float, w: float) -> int:
     return n
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def amplify(signal: F32, bias: F32, normal: F32, read_noise: F32, adu_per_e: F32, out: F32) -> None:
     """Electrons (y, x) in ADU, with read noise (e- rms) times standard normals, and bias (ADU)."""
     for i in range(out.shape[0]):
@@ -179,7 +179,7 @@ def amplify(signal: F32, bias: F32, normal: F32, read_noise: F32, adu_per_e: F32
             out[i, j] = electrons * adu_per_e[i, j] + bias[i, j]
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def convert(adu: F32, step: int, top: int, out: U16) -> None:
     """Codes of the converter, rounded to multiples of ``step``, clipped to 0 and ``top`` (ADU)."""
     low, high, half = np.float32(0), np.float32(top // step), np.float32(0.5)

@@ -8,9 +8,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from pixcal.kernels import inner
+from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F32, F64
 
 STEPS_PER_PX = 4  # points of a track that stand for a pixel of its length
@@ -18,7 +17,7 @@ GRAZING = 0.02  # least cosine to the layer's normal: no track is longer than 50
 _RANGE = 4.0
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def add_tracks(charge: F32, tracks: F64, sigma: float, first_row: int) -> None:
     """Add the charge of tracks to a frame (y, x), e-; what falls beside it is lost.
 

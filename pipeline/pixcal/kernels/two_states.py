@@ -1,12 +1,12 @@
 """A hidden state that is one of two: how likely each is in every frame, all frames being known."""
 
 import numpy as np
-from numba import njit
 
+from pixcal.kernels import kernel
 from pixcal.model.arrays import F64
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def likely_states(odds: F64, change: F64) -> tuple[F64, float, float]:
     """Chance of the second state, expected number of changes, and gain in log-likelihood.
 

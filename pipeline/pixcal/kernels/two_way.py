@@ -7,9 +7,8 @@ projected, with its weights, onto what frames leave and onto what pixels leave, 
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from pixcal.kernels import inner
+from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F32
 
 _PIXELS = 2048  # of a frame that are worked on together: they stay in the cache
@@ -34,7 +33,7 @@ def left_over(
     return rest
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})  # type: ignore[untyped-decorator]
+@kernel(fastmath={"reassoc", "contract"})
 def _project(
     rest: Any, weight: Any, of_place: Any, covariance: Any, of_time: Any, inverse: Any, turns: int
 ) -> None:

@@ -12,10 +12,10 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numba import njit
 from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
+from pixcal.kernels import kernel
 from pixcal.kernels.normal_matrix import symmetric
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
@@ -142,7 +142,7 @@ def tile_sums(
     return (i0, j0), sums
 
 
-@njit(cache=True, nogil=True, inline="always")  # type: ignore[untyped-decorator]
+@kernel(inline="always")
 def _horner(coefficients: F64, x: float) -> float:
     value = 0.0
     for n in range(coefficients.size - 1, -1, -1):
@@ -150,7 +150,7 @@ def _horner(coefficients: F64, x: float) -> float:
     return value
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def _add(
     signal: Any,
     good: Any,
