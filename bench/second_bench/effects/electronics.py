@@ -87,11 +87,16 @@ def switching(run: Run, dwell_s: F64, period_s: float, rng: np.random.Generator)
     return state
 
 
-def _telegraph(bench: Bench, share: float, amplitude: Any, rng: np.random.Generator) -> None:
+def _telegraph(
+    bench: Bench, share: float, amplitude: Any, rng: np.random.Generator, high: float | None = None
+) -> None:
     ny, nx = bench.shape
     where = np.flatnonzero(rng.random(ny * nx) < share)
     dwell = np.exp(rng.uniform(np.log(0.1), np.log(3), (2, len(where))))
     own = amplitude(len(where)) * rng.choice([-1, 1], len(where))
+    if high is not None:
+        dwell[1] = dwell[0] * high / (1 - high)
+        own = np.abs(own)
     state = {
         run.name: switching(run, dwell, bench.period_s, stream(bench.seed, "traps", run.name))
         for run in bench.runs
@@ -119,6 +124,14 @@ def exponential(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     share = float(np.exp(rng.uniform(np.log(0.005), np.log(0.04))))
     _telegraph(bench, share, lambda n: rng.exponential(size, n), rng)
     return {"share": share}
+
+
+@law("telegraph_noise", "spikes", 40, 400, "e-, the median")
+def spikes(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """Pixels that are in the upper level for a small part of the time."""
+    share, high = (float(np.exp(rng.uniform(*np.log(r)))) for r in ((0.005, 0.04), (0.03, 0.15)))
+    _telegraph(bench, share, lambda n: size * np.exp(rng.uniform(-0.6, 0.6, n)), rng, high)
+    return {"share": share, "high": high}
 
 
 def _coarse(bench: Bench, rng: np.random.Generator) -> None:
@@ -178,3 +191,29 @@ def weights(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
     bench.samples.append(converts)
     return {"gain_e_per_adu": bench.gain_e_per_adu, "weights": true.tolist()}
+
+
+@law("quantisation", "levels", 5e-4, 0.01, "rms of a bit's weight")
+def levels(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """The nearest of the levels that weights make which are off."""
+    _coarse(bench, rng)
+    codes = np.arange(_codes(bench))
+    bits = int(np.ceil(np.log2(len(codes))))
+    true = 2.0 ** np.arange(bits) * (1 + size * rng.standard_normal(bits))
+    level = (codes[:, None] >> np.arange(bits) & 1) @ true
+    order = np.argsort(level, kind="stable")
+    between = (level[order][1:] + level[order][:-1]) / 2
+    bench.samples.append(lambda adu, _: order[np.searchsorted(between, adu)].astype(float))
+    return {"gain_e_per_adu": bench.gain_e_per_adu, "weights": true.tolist()}
+
+
+@law("quantisation", "references", 0.1, 1.0, "codes rms")
+def references(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """Coarse steps between references that are off, each by itself, and even fine steps."""
+    _coarse(bench, rng)
+    fine = 2 ** int(rng.integers(4, 7))
+    count = _codes(bench)
+    off = np.repeat(rng.normal(0, size, count // fine + 1), fine)[: count - 1]
+    thresholds = np.maximum.accumulate(np.arange(1, count) - 0.5 + off)
+    bench.samples.append(lambda adu, _: np.searchsorted(thresholds, adu).astype(float))
+    return {"gain_e_per_adu": bench.gain_e_per_adu, "fine": fine}
