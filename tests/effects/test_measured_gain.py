@@ -10,6 +10,7 @@ from pixcal.effects.cosmic_hits import CosmicHits
 from pixcal.effects.gain_error import GainError
 from pixcal.effects.ipc import Coupling, Ipc
 from pixcal.effects.lag import Lag
+from pixcal.effects.quantisation import Quantisation
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
@@ -50,6 +51,18 @@ def test_brighter_fatter_takes_noise_in_proportion_to_the_level(
     weak, strong = (1 - change(bench, BrighterFatter(s)) for s in (2e-7, 4e-7))
     assert weak > 0.005
     assert strong == pytest.approx(2 * weak, rel=0.15)
+
+
+def test_narrow_codes_scale_noise_and_mean_alike(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    """A 16th of the codes is 0.8 codes narrow: the response is steeper, and the noise larger."""
+    bench = make_effect_bench({"detector.shape": [61, 67], "detector.gain_e_per_adu": 40.0})
+    widths = np.zeros(4000)
+    widths[15::16] = -0.8
+    assert change(bench, Quantisation(0.0, 0.0, 0.0, widths=tuple(widths))) == pytest.approx(
+        1 / 0.95, rel=0.01
+    )
 
 
 @pytest.mark.long

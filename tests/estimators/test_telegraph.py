@@ -62,7 +62,7 @@ def test_pixels_that_hardly_stand_out_tell_share_amplitude_and_time(
     assert abs(found.share - 0.03) < 4 * found.share_error < 0.03
     assert abs(found.amplitude - amplitude) < 4 * found.amplitude_error < amplitude
     assert abs(found.switching_s - switching_s) < 4 * found.switching_error < 2 * switching_s
-    assert found.significance > 8
+    assert found.signs.significance > 8
     assert found.switching_decades == 0
 
 

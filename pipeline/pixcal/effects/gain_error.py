@@ -43,6 +43,7 @@ class GainError(Effect):
     acts_at = Stage.CONVERTER
     order = 1
     domains = ("noise", "intensity")
+    is_gain = True
     strengths = ("relative",)
     left_because = (
         "only SIGMA is wrong: correct gain_e_per_adu in acquisition.yaml, or use 'pixcal "

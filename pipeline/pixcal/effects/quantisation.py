@@ -1,6 +1,6 @@
 """The converter: steps that are coarser than the file's, and codes that are not equally wide."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -28,6 +28,7 @@ from pixcal.simulation.shot import Shot
 FARTHEST = 0.98
 FEW_MISSING = 1.1  # step up to which wrong bits may be why codes never come, every so often
 _KEY = 997
+_LAW = "wrong weights of bits, scatter and a ripple of the widths"
 _OTHER_GAIN = (
     "only codes of bright samples are uneven, as in a camera that reads bright pixels at another "
     "gain (dual gain, HDR)"
@@ -101,7 +102,8 @@ class Quantisation(Effect):
         unit="codes",
         low=-1,
         high=100,
-        doc="width of each code minus 1 code, from code 0 on, as measured",
+        doc="width of each code minus 1 code, from code 0 on, beside wrong bits; the scatter and "
+        "ripple then only describe them",
     )
 
     @property
@@ -120,17 +122,19 @@ class Quantisation(Effect):
         """
         number = np.arange(codes)
         shift = np.zeros(codes)
-        if self.dnl_rms:
+        measured = np.array(self.widths)
+        if self.dnl_rms and not len(measured):
             rng = generator(specimen, Stream.EFFECT, _KEY)
             shift += self.dnl_rms / np.sqrt(2) * rng.standard_normal(codes)
-        turn = 2 * np.pi / self.ripple_codes
-        # Sum of the ripple of all codes below.
-        phase = turn * (number - 0.5) + self.ripple_phase_rad
-        shift += self.ripple * np.sin(phase) / (2 * np.sin(turn / 2))
+        if self.ripple and not len(measured):
+            turn = 2 * np.pi / self.ripple_codes
+            # Sum of the ripple of all codes below.
+            phase = turn * (number - 0.5) + self.ripple_phase_rad
+            shift += self.ripple * np.sin(phase) / (2 * np.sin(turn / 2))
         begins = number - 0.5 + np.clip(shift, -FARTHEST, FARTHEST)
         begins += moved_by_bits(np.array(self.bits), self.below, codes)
         wider = np.zeros(codes)
-        wider[1:][: len(self.widths)] = self.widths[: codes - 1]
+        wider[1:][: len(measured)] = measured[: codes - 1]
         return np.asarray(begins + np.cumsum(wider))
 
     def converted(self, adu: F32, specimen: int, top_adu: float, normals: F32 | None = None) -> F32:
@@ -198,7 +202,7 @@ class Quantisation(Effect):
                 step = 1.0
             widths = code_widths(converter_counts(counts, step), noise, first, top / step)
         values: dict[str, Any] = {"coarse_adu": step - 1, "dnl_rms": 0.0, "ripple": 0.0}
-        in_full = None
+        measured = None
         together: tuple[dict[str, float], ...] = ()
         errors = {"coarse_adu": step_error}
         # A camera that shifts its codes by whole bits is an ordinary one.
@@ -207,20 +211,24 @@ class Quantisation(Effect):
             known, its_errors, chances, together = _uneven(widths)
             law = {name: known[name] for name in ("bits", "below") if name in known}
             rest = widths.without(np.array(law["bits"]), law["below"]) if law else widths
-            if (measured := rest.measured) is not None:
-                in_full = cls(**values, **law, widths=tuple(map(float, measured)))
+            measured = rest.measured
             values, errors = values | known, errors | its_errors
             found += chances
         elif step == evidence.step_adu:
             return None
+        by_law, significance = cls(**values), sigmas_of_best(*found)
+        effect = by_law
+        if measured is not None and significance > SIGNIFICANT:
+            effect = replace(by_law, widths=tuple(map(float, measured)))
         return Estimate(
-            cls(**values),
+            effect,
             errors,
-            sigmas_of_best(*found),
+            significance,
             "missing codes, and code counts compared with neighbouring codes",
             {"sigmas": found, "codes": 0 if widths is None else len(widths.number)},
-            together=(*together, *({n: e} for n, e in errors.items() if n[:4] != "bits")),
-            in_full=in_full,
+            (*together, *({n: e} for n, e in errors.items() if n[:4] != "bits")),
+            law="" if effect == by_law else _LAW,
+            by_law=None if effect == by_law else by_law,
             refused=_OTHER_GAIN if widths is not None and widths.uneven_above else "",
         )
 

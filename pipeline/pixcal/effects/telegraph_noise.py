@@ -101,8 +101,9 @@ class TelegraphNoise(Effect):
         """Pixels noisier than the rest whose noise is telegraph noise by its shape.
 
         How many and how strong from the distribution of the pixels' variances; that they jump,
-        rather than being noisier, from two signs that Gaussian noise of any size has not: a flat
-        top (negative kurtosis), and neighbouring frames that resemble each other. Each is summed
+        rather than being noisier, from three signs that Gaussian noise of any size has not: a flat
+        top (negative kurtosis), skewness, and neighbouring frames that resemble each other. Each is
+        summed
         over the noisy pixels, so nothing is to be corrected for having looked at many of them.
         Bias and dark frames; without enough of them the residuals of fringes. How long pixels stay,
         by the fringes where there are any.
@@ -132,9 +133,14 @@ def _estimate(cls: type[TelegraphNoise], found: Telegraph) -> Estimate:
             "switching_s": found.switching_error,
         }
         | ({"amplitude_shape": found.shape_error} if found.shape_error else {}),
-        found.significance,
+        found.signs.significance,
         "noisy pixels have two levels or stay in one from frame to frame",
-        {"flat_top_sigmas": found.flat_top, "staying_sigmas": found.staying, "noisy": found.noisy},
+        {
+            "flat_top_sigmas": found.signs.flat_top,
+            "skewed_sigmas": found.signs.skewed,
+            "staying_sigmas": found.signs.staying,
+            "noisy": found.signs.noisy,
+        },
     )
 
 

@@ -169,6 +169,8 @@ class Effect(ForwardModel):
         How the fit absorbs it; empty where it does not.
     left_because : str
         Why maps need no correction for it all the same: it is noise, or small.
+    is_gain : bool
+        Whether it scales all samples alike, as photon transfer measures.
     fit_model : str
         Shape of the fringes (`pixcal.estimators.fringe_fit.models`) that takes it up.
     smooth_degree : int
@@ -177,6 +179,7 @@ class Effect(ForwardModel):
 
     absorbed_because: ClassVar[str] = ""
     left_because: ClassVar[str] = ""
+    is_gain: ClassVar[bool] = False
     fit_model: ClassVar[str] = ""
     smooth_degree: ClassVar[int] = 3
 

@@ -66,7 +66,7 @@ def photon_transfer_change(
     detector = bench.detector
     room = (detector.top_adu - detector.bias_adu) * detector.gain_e_per_adu
     flats = [r for r in flats if r.electrons < 0.8 * room]
-    if not flats or not any(effect.acts_at in OF_NOISE for effect in effects):
+    if not flats or not any(e.acts_at in OF_NOISE and not e.is_gain for e in effects):
         return 1.0
     if len(flats) < LADDER:
         flat = max(flats, key=lambda r: r.electrons)

@@ -6,14 +6,21 @@ from dataclasses import dataclass
 from pixcal.estimators.detector.telegraph.classes import Stays
 from pixcal.estimators.detector.telegraph.dwell import LitSeries, find_stays
 from pixcal.estimators.detector.telegraph.levels import find_upper
-from pixcal.estimators.detector.telegraph.moments import Moments, Series, moments_of, signs, thinned
+from pixcal.estimators.detector.telegraph.moments import (
+    Moments,
+    Series,
+    Signs,
+    moments_of,
+    signs,
+    thinned,
+)
 from pixcal.estimators.detector.telegraph.population import (
     Population,
     find_population,
     find_switching,
     off_later,
 )
-from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best
+from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import Indices
 
 ROUNDS = 3  # most, in which population and time are found, each with the other known
@@ -39,10 +46,7 @@ class Telegraph:
     amplitude_error: float
     shape_error: float
     switching_error: float
-    significance: float  # that noisy pixels jump
-    flat_top: float  # flat_top, staying: its two signs, in sigmas
-    staying: float
-    noisy: int  # pixels that stand out
+    signs: Signs  # that noisy pixels jump
 
 
 def find_telegraph(
@@ -55,12 +59,11 @@ def find_telegraph(
     parts = [m for s in series if (m := moments_of(s)) is not None]
     if not parts:
         return None
-    flat_top, staying, noisy = signs(parts)
-    significance = sigmas_of_best(flat_top, staying)
+    told = signs(parts)
     longest = max(parts, key=lambda m: m.frames)
     chosen = longest.pixel[longest.excess > 0]
     known = None
-    if significance > SIGNIFICANT and noisy:
+    if told.significance > SIGNIFICANT and told.noisy:
         of_fringes = lit(chosen)
         upper = find_upper(of_fringes, longest.sigma)
         if upper != 0.5:
@@ -78,8 +81,7 @@ def find_telegraph(
     p = found.population
     return Telegraph(
         p.share, p.amplitude, p.shape, found.stays.mean_s, found.stays.decades, found.stays.upper,
-        p.share_error, p.amplitude_error, p.shape_error, found.error,
-        significance, flat_top, staying, noisy,
+        p.share_error, p.amplitude_error, p.shape_error, found.error, told,
     )  # fmt: skip
 
 

@@ -1,8 +1,8 @@
 """Moments of each pixel's noise, and what they say of jumps.
 
-A pixel that is noisier than others need not jump. Of Gaussian noise of any size the kurtosis and
-the correlation of neighbouring frames, each over the variance, do not depend on it (Basu's
-theorem); so their sums over pixels, weighted by the variance, have known mean and scatter.
+A pixel that is noisier than others need not jump. Of Gaussian noise of any size the skewness, the
+kurtosis and the correlation of neighbouring frames, each over the variance, do not depend on it
+(Basu's theorem); so their sums over pixels, weighted by the variance, have known mean and scatter.
 """
 
 from collections.abc import Sequence
@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from pixcal.kernels.frame_order import follows
+from pixcal.kernels.significance import sigmas_of_best
 from pixcal.model.arrays import F64, Indices, Mask
 
 NOISY = 3.0  # excess of the variance, in its own sigmas, from which a pixel's noise is looked at
@@ -42,6 +43,7 @@ class Moments:
     pixel: Indices
     count: F64  # samples
     variance: F64
+    skewness: F64
     kurtosis: F64  # excess, unbiased
     # (lag, n) mean product of frames `LAGS` apart; NaN where there are none
     products: F64
@@ -56,7 +58,7 @@ class Moments:
     def of(self, pixels: Indices) -> "Moments":
         """Of some pixels (ascending) alone."""
         own = np.isin(self.pixel, pixels)
-        names = ("pixel", "count", "variance", "kurtosis", "products", "stands_for")
+        names = ("pixel", "count", "variance", "skewness", "kurtosis", "products", "stands_for")
         return replace(self, **{name: getattr(self, name)[..., own] for name in names})
 
     @property
@@ -87,6 +89,7 @@ def moments_of(series: Series, *, hits: bool = False) -> Moments | None:
     x = np.nan_to_num(x - np.nanmean(x, axis=0))
     square = np.maximum((x**2).sum(axis=0), 1e-12)
     variance = square / (n - 1)
+    skewness = np.sqrt(n) * (x**3).sum(axis=0) / square**1.5
     kurtosis = n * (x**4).sum(axis=0) / square**2 - 3
     kurtosis = (n - 1) / ((n - 2) * (n - 3)) * ((n + 1) * kurtosis + 6)
     products, pairs = np.full((len(LAGS), x.shape[1]), np.nan), []
@@ -105,6 +108,7 @@ def moments_of(series: Series, *, hits: bool = False) -> Moments | None:
         series.pixel[used],
         n,
         variance / centre,
+        skewness,
         kurtosis,
         products / centre,
         pairs[0],
@@ -147,19 +151,36 @@ def thinned(parts: Sequence[Moments]) -> list[Moments]:
     return [replace(m, stands_for=np.where(np.isin(m.pixel, noisy), 1.0, each)) for m in some]
 
 
-def signs(parts: Sequence[Moments]) -> tuple[float, float, int]:
-    """How much flatter noisy pixels' noise is, and how much more it stays, than Gaussian noise."""
-    flat = flat_variance = stay = stay_variance = 0.0
+@dataclass(frozen=True)
+class Signs:
+    """Of jumps, in sigmas of Gaussian noise of any size, by all noisy pixels together."""
+
+    flat_top: float  # two levels that are about equally frequent
+    skewed: float  # the upper level is the rarer one; negative: the lower one
+    staying: float  # neighbouring frames that are alike
+    noisy: int  # pixels that stand out
+
+    @property
+    def significance(self) -> float:
+        """Of the clearest sign."""
+        return sigmas_of_best(self.flat_top, self.skewed, -self.skewed, self.staying)
+
+
+def signs(parts: Sequence[Moments]) -> Signs:
+    """How flat, skewed and alike from frame to frame the noise of noisy pixels is."""
+    value, variance = np.zeros((2, 3))
     noisy: set[int] = set()
     for m in parts:
         n, part = m.count, m.excess / (1 + m.excess)
         of_kurtosis = 24 * n * (n - 1) ** 2 / ((n - 3) * (n - 2) * (n + 3) * (n + 5))
-        flat -= float(part**2 @ m.kurtosis)
-        flat_variance += float(part**4 @ of_kurtosis)
+        of_skewness = 6 * (n - 2) / ((n + 1) * (n + 3))
         # Mean and variance for white noise, exact (Moran 1948, Biometrika 35, 255).
-        stay += float(part @ (m.products[0] / m.variance + 1 / n))
-        stay_variance += float(part**2 @ ((n - 2) ** 2 / (n**2 * (n - 1)))) / m.pairs
+        of_products = (n - 2) ** 2 / (n**2 * (n - 1)) / m.pairs
+        alike = m.products[0] / m.variance + 1 / n
+        value += -(part**2 @ m.kurtosis), part @ m.skewness, part @ alike
+        variance += part**4 @ of_kurtosis, part**2 @ of_skewness, part**2 @ of_products
         noisy.update(m.pixel[m.excess > 0].tolist())
-    if not flat_variance:
-        return 0.0, 0.0, 0
-    return flat / flat_variance**0.5, stay / stay_variance**0.5, len(noisy)
+    if not noisy:
+        return Signs(0.0, 0.0, 0.0, 0)
+    flat, skewed, staying = value / np.sqrt(np.maximum(variance, 1e-300))
+    return Signs(float(flat), float(skewed), float(staying), len(noisy))
