@@ -102,8 +102,8 @@ class TelegraphNoise(Effect):
 
         How many and how strong from the distribution of the pixels' variances; that they jump,
         rather than being noisier, from three signs that Gaussian noise of any size has not: a flat
-        top (negative kurtosis), skewness, and neighbouring frames that resemble each other. Each is
-        summed
+        top (negative kurtosis), outliers to one side that come back, and neighbouring frames that
+        resemble each other. Each is summed
         over the noisy pixels, so nothing is to be corrected for having looked at many of them.
         Bias and dark frames; without enough of them the residuals of fringes. How long pixels stay,
         by the fringes where there are any.
@@ -137,7 +137,7 @@ def _estimate(cls: type[TelegraphNoise], found: Telegraph) -> Estimate:
         "noisy pixels have two levels or stay in one from frame to frame",
         {
             "flat_top_sigmas": found.signs.flat_top,
-            "skewed_sigmas": found.signs.skewed,
+            "one_sided_sigmas": found.signs.one_sided,
             "staying_sigmas": found.signs.staying,
             "noisy": found.signs.noisy,
         },

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from pixcal.estimators.detector.telegraph.classes import Stays
 from pixcal.estimators.detector.telegraph.dwell import LitSeries, find_stays
 from pixcal.estimators.detector.telegraph.levels import find_upper
@@ -60,29 +62,45 @@ def find_telegraph(
     if not parts:
         return None
     told = signs(parts)
-    longest = max(parts, key=lambda m: m.frames)
-    chosen = longest.pixel[longest.excess > 0]
-    known = None
+    longest, upper, known = max(parts, key=lambda m: m.frames), 0.5, None
     if told.significance > SIGNIFICANT and told.noisy:
-        of_fringes = lit(chosen)
-        upper = find_upper(of_fringes, longest.sigma)
+        own = max(series, key=lambda s: len(s.noise))
+        upper = _upper(lit, own, longest, told)
         if upper != 0.5:
             # What looks like a hit is the rarer level.
             parts = [m for s in series if (m := moments_of(s, hits=True)) is not None]
             longest = max(parts, key=lambda m: m.frames)
-            of_fringes = lit(longest.pixel[longest.excess > 0])
-            upper = find_upper(of_fringes, longest.sigma)
-        known = find_stays(of_fringes, longest, upper)
+            upper = _upper(lit, own, longest, told)
+        known = find_stays(lit(_chosen(longest)), longest, upper)
     parts = thinned(parts)
     if known is not None:
         found = _Found(find_population(parts, known[0]), *known, 0.0)
     else:
-        found = _likeliest(parts)
+        found = _likeliest(parts, upper)
     p = found.population
     return Telegraph(
         p.share, p.amplitude, p.shape, found.stays.mean_s, found.stays.decades, found.stays.upper,
         p.share_error, p.amplitude_error, p.shape_error, found.error, told,
     )  # fmt: skip
+
+
+def _chosen(m: Moments) -> Indices:
+    return m.pixel[m.excess > 0]
+
+
+def _upper(
+    lit: Callable[[Indices], Sequence[LitSeries]], own: Series, seen: Moments, told: Signs
+) -> float:
+    """Share of the time in the upper level: by the fringes, else by the frames without light."""
+    pixels = _chosen(seen)
+    upper = find_upper(lit(pixels), seen.sigma)
+    if upper != 0.5 or abs(told.one_sided) < SIGNIFICANT:
+        return upper
+    # Pixels were chosen for what they do in these, so a rare level is taken for a less rare one.
+    noise = np.nan_to_num(own.noise[:, np.isin(own.pixel, pixels)]) * own.sigma
+    noise -= noise.mean(axis=0)
+    dark = LitSeries(noise, np.full(noise.shape, own.sigma**-2), own.frame, own.period_s)
+    return find_upper([dark], seen.sigma)
 
 
 @dataclass(frozen=True)
@@ -95,30 +113,30 @@ class _Found:
     later: float  # what frames further apart have in common beyond that, in errors
 
 
-def _likeliest(parts: Sequence[Moments]) -> _Found:
+def _likeliest(parts: Sequence[Moments], upper: float) -> _Found:
     """Population and stays, of equal stays or of such that differ, by the same frames."""
-    even = _of_stays(parts, 0.0)
+    even = _of_stays(parts, 0.0, upper)
     if even.stays.mean_s > 0:
         # Times of traps differ widely, where frames further apart say so.
-        spread = _of_stays(parts, SPREAD)
+        spread = _of_stays(parts, SPREAD, upper)
         if even.later**2 - spread.later**2 > DIFFER:
             return spread
     return even
 
 
-def _of_stays(parts: Sequence[Moments], decades: float) -> _Found:
+def _of_stays(parts: Sequence[Moments], decades: float, upper: float) -> _Found:
     """The likeliest population with stays that differ by so many decades."""
     # A pixel's variance is high by telegraph noise or by chance: how much is which, the population
     # tells; how much of it a few frames hold, the time.
-    found = find_population(parts, Stays(0.0))
-    switching, error = find_switching(parts, found, decades)
+    found = find_population(parts, Stays(0.0, upper=upper))
+    switching, error = find_switching(parts, found, decades, upper)
     for _ in range(ROUNDS):
         before = switching
         if before == 0:
             break
-        found = find_population(parts, Stays(switching, decades))
-        switching, error = find_switching(parts, found, decades)
+        found = find_population(parts, Stays(switching, decades, upper))
+        switching, error = find_switching(parts, found, decades, upper)
         if abs(switching - before) < SETTLED * error:
             break
-    stays = Stays(switching, decades)
+    stays = Stays(switching, decades, upper)
     return _Found(found, stays, error, off_later(parts, found, stays))

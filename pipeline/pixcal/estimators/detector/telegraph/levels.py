@@ -15,11 +15,11 @@ from pixcal.model.arrays import F64
 _RARER = np.array([0.02, 0.035, 0.06, 0.1, 0.17, 0.28])
 SHARES = np.concatenate([_RARER, [0.5], 1 - _RARER[::-1]])  # of the time in the upper level
 AMPLITUDES = np.geomspace(1.0, 60.0, 14)  # over the noise of dark frames
-# by which the log-likelihood of unequal levels must be higher, a pixel: frames near each other are
-# alike, so it rises by more than of independent ones
+# by which pixels with unequal levels must make the frames likelier, a pixel that has them: frames
+# near each other are alike, so it rises by more than of independent ones
 CLEAR, CLEAR_A_PIXEL = 10.0, 0.1
 MOST_PIXELS = 400
-_QUIET = np.array([0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0])  # shares of pixels that may not jump at all
+_TURNS = 60  # of the maximisation
 
 
 def find_upper(lit: Sequence[LitSeries], noise: float) -> float:
@@ -36,9 +36,16 @@ def find_upper(lit: Sequence[LitSeries], noise: float) -> float:
     each = -(-used[0].charge.shape[1] // MOST_PIXELS)
     charge = np.concatenate([s.charge[:, ::each] for s in used])
     weight = np.concatenate([s.weight[:, ::each] for s in used])
-    likely = np.array([_log_likelihood(charge, weight, p, noise * AMPLITUDES) for p in SHARES])
-    best, even = int(np.argmax(likely)), int(np.flatnonzero(SHARES == 0.5)[0])
-    if likely[best] - likely[even] < CLEAR + CLEAR_A_PIXEL * charge.shape[1]:
+    jumps = np.stack([_log_likelihoods(charge, weight, p, noise * AMPLITUDES) for p in SHARES])
+    even = int(np.flatnonzero(SHARES == 0.5)[0])
+    plain = _mixed(jumps[[even]])[0]
+    found = [
+        _mixed(jumps[[even, n]]) if n != even else (plain, 0.0, 1.0) for n in range(len(SHARES))
+    ]
+    likely, parts, others = np.array(found).T
+    best = int(np.argmax(likely))
+    gain = likely[best] - plain
+    if gain < CLEAR + CLEAR_A_PIXEL * parts[best] * charge.shape[1] or parts[best] < others[best]:
         return 0.5
     # The top of a parabola through it and its neighbours.
     near = np.clip(np.arange(best - 1, best + 2), 0, len(SHARES) - 1)
@@ -48,14 +55,27 @@ def find_upper(lit: Sequence[LitSeries], noise: float) -> float:
     return float(1 / (1 + np.exp(curve[1] / (2 * curve[0]))))
 
 
-def _log_likelihood(charge: F64, weight: F64, upper: float, amplitudes: F64) -> float:
-    """Of all pixels (t, n), each of which has any of the amplitudes or none; over that of none."""
+def _mixed(jumps: F64) -> tuple[float, float, float]:
+    """Likelihood of pixels that are quiet or of some kinds; shares of the last one, and before it.
+
+    ``jumps``: (kind, n) logarithm of each pixel's likelihood, over that of a quiet one.
+    """
+    every = np.vstack([np.zeros(jumps.shape[1]), jumps])
+    log_share = np.full(len(every), -np.log(len(every)))
+    for _ in range(_TURNS):
+        joint = every + log_share[:, None]
+        own = joint - logsumexp(joint, axis=0)
+        log_share = logsumexp(own, axis=1) - np.log(own.shape[1])
+    total = logsumexp(every + log_share[:, None], axis=0)
+    last, before = np.exp(log_share[[-1, -2]])
+    return float(total.sum()), float(last), float(before)
+
+
+def _log_likelihoods(charge: F64, weight: F64, upper: float, amplitudes: F64) -> F64:
+    """Of pixels (t, n), each of which has any of the amplitudes, over that of none."""
     total = np.empty((len(amplitudes), charge.shape[1]))
     for own, amplitude in zip(total, amplitudes, strict=True):
         levels = -upper * amplitude, (1 - upper) * amplitude
         low, high = ((level * charge - level**2 / 2) * weight for level in levels)
         own[:] = np.logaddexp(np.log1p(-upper) + low, np.log(upper) + high).sum(axis=0)
-    jumps = logsumexp(total, axis=0) - np.log(len(amplitudes))
-    with np.errstate(divide="ignore"):  # none jumps
-        either = np.logaddexp(np.log(_QUIET)[:, None], np.log1p(-_QUIET)[:, None] + jumps)
-    return float(either.sum(axis=1).max())
+    return np.asarray(logsumexp(total, axis=0) - np.log(len(amplitudes)))

@@ -1,15 +1,15 @@
 """Moments of each pixel's noise, and what they say of jumps.
 
-A pixel that is noisier than others need not jump. Of Gaussian noise of any size the skewness, the
-kurtosis and the correlation of neighbouring frames, each over the variance, do not depend on it
-(Basu's theorem); so their sums over pixels, weighted by the variance, have known mean and scatter.
+A pixel that is noisier than others need not jump. Of Gaussian noise of any size the kurtosis and
+the correlation of neighbouring frames, each over the variance, do not depend on it (Basu's
+theorem); so their sums over pixels, weighted by the variance, have known mean and scatter.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtri, lambertw
 
 from pixcal.kernels.frame_order import follows
 from pixcal.kernels.significance import sigmas_of_best
@@ -43,7 +43,8 @@ class Moments:
     pixel: Indices
     count: F64  # samples
     variance: F64
-    skewness: F64
+    above: F64  # above, below: samples that are outliers upwards and downwards
+    below: F64
     kurtosis: F64  # excess, unbiased
     # (lag, n) mean product of frames `LAGS` apart; NaN where there are none
     products: F64
@@ -58,7 +59,16 @@ class Moments:
     def of(self, pixels: Indices) -> "Moments":
         """Of some pixels (ascending) alone."""
         own = np.isin(self.pixel, pixels)
-        names = ("pixel", "count", "variance", "skewness", "kurtosis", "products", "stands_for")
+        names = (
+            "pixel",
+            "count",
+            "variance",
+            "above",
+            "below",
+            "kurtosis",
+            "products",
+            "stands_for",
+        )
         return replace(self, **{name: getattr(self, name)[..., own] for name in names})
 
     @property
@@ -79,6 +89,7 @@ def moments_of(series: Series, *, hits: bool = False) -> Moments | None:
     ``hits``: whether samples far beyond all others of their pixel count.
     """
     x = series.noise - np.nanmedian(series.noise, axis=0)
+    above, below = (np.count_nonzero(way * x > _OUTLIER, axis=0) for way in (1, -1))
     if not hits:
         x[_particles(x)] = np.nan
     n = np.isfinite(x).sum(axis=0).astype(float)
@@ -89,7 +100,6 @@ def moments_of(series: Series, *, hits: bool = False) -> Moments | None:
     x = np.nan_to_num(x - np.nanmean(x, axis=0))
     square = np.maximum((x**2).sum(axis=0), 1e-12)
     variance = square / (n - 1)
-    skewness = np.sqrt(n) * (x**3).sum(axis=0) / square**1.5
     kurtosis = n * (x**4).sum(axis=0) / square**2 - 3
     kurtosis = (n - 1) / ((n - 2) * (n - 3)) * ((n + 1) * kurtosis + 6)
     products, pairs = np.full((len(LAGS), x.shape[1]), np.nan), []
@@ -108,7 +118,8 @@ def moments_of(series: Series, *, hits: bool = False) -> Moments | None:
         series.pixel[used],
         n,
         variance / centre,
-        skewness,
+        above[used].astype(float),
+        below[used].astype(float),
         kurtosis,
         products / centre,
         pairs[0],
@@ -153,34 +164,48 @@ def thinned(parts: Sequence[Moments]) -> list[Moments]:
 
 @dataclass(frozen=True)
 class Signs:
-    """Of jumps, in sigmas of Gaussian noise of any size, by all noisy pixels together."""
+    """Of jumps, in sigmas of Gaussian noise of any size, by all pixels together."""
 
     flat_top: float  # two levels that are about equally frequent
-    skewed: float  # the upper level is the rarer one; negative: the lower one
+    # outliers that come back to the same pixels to one side alone: a level that is rare, the upper
+    # one (positive) or the lower one
+    one_sided: float
     staying: float  # neighbouring frames that are alike
     noisy: int  # pixels that stand out
 
     @property
     def significance(self) -> float:
         """Of the clearest sign."""
-        return sigmas_of_best(self.flat_top, self.skewed, -self.skewed, self.staying)
+        return sigmas_of_best(self.flat_top, self.one_sided, -self.one_sided, self.staying)
 
 
 def signs(parts: Sequence[Moments]) -> Signs:
-    """How flat, skewed and alike from frame to frame the noise of noisy pixels is."""
-    value, variance = np.zeros((2, 3))
+    """How flat, one-sided and alike from frame to frame the noise of pixels is."""
+    flat = flat_variance = stay = stay_variance = more = more_variance = 0.0
     noisy: set[int] = set()
     for m in parts:
         n, part = m.count, m.excess / (1 + m.excess)
         of_kurtosis = 24 * n * (n - 1) ** 2 / ((n - 3) * (n - 2) * (n + 3) * (n + 5))
-        of_skewness = 6 * (n - 2) / ((n + 1) * (n + 3))
+        flat -= float(part**2 @ m.kurtosis)
+        flat_variance += float(part**4 @ of_kurtosis)
         # Mean and variance for white noise, exact (Moran 1948, Biometrika 35, 255).
-        of_products = (n - 2) ** 2 / (n**2 * (n - 1)) / m.pairs
-        alike = m.products[0] / m.variance + 1 / n
-        value += -(part**2 @ m.kurtosis), part @ m.skewness, part @ alike
-        variance += part**4 @ of_kurtosis, part**2 @ of_skewness, part**2 @ of_products
+        stay += float(part @ (m.products[0] / m.variance + 1 / n))
+        stay_variance += float(part**2 @ ((n - 2) ** 2 / (n**2 * (n - 1)))) / m.pairs
+        for sign, counts in ((1, m.above), (-1, m.below)):
+            again, by_chance = _come_back(counts)
+            more += sign * (again - by_chance)
+            more_variance += again + by_chance
         noisy.update(m.pixel[m.excess > 0].tolist())
-    if not noisy:
+    if not flat_variance:
         return Signs(0.0, 0.0, 0.0, 0)
-    flat, skewed, staying = value / np.sqrt(np.maximum(variance, 1e-300))
-    return Signs(float(flat), float(skewed), float(staying), len(noisy))
+    one_sided = float(more / (more_variance + 1) ** 0.5)
+    return Signs(flat / flat_variance**0.5, one_sided, stay / stay_variance**0.5, len(noisy))
+
+
+def _come_back(counts: F64) -> tuple[int, float]:
+    """Pixels with several outliers, and how many had them if all pixels were hit alike."""
+    once = np.count_nonzero(counts == 1) / len(counts)
+    # Of a Poisson distribution with this share of ones: the root below one.
+    rate = -float(np.real(lambertw(-min(once, np.exp(-1)))))
+    by_chance = len(counts) * (1 - np.exp(-rate) * (1 + rate))
+    return int(np.count_nonzero(counts > 1)), float(by_chance)

@@ -124,7 +124,7 @@ def _curvature(cost: Callable[[F64], float], at: F64, step: float = 0.05) -> F64
 
 
 def find_switching(
-    parts: Sequence[Moments], population: Population, decades: float
+    parts: Sequence[Moments], population: Population, decades: float, upper: float
 ) -> tuple[float, float]:
     """Mean stay in a level and its error, s, from neighbouring frames."""
     period = min(m.period_s for m in parts)
@@ -134,7 +134,7 @@ def find_switching(
         return 0.0, period
 
     def rest(log_time: float, most: float) -> tuple[float, float]:
-        return _rest(parts, population, Stays(float(np.exp(log_time)), decades), 0, most)
+        return _rest(parts, population, Stays(float(np.exp(log_time)), decades, upper), 0, most)
 
     # Of longer stays the frames do not tell how long.
     longest = max(m.period_s * m.frames for m in parts)
