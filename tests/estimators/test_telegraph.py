@@ -170,6 +170,9 @@ def test_frames_of_fringes_tell_how_much_of_the_time_pixels_are_in_the_upper_lev
     charge -= charge.mean(axis=0)
     lit = LitSeries(charge, 1 / (1 + noisier**2), bright.frame, PERIOD_S)
     assert find_upper([lit], 1.0) == pytest.approx(upper, rel=0.15)
+    # Another set may lack some of the pixels.
+    fewer = replace(lit, charge=lit.charge[:, 7:], weight=lit.weight[:, 7:])
+    assert find_upper([lit, fewer], 1.0) == pytest.approx(upper, rel=0.15)
     noise = replace(lit, charge=noisier * rng.standard_normal(noisier.shape))
     assert find_upper([noise], 1.0) == 0.5
 

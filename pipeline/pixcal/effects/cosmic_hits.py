@@ -227,7 +227,6 @@ class _Search:
     samples: int
     limit: float  # from how many sigmas on a sample is an outlier
     hits: _Hits  # upwards
-    struck: tuple[I64, I64]  # hits on each pixel (y x) in either half of the frames
     downwards: int  # number of those downwards
     sigma: F32  # (t, y, x) noise of the samples, e-; NaN where they do not count
     faintest: float  # usual charge from which a sample is an outlier, e-
@@ -260,15 +259,13 @@ def _search(residual: F32, sigma: F32, seconds: float, area: float) -> _Search:
     up &= ~often
     down &= ~often
     least = limit * np.float32(JOINED / THRESHOLD)
-    hits = _hits(up, ratio > least, residual)
     n = int(np.count_nonzero(usable))
     return _Search(
         seconds,
         area * ratio.size,
         n,
         float(limit),
-        hits,
-        _struck(hits, residual.shape),
+        _hits(up, ratio > least, residual),
         len(_hits(down, ratio < -least, -residual).peaks),
         np.where(usable, sigma, np.float32(np.nan)),
         float(limit * np.median(sigma)),
@@ -312,7 +309,9 @@ def _struck(hits: _Hits, shape: tuple[int, ...]) -> tuple[I64, I64]:
 
 def _come_back(searches: Sequence[_Search]) -> bool:
     """Whether different frames have hits on the same pixels, far more often than by chance."""
-    parts = np.stack([part for s in searches for part in s.struck]).astype(float)
+    parts = np.stack([part for s in searches for part in _struck(s.hits, s.sigma.shape)]).astype(
+        float
+    )
 
     def pairs(counts: F64) -> F64:
         return np.asarray((counts.sum(axis=0) ** 2 - (counts**2).sum(axis=0)) / 2)

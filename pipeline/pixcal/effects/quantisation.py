@@ -42,9 +42,9 @@ class Quantisation(Effect):
     One converter, or one ramp, for all columns. Displacements that are independent leave the
     response straight: codes differ in width, by chance and by a ripple, and one of no width is
     missing. A bit whose weight is off makes codes wide or narrow wherever the bit changes, and
-    bends the response. Codes of any widths, as counts tell them, are a replay of what any converter
-    does. The round-off itself is no more than noise of step²/12 as long as the noise
-    before it spans half a step; so maps do not show it, unless read noise is lower than that.
+    bends the response. ``widths`` holds the widths as measured, whatever the converter. The
+    round-off itself is no more than noise of step²/12 as long as the noise before it spans half a
+    step; so maps do not show it, unless read noise is lower than that.
     """
 
     name = "quantisation"

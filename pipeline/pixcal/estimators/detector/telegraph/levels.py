@@ -27,17 +27,14 @@ def find_upper(lit: Sequence[LitSeries], noise: float) -> float:
 
     Parameters
     ----------
-    lit : frames of fringes of the same pixels
+    lit : frames of fringes; a pixel counts in each set by itself, as one may lack it
     noise : of dark frames, e-
     """
     used = [s for s in lit if s.charge.shape[1] >= FEWEST_PIXELS]
     if not used:
         return 0.5
-    each = -(-used[0].charge.shape[1] // MOST_PIXELS)
-    charge = np.concatenate([s.charge[:, ::each] for s in used])
-    weight = np.concatenate([s.weight[:, ::each] for s in used])
-    jumps = np.stack([_log_likelihoods(charge, weight, p, noise * AMPLITUDES) for p in SHARES])
-    even = int(np.flatnonzero(SHARES == 0.5)[0])
+    jumps = np.hstack([_by_share(s, noise * AMPLITUDES) for s in used])
+    even = len(_RARER)
     plain = _mixed(jumps[[even]])[0]
     found = [
         _mixed(jumps[[even, n]]) if n != even else (plain, 0.0, 1.0) for n in range(len(SHARES))
@@ -45,7 +42,7 @@ def find_upper(lit: Sequence[LitSeries], noise: float) -> float:
     likely, parts, others = np.array(found).T
     best = int(np.argmax(likely))
     gain = likely[best] - plain
-    if gain < CLEAR + CLEAR_A_PIXEL * parts[best] * charge.shape[1] or parts[best] < others[best]:
+    if gain < CLEAR + CLEAR_A_PIXEL * parts[best] * jumps.shape[1] or parts[best] < others[best]:
         return 0.5
     # The top of a parabola through it and its neighbours.
     near = np.clip(np.arange(best - 1, best + 2), 0, len(SHARES) - 1)
@@ -53,6 +50,13 @@ def find_upper(lit: Sequence[LitSeries], noise: float) -> float:
         return float(SHARES[best])
     curve = np.polyfit(logit(SHARES[near]), likely[near] - likely[best], 2)
     return float(1 / (1 + np.exp(curve[1] / (2 * curve[0]))))
+
+
+def _by_share(series: LitSeries, amplitudes: F64) -> F64:
+    """Logarithms (share, n) of the likelihoods of some pixels, over that of quiet ones."""
+    each = -(-series.charge.shape[1] // MOST_PIXELS)
+    charge, weight = series.charge[:, ::each], series.weight[:, ::each]
+    return np.stack([_log_likelihoods(charge, weight, p, amplitudes) for p in SHARES])
 
 
 def _mixed(jumps: F64) -> tuple[float, float, float]:
