@@ -278,10 +278,12 @@ def test_level_dependent_shares_are_undone_too() -> None:
     ids=["four rows", "weak", "nearest neighbours"],
 )
 def test_a_kernel_is_found_with_its_period_and_nothing_else(acquired: Acquired, truth: Ipc) -> None:
-    found = Ipc.estimate(acquired(None, {"ipc": to_plain(truth)}))
+    evidence = acquired(None, {"ipc": to_plain(truth)})
+    found = Ipc.estimate(evidence)
     assert found is not None
     assert isinstance(found.effect, Ipc)
     assert found.significance > 8
+    assert Ipc.detect(evidence) == found.significance
     assert set(shares(found.effect.couplings)) <= set(shares(truth.couplings))
     strong = {key for key, share in shares(truth.couplings).items() if share > 0.003}
     assert strong <= set(shares(found.effect.couplings))

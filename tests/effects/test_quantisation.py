@@ -212,12 +212,27 @@ def test_single_wide_codes_are_measured_whatever_the_converter_does() -> None:
     widths = code_widths(codes_of(np.minimum.accumulate(begins[::-1])[::-1]), 3.0)
     assert widths is not None
     measured = widths.measured
-    assert measured is not None
     steps = np.arange(639, 3400, 64)  # the last codes before a reference
     steps = steps[true[steps] > -0.9]  # neither left out nor over others
     assert np.abs(measured[steps] - true[steps]).max() < 0.15
     even = np.setdiff1d(np.arange(600, 3400), np.arange(639, 3400, 64)[:, None] + np.arange(-4, 5))
     assert np.abs(measured[even]).max() < 4.5 * (4_000_000 / 3000) ** -0.5  # chance of the counts
+
+
+def test_widths_of_a_converter_of_sixteen_bits_are_measured() -> None:
+    rng = np.random.default_rng(5)
+    true = np.zeros(60_001)
+    wide = rng.choice(np.arange(1000, 59_000, 17), 300, replace=False)
+    true[wide] = 0.7
+    light = rng.uniform(900, 59_500, 6_000_000) + rng.normal(0, 8, 6_000_000)
+    begins = np.arange(60_001) - 0.5 + np.cumsum(true) - true
+    counts = np.bincount(np.searchsorted(begins, light, "right") - 1).astype(float)
+    widths = code_widths(counts, 8.0)
+    assert widths is not None
+    measured, chance = widths.measured, 100**-0.5
+    wide = wide[wide < len(measured) - 100]
+    assert np.abs(measured[wide] - 0.7).max() < 5.5 * chance * 1.7**0.5 + 0.05
+    assert 0.63 < measured[wide].mean() < 0.71  # shrunk, by less than a tenth
 
 
 @pytest.mark.parametrize("step", [0.8, -0.6, -1.3, -2.8, -3.5])

@@ -6,6 +6,7 @@ from scipy.linalg import block_diag
 
 from pixcal.estimators.crosstalk.links import PixelClasses, links
 from pixcal.estimators.crosstalk.maps import response_slopes
+from pixcal.estimators.crosstalk.second_order import _third_pixels
 from pixcal.estimators.crosstalk.shrinkage import ShareShrinkage
 from pixcal.kernels.crosstalk import Coupling, couple_fringes
 
@@ -99,3 +100,30 @@ def test_slopes_are_those_of_maps_that_are_coupled():
         moved = [*one[:n], Coupling(c.dy, c.dx, c.share + step, 4, c.row), *one[n + 1 :]]
         expected = (log_response(moved) - log_response(one)) / step
         np.testing.assert_allclose(slopes[n], expected, atol=1e-4)
+
+
+def test_third_pixels_are_those_of_the_couplings_matrix() -> None:
+    """Of sources that repeat every two rows and three columns, in a piece that begins at (1, 2)."""
+    rng = np.random.default_rng(4)
+    steps = (0, 1), (1, 0), (-1, 0), (1, 1), (0, -2)
+    couplings = [
+        Coupling(dy, dx, float(rng.uniform(0.002, 0.02)), 2, row, 3, column)
+        for dy, dx in steps
+        for row in range(2)
+        for column in range(3)
+    ] + [Coupling(0, -1, 0.01)]
+    shape, first = (11, 13), (1, 2)
+    given = np.zeros((shape[0] * shape[1],) * 2)  # (receiver, source)
+    number = np.arange(shape[0] * shape[1]).reshape(shape)
+    for c in couplings:
+        here, there = c.places(shape, first)
+        given[number[there].ravel(), number[here].ravel()] += c.share
+    both = given @ given.T
+    third = _third_pixels(couplings, shape, first)
+    inner = np.ones(shape, bool)
+    inner[:4] = inner[-4:] = inner[:, :4] = inner[:, -4:] = False
+    for step, found in third.items():
+        y, x = np.nonzero(inner)
+        expected = both[number[y, x], number[y + step[0], x + step[1]]]
+        np.testing.assert_allclose(found[inner], expected, atol=1e-12)
+    assert {(0, 1), (2, 0), (1, -1), (0, 3)} <= set(third)

@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 
 from pixcal.estimators.crosstalk.dense import dense_kernel
-from pixcal.estimators.crosstalk.joined import Kernel, measure
+from pixcal.estimators.crosstalk.joined import Kernel, measure, significance
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import (
     Coupling,
@@ -145,6 +145,10 @@ class Ipc(Effect):
             law=f"a kernel of {len(kernel.couplings)} couplings, all significant",
             in_full=cls(_worth_it(kernel.whole)) if kernel.whole else None,
         )  # fmt: skip
+
+    @classmethod
+    def detect(cls, evidence: Evidence) -> float | None:
+        return significance(evidence)
 
     def predict(self, maps: FringeMaps) -> FringeMaps:
         """Maps with the couplings on: ``L (flat theta) / L flat`` (physics note, section 5).

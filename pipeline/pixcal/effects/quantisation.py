@@ -19,7 +19,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.variance_components import sigmas
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best, sigmas_of_chi2
 from pixcal.kernels.synthesis import Stream, generator
-from pixcal.model.arrays import F32, F64
+from pixcal.model.arrays import F32, F64, Indices
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
@@ -28,6 +28,7 @@ from pixcal.simulation.shot import Shot
 FARTHEST = 0.98
 FEW_MISSING = 1.1  # step up to which wrong bits may be why codes never come, every so often
 _KEY = 997
+_CELLS = 16  # to a step, in which codes are looked up; a power of two, so that it is exact
 _LAW = "wrong weights of bits, scatter and a ripple of the widths"
 _OTHER_GAIN = (
     "only codes of bright samples are uneven, as in a camera that reads bright pixels at another "
@@ -106,6 +107,10 @@ class Quantisation(Effect):
         "ripple then only describe them",
     )
 
+    def __hash__(self) -> int:
+        """Without every width: it is asked for in each frame."""
+        return hash((self.coarse_adu, self.dnl_rms, self.ripple, self.bits, len(self.widths)))
+
     @property
     def step_adu(self) -> float:
         """Mean width of a code."""
@@ -155,8 +160,12 @@ class Quantisation(Effect):
         """
         codes = int(top_adu / self.step_adu) + 3
         if any(self.bits) or any(self.widths):
-            found = np.searchsorted(_reached(self, specimen, codes), adu / self.step_adu, "right")
-            return np.asarray(np.maximum(found - 1, 0) * self.step_adu, np.float32)
+            edges, lowest = _reached(self, specimen, codes)
+            reached = adu / np.float32(self.step_adu)
+            code = lowest[np.clip(reached * _CELLS, 0, len(lowest) - 1).astype(np.int32)]
+            while (passed := reached >= edges[code + 1]).any():
+                code += passed
+            return np.asarray(code * self.step_adu, np.float32)
         begins = _thresholds(self, specimen, codes)
         level = np.clip(adu / np.float32(self.step_adu), 0, np.float32(codes - 2))
         nearest = (level + np.float32(0.5)).astype(np.int32)
@@ -182,55 +191,74 @@ class Quantisation(Effect):
         light is no smooth function of the code: then fringes tell, or flats, from where shot noise
         is as large as a step.
         """
-        lit = [f.adu for f in evidence.fringes.values()]
-        counts = histogram([*(s.adu for s in evidence.stacks), *lit], evidence.good)
-        if counts is None or not counts.any():
+        found = _by_law(evidence)
+        if found is None:
             return None
-        step, step_error = step_of(counts)
-        step = max(step, float(evidence.step_adu))
-        noise, first = evidence.read_noise / evidence.gain / step, 0.0
-        lit = lit or [s.adu for s in evidence.of_kind("flat")]
-        if noise < MIN_NOISE and lit:
-            counts = histogram(lit, evidence.good)
-            shot = MIN_NOISE**2 - noise**2
-            first = float(np.median(evidence.bias)) / step + shot * step * evidence.gain
-            noise = MIN_NOISE
-        widths = None
-        if counts is not None:
-            top = evidence.saturation_adu
-            if 1 < step < FEW_MISSING and _has_wrong_bits(code_widths(counts, noise, first, top)):
-                step = 1.0
-            widths = code_widths(converter_counts(counts, step), noise, first, top / step)
-        values: dict[str, Any] = {"coarse_adu": step - 1, "dnl_rms": 0.0, "ripple": 0.0}
-        measured = None
-        together: tuple[dict[str, float], ...] = ()
-        errors = {"coarse_adu": step_error}
-        # A camera that shifts its codes by whole bits is an ordinary one.
-        found = [-1.0 if step == evidence.step_adu else min((step - 1) / step_error, 1e6)]
-        if widths is not None:
-            known, its_errors, chances, together = _uneven(widths)
-            law = {name: known[name] for name in ("bits", "below") if name in known}
-            rest = widths.without(np.array(law["bits"]), law["below"]) if law else widths
-            measured = rest.measured
-            values, errors = values | known, errors | its_errors
-            found += chances
-        elif step == evidence.step_adu:
-            return None
-        by_law, significance = cls(**values), sigmas_of_best(*found)
-        effect = by_law
-        if measured is not None and significance > SIGNIFICANT:
-            effect = replace(by_law, widths=tuple(map(float, measured)))
+        by_law, significance = cls(**found.values), sigmas_of_best(*found.sigmas)
+        effect, widths = by_law, found.widths
+        if widths is not None and significance > SIGNIFICANT:
+            rest = widths.without(np.array(by_law.bits), by_law.below) if by_law.bits else widths
+            effect = replace(by_law, widths=tuple(map(float, rest.measured)))
+        errors = found.errors
         return Estimate(
             effect,
             errors,
             significance,
             "missing codes, and code counts compared with neighbouring codes",
-            {"sigmas": found, "codes": 0 if widths is None else len(widths.number)},
-            (*together, *({n: e} for n, e in errors.items() if n[:4] != "bits")),
+            {"sigmas": found.sigmas, "codes": 0 if widths is None else len(widths.number)},
+            (*found.together, *({n: e} for n, e in errors.items() if n[:4] != "bits")),
             law="" if effect == by_law else _LAW,
             by_law=None if effect == by_law else by_law,
             refused=_OTHER_GAIN if widths is not None and widths.uneven_above else "",
         )
+
+    @classmethod
+    def detect(cls, evidence: Evidence) -> float | None:
+        found = _by_law(evidence)
+        return None if found is None else sigmas_of_best(*found.sigmas)
+
+
+@dataclass(frozen=True)
+class _ByLaw:
+    """A converter by its step, wrong bits, scatter and ripple."""
+
+    values: dict[str, Any]
+    errors: dict[str, float]
+    sigmas: list[float]  # of each of these
+    together: tuple[dict[str, float], ...]  # steps of the bits, of one sigma each
+    widths: CodeWidths | None
+
+
+def _by_law(evidence: Evidence) -> _ByLaw | None:
+    lit = [f.adu for f in evidence.fringes.values()]
+    counts = histogram([*(s.adu for s in evidence.stacks), *lit], evidence.good)
+    if counts is None or not counts.any():
+        return None
+    step, step_error = step_of(counts)
+    step = max(step, float(evidence.step_adu))
+    noise, first = evidence.read_noise / evidence.gain / step, 0.0
+    lit = lit or [s.adu for s in evidence.of_kind("flat")]
+    if noise < MIN_NOISE and lit:
+        counts = histogram(lit, evidence.good)
+        shot = MIN_NOISE**2 - noise**2
+        first = float(np.median(evidence.bias)) / step + shot * step * evidence.gain
+        noise = MIN_NOISE
+    widths = None
+    if counts is not None:
+        top = evidence.saturation_adu
+        if 1 < step < FEW_MISSING and _has_wrong_bits(code_widths(counts, noise, first, top)):
+            step = 1.0
+        widths = code_widths(converter_counts(counts, step), noise, first, top / step)
+    if widths is None and step == evidence.step_adu:
+        return None
+    # A camera that shifts its codes by whole bits is an ordinary one.
+    sigmas = [-1.0 if step == evidence.step_adu else min((step - 1) / step_error, 1e6)]
+    values: dict[str, Any] = {"coarse_adu": step - 1, "dnl_rms": 0.0, "ripple": 0.0}
+    errors = {"coarse_adu": step_error}
+    if widths is None:
+        return _ByLaw(values, errors, sigmas, (), None)
+    known, its_errors, chances, together = _uneven(widths)
+    return _ByLaw(values | known, errors | its_errors, sigmas + chances, together, widths)
 
 
 @lru_cache(maxsize=4)
@@ -240,10 +268,15 @@ def _thresholds(effect: Quantisation, specimen: int, codes: int) -> F32:
 
 
 @lru_cache(maxsize=4)
-def _reached(effect: Quantisation, specimen: int, codes: int) -> F64:
-    """From where on a sample is given a code or a higher one: a bit is taken if it fits."""
+def _reached(effect: Quantisation, specimen: int, codes: int) -> tuple[F64, Indices]:
+    """From where on a sample is given a code or a higher one: a bit is taken if it fits.
+
+    With the lowest code of each of `_CELLS` to a step.
+    """
     begins = effect.thresholds(specimen, codes)
-    return np.asarray(np.minimum.accumulate(begins[::-1])[::-1])
+    begins = np.minimum.accumulate(begins[::-1])[::-1]
+    lowest = np.searchsorted(begins, np.arange(codes * _CELLS) / _CELLS, "right") - 1
+    return np.append(begins, np.inf), np.maximum(lowest, 0)
 
 
 def _has_wrong_bits(widths: CodeWidths | None) -> bool:

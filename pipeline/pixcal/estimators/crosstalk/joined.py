@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from pixcal.estimators.crosstalk.dense import CouplingFrames, Dense, frames_of, within
-from pixcal.estimators.crosstalk.links import links
+from pixcal.estimators.crosstalk.links import Place, links
 from pixcal.estimators.crosstalk.pattern import visibility_pattern
 from pixcal.estimators.crosstalk.support import Choice, choose
 from pixcal.estimators.diagnosis.central_crop import central_crop
@@ -47,19 +47,14 @@ def measure(evidence: Evidence) -> Kernel | None:
     are measured together, and those that are there are told. Raises InputError if so many stand out
     that it is no kernel.
     """
-    if not evidence.fringes:
-        evidence = central_crop(evidence, MOST_PIXELS)
-    shape = (evidence.good.shape[0], evidence.good.shape[1])
-    every = links(shape)
-    frames = frames_of([evidence], lambda _: every) if every else None
-    if frames is None:
+    stands_out = _standing_out(evidence)
+    if stands_out is None:
         return None
-    found = choose(frames.measured(()), visibility_pattern(evidence))
+    evidence, every, found = stands_out
     none = Kernel((), np.zeros((0, 0)), found.significance, (), 0.0, np.inf)
     if not found.links:
         return none
-    near = within(shape, {every[n] for n in found.links})
-    del frames
+    near = within(_shape(evidence), {every[n] for n in found.links})
     known: tuple[Coupling, ...] = ()
     per_ke, error = 0.0, np.inf
     for _ in range(2):
@@ -74,6 +69,27 @@ def measure(evidence: Evidence) -> Kernel | None:
         known = tuple(c for c in dense.couplings) if dense else ()
     assert dense is not None
     return _told(dense, replace(none, per_ke=per_ke, per_ke_error=error))
+
+
+def significance(evidence: Evidence) -> float | None:
+    """Of the strongest coupling, as `measure` gives it."""
+    stands_out = _standing_out(evidence)
+    return None if stands_out is None else stands_out[-1].significance
+
+
+def _standing_out(evidence: Evidence) -> tuple[Evidence, tuple[Place, ...], Choice] | None:
+    """The pixels that are looked at, all links of theirs, and which of these stand out."""
+    if not evidence.fringes:
+        evidence = central_crop(evidence, MOST_PIXELS)
+    every = links(_shape(evidence))
+    frames = frames_of([evidence], lambda _: every) if every else None
+    if frames is None:
+        return None
+    return evidence, every, choose(frames.measured(()), visibility_pattern(evidence))
+
+
+def _shape(evidence: Evidence) -> Place:
+    return evidence.good.shape[0], evidence.good.shape[1]
 
 
 def _level(

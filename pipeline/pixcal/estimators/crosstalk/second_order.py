@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import lcm
 
 import numpy as np
 
@@ -97,17 +98,22 @@ def _per_unit(couplings: Sequence[Coupling]) -> float:
 
 
 def _third_pixels(couplings: Sequence[Coupling], shape: Place, first: Place) -> dict[Place, F64]:
-    """By step: at the first pixel of a link, product of what both partners get of a third."""
-    given = []
+    """By step: at the first pixel of a link, product of what both partners get of a third.
+
+    Of one period of the kernel, repeated over the piece: third pixels beyond it count as well.
+    """
+    period = lcm(*(c.every_rows for c in couplings)), lcm(*(c.every_columns for c in couplings))
+    given: dict[Place, F64] = {}
     for c in couplings:
-        source = np.zeros(shape)
-        source[c.places(shape, first)[0]] = c.share
-        given.append(source)
+        rows = slice((c.row - first[0]) % c.every_rows, None, c.every_rows)
+        columns = slice((c.column - first[1]) % c.every_columns, None, c.every_columns)
+        given.setdefault((c.dy, c.dx), np.zeros(period))[rows, columns] += c.share
     found: dict[Place, F64] = {}
-    for a, of_a in zip(couplings, given, strict=True):
-        for b, of_b in zip(couplings, given, strict=True):
-            step = (b.dy - a.dy, b.dx - a.dx)
+    for a, of_a in given.items():
+        for b, of_b in given.items():
+            step = (b[0] - a[0], b[1] - a[1])
             if step > (0, 0):
-                product = np.roll(of_a * of_b, (a.dy, a.dx), (0, 1))
-                found[step] = found.get(step, np.zeros(shape)) + product
-    return found
+                product = np.roll(of_a * of_b, a, (0, 1))
+                found[step] = found.get(step, 0.0) + product
+    repeats = -(-shape[0] // period[0]), -(-shape[1] // period[1])
+    return {s: np.tile(own, repeats)[: shape[0], : shape[1]] for s, own in found.items()}

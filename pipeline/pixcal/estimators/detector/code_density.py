@@ -40,7 +40,6 @@ MIN_NOISE = 1.4
 # shares of the codes below which they may be even and above which they may not; how much larger
 # than chance the squares of the widths are then, and how many codes below may be as uneven
 _SPLITS, _CLEAR, _EVEN = (0.03, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75), 25.0, 0.05
-MAX_MEASURED = 1 << 12  # codes whose widths are measured one by one: of a converter of 12 bits
 _WIDTH_FITS = 12  # of widths whose variances are found by the fit before
 BELOW = 0.0, 0.5  # where thresholds may lie between two levels
 LOWEST_RIPPLE = 1 / 16  # turns a code
@@ -215,16 +214,14 @@ class CodeWidths:
         return size / more, error / more, sigmas
 
     @property
-    def measured(self) -> F64 | None:
-        """The true width of every code from 0 on, less one; None where codes are too many.
+    def measured(self) -> F64:
+        """The true width of every code from 0 on, less one.
 
         What a local fit takes of the widths is given back as far as few codes explain it: each
         width has a variance of its own, which is as large as it is found to be (Tipping 2001,
         sparse Bayesian learning, without the posterior variances).
         """
         top = int(self.number[-1]) + 1
-        if top > MAX_MEASURED:
-            return None
         half = len(self.kernel) // 2
         bands = [self.kernel[half + k] * np.ones(top) for k in range(-half, half + 1)]
         # The local fit does without codes that are left out.
