@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pixcal.effects.telegraph_noise import TelegraphNoise
+from pixcal.effects.telegraph_noise import MeasuredPixels, TelegraphNoise
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import frames_of
@@ -61,6 +61,33 @@ def test_pixels_are_in_the_upper_level_for_its_share_of_the_time(
     np.testing.assert_allclose(0.9 * low + 0.1 * high, 9000, atol=1)
 
 
+def test_measured_pixels_have_their_levels_and_others_follow_the_law(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    bench = make_effect_bench(LONG)
+    law = TelegraphNoise(0.1, 400.0, 0.0)
+    own = MeasuredPixels((5, 66), (3, 40), 0.5, (9, 64, 65), (3, 20, 39), (2.0, 1.5, 0.75),
+                         (0.5, 0.1, 0.9))  # fmt: skip
+    every, some = (
+        frames_of(bench, bias_of(bench), [effect]).astype(float)
+        for effect in (law, replace(law, measured=(own,)))
+    )
+    by_law, now = (0.5 * np.ptp(frames, axis=0) for frames in (every, some))
+    part = np.zeros(now.shape, bool)
+    part[5:66, 3:40] = True
+    np.testing.assert_array_equal(now[~part], by_law[~part])
+    at = np.array([own.row, own.column])
+    np.testing.assert_allclose(now[*at], [800, 600, 300], atol=1)
+    faint = part & (by_law > 0) & (by_law < 195)
+    faint[*at] = False
+    part[*at] = False
+    np.testing.assert_array_equal(now[faint], by_law[faint])
+    assert now[part].max() < 201
+    series = some[:, *at]
+    up = series > (series.max(axis=0) + series.min(axis=0)) / 2
+    np.testing.assert_allclose(up.mean(axis=0), own.upper, atol=4 * 0.5 / np.sqrt(len(up)))
+
+
 def test_it_belongs_to_the_pixels_of_the_chip(make_effect_bench: Callable[..., Bench]) -> None:
     chip = {"detector.chip": [150, 300], "frames.bias": 30}
     effect = TelegraphNoise(0.1, 400.0, 0.0)
@@ -89,9 +116,11 @@ def test_share_amplitude_and_time_are_found(
 ) -> None:
     names = ("share", "amplitude_e", "switching_s", "amplitude_shape")
     parameters = {n: getattr(truth, n) for n in names}
-    found = TelegraphNoise.estimate(acquired(None, {"telegraph_noise": parameters}))
+    evidence = acquired(None, {"telegraph_noise": parameters})
+    found = TelegraphNoise.estimate(evidence)
     assert found is not None
     assert isinstance(found.effect, TelegraphNoise)
+    assert TelegraphNoise.detect(evidence) == found.significance
     for name, value in parameters.items():
         assert abs(getattr(found.effect, name) - value) <= 4 * found.errors.get(name, 0.0), name
     assert found.errors["share"] < 0.4 * truth.share

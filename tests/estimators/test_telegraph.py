@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from pixcal.estimators.detector.telegraph.classes import Mixture
 from pixcal.estimators.detector.telegraph.dwell import LitSeries, find_stays
 from pixcal.estimators.detector.telegraph.find import find_telegraph
-from pixcal.estimators.detector.telegraph.levels import find_upper
+from pixcal.estimators.detector.telegraph.levels import find_upper, own_levels
 from pixcal.estimators.detector.telegraph.moments import QUIET, Series, moments_of, thinned
 from pixcal.model.arrays import Indices
 
@@ -151,7 +151,7 @@ def test_frames_of_fringes_tell_how_long_pixels_stay(time_s: float, decades: flo
     assert seen is not None
     chosen = seen.pixel[seen.excess > 0]
     chosen = chosen[chosen < 400]
-    lit = LitSeries(charge[:, chosen], weight[:, chosen], bright.frame, PERIOD_S)
+    lit = LitSeries(charge[:, chosen], weight[:, chosen], bright.frame, PERIOD_S, chosen)
     found = find_stays([lit], seen)
     assert found is not None
     stays, error = found
@@ -168,13 +168,44 @@ def test_frames_of_fringes_tell_how_much_of_the_time_pixels_are_in_the_upper_lev
     noisier = rng.uniform(3.0, 9.0, bright.noise.shape)
     charge = bright.noise + noisier * rng.standard_normal(noisier.shape)
     charge -= charge.mean(axis=0)
-    lit = LitSeries(charge, 1 / (1 + noisier**2), bright.frame, PERIOD_S)
+    lit = LitSeries(charge, 1 / (1 + noisier**2), bright.frame, PERIOD_S, np.arange(200))
     assert find_upper([lit], 1.0) == pytest.approx(upper, rel=0.15)
     # Another set may lack some of the pixels.
-    fewer = replace(lit, charge=lit.charge[:, 7:], weight=lit.weight[:, 7:])
+    fewer = replace(lit, charge=lit.charge[:, 7:], weight=lit.weight[:, 7:], pixel=lit.pixel[7:])
     assert find_upper([lit, fewer], 1.0) == pytest.approx(upper, rel=0.15)
     noise = replace(lit, charge=noisier * rng.standard_normal(noisier.shape))
     assert find_upper([noise], 1.0) == 0.5
+
+
+def test_levels_of_single_pixels_are_those_that_they_have() -> None:
+    """Weak ones by the dark frames, strong ones by those of fringes, also where one was unseen."""
+    rng = np.random.default_rng(3)
+    amplitude = np.repeat([5.0, 25.0, 0.0], [60, 40, 30])
+    upper = np.repeat([0.5, 0.2, 0.5], [60, 40, 30])
+    series = []
+    for frames, noise in ((40, 1.0), (311, 7.0), (290, 7.0)):
+        up = rng.random((frames, len(amplitude))) < upper
+        if frames == 40:
+            up[:, 70:80] = False  # they stayed in the lower one
+        x = up * amplitude + noise * rng.standard_normal(up.shape)
+        x -= x.mean(axis=0)
+        pixels = 3 * np.arange(len(amplitude))
+        series.append(LitSeries(x, np.full(x.shape, noise**-2), np.arange(frames), 0.14, pixels))
+    lacking = replace(
+        series[2], charge=series[2].charge[:, 5:], weight=series[2].weight[:, 5:],
+        pixel=series[2].pixel[5:],
+    )  # fmt: skip
+    found = own_levels([*series[:2], lacking], 1.0)
+    number = found.pixel // 3
+    assert set(range(100)) <= set(number.tolist())
+    assert np.count_nonzero(number >= 100) <= 1
+    weak, strong = number < 60, (number >= 60) & (number < 100)
+    # Of a weak one 40 frames tell it to a sigma over the root of 40, at best.
+    assert found.amplitude[weak].mean() == pytest.approx(5, rel=0.05)
+    assert found.amplitude[weak].std() < 0.6
+    assert found.amplitude[strong].mean() == pytest.approx(25, rel=0.02)
+    assert found.amplitude[strong].std() < 2.0
+    assert found.upper[strong].mean() == pytest.approx(0.2, abs=0.03)
 
 
 @pytest.mark.long
@@ -186,7 +217,7 @@ def test_pixels_that_are_rarely_in_the_upper_level_are_counted() -> None:
 
     def lit(pixels: Indices) -> list[LitSeries]:
         own = charge[:, pixels]
-        return [LitSeries(own, np.full(own.shape, 1 / 37), bright.frame, PERIOD_S)]
+        return [LitSeries(own, np.full(own.shape, 1 / 37), bright.frame, PERIOD_S, pixels)]
 
     found = find_telegraph([dark], lit)
     assert found is not None
@@ -201,7 +232,8 @@ def test_noise_without_jumps_tells_no_stays() -> None:
     seen = moments_of(dark)
     assert seen is not None
     charge = rng.standard_normal((307, 60))
-    assert find_stays([LitSeries(charge, np.ones((307, 60)), np.arange(307), 0.14)], seen) is None
+    series = LitSeries(charge, np.ones((307, 60)), np.arange(307), 0.14, np.arange(60))
+    assert find_stays([series], seen) is None
     assert find_stays([], seen) is None
 
 

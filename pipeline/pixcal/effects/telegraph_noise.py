@@ -8,7 +8,7 @@ import numpy as np
 
 from pixcal.estimators.detector.telegraph.classes import Stays
 from pixcal.estimators.detector.telegraph.dwell import LitSeries
-from pixcal.estimators.detector.telegraph.find import Telegraph, find_telegraph
+from pixcal.estimators.detector.telegraph.find import Telegraph, find_telegraph, significance
 from pixcal.estimators.detector.telegraph.moments import Series
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
@@ -28,6 +28,28 @@ _MIN_NOISE_ADU = 0.8
 _HOT = 4.0
 _WIDE = 16
 _FRAMES_AT_ONCE = 256
+_LAW = "amplitudes of a gamma distribution, all pixels as often in the upper level"
+
+
+@dataclass(frozen=True)
+class MeasuredPixels:
+    """Pixels of a part of the window whose levels were measured one by one."""
+
+    rows: tuple[int, int] = quantity(doc="first row of the part, and the one after the last")
+    columns: tuple[int, int] = quantity(doc="first column, and the one after the last")
+    faintest: float = quantity(
+        low=0, doc="difference of the levels from which pixels were measured, over the mean one"
+    )
+    row: tuple[int, ...] = quantity(doc="row of each pixel")
+    column: tuple[int, ...] = quantity(doc="column of each pixel")
+    amplitude: tuple[float, ...] = quantity(
+        doc="difference of its levels, over the mean one of all pixels"
+    )
+    upper: tuple[float, ...] = quantity(doc="share of the time in its upper level")
+
+    def __hash__(self) -> int:
+        """Without the pixels: it is asked for in each frame."""
+        return hash((self.rows, self.columns, self.faintest, len(self.row)))
 
 
 @dataclass(frozen=True)
@@ -35,7 +57,8 @@ class TelegraphNoise(Effect):
     """Some pixels jump between two levels, as a trap fills and empties.
 
     Both states are equally likely unless ``upper`` says otherwise; the mean level does not change.
-    Amplitudes have a gamma distribution, by default an exponential one. Nothing of it is constant
+    Amplitudes have a gamma distribution, by default an exponential one, but for pixels that were
+    measured by themselves. Nothing of it is constant
     in time, so maps of the fit neither show it nor can be mended; the pixels are those that
     `reduce` flags as noisy.
     """
@@ -74,6 +97,7 @@ class TelegraphNoise(Effect):
         "switching_s is the geometric mean"
     )  # fmt: skip
     upper: float = quantity(0.5, above=0, below=1, doc="share of the time in the upper level")
+    measured: tuple[MeasuredPixels, ...] = quantity((), doc="pixels with levels of their own")
 
     def readout(self, adu: F32, shot: Shot) -> F32:
         found = adu.copy()
@@ -81,16 +105,16 @@ class TelegraphNoise(Effect):
         stays = Stays(self.switching_s, self.switching_decades)
         first, last = shot.rows
         for block in range(first // BLOCK_ROWS, -(-last // BLOCK_ROWS)):
-            rows, columns, amplitudes, places = _pixels(
-                detector, block, self.share, self.amplitude_shape
+            rows, columns, amplitudes, places, upper = _pixels(
+                detector, block, self.share, self.amplitude_shape, self.upper, self.measured
             )
             if not len(rows):
                 continue
             seed = int(recording.pixel_rng(self.name, block).integers(1 << 62))
             keep = np.broadcast_to(stays.kept(recording.period_s, places), len(rows))
-            states = _states(seed, recording.count, keep.tobytes(), self.upper)
+            states = _states(seed, recording.count, keep.tobytes(), upper.tobytes())
             up = np.unpackbits(states[shot.frame], count=len(rows))
-            step = (up - np.float32(self.upper)) * amplitudes * np.float32(self.amplitude_e)
+            step = (up - upper) * amplitudes * np.float32(self.amplitude_e)
             inside = (rows >= first) & (rows < last)
             at = rows[inside] - first, columns[inside]
             found[at] += step[inside] / np.float32(detector.gain_e_per_adu)
@@ -111,22 +135,41 @@ class TelegraphNoise(Effect):
         series = tuple(_series(evidence))
         if not series:
             return None
-        found = find_telegraph(series, partial(_lit, evidence))
+        found = find_telegraph(series, partial(_lit, evidence), _turned_away(evidence))
         if found is None:
             return None
-        return _estimate(cls, found)
+        return _estimate(cls, found, evidence)
+
+    @classmethod
+    def detect(cls, evidence: Evidence) -> float | None:
+        return significance(tuple(_series(evidence)))
 
 
-def _estimate(cls: type[TelegraphNoise], found: Telegraph) -> Estimate:
+def _estimate(cls: type[TelegraphNoise], found: Telegraph, evidence: Evidence) -> Estimate:
+    by_law = cls(
+        found.share,
+        found.amplitude,
+        found.switching_s,
+        found.shape,
+        found.switching_decades,
+        found.upper,
+    )
+    effect, own = by_law, found.own
+    if own is not None and len(own.pixel):
+        (y, x), (ny, nx) = evidence.origin, evidence.good.shape
+        rows, columns = np.divmod(own.pixel, nx)
+        measured = MeasuredPixels(
+            (y, y + ny),
+            (x, x + nx),
+            found.faintest / found.amplitude,
+            tuple((y + rows).tolist()),
+            tuple((x + columns).tolist()),
+            tuple((own.amplitude / found.amplitude).tolist()),
+            tuple(own.upper.tolist()),
+        )
+        effect = replace(by_law, measured=(measured,))
     return Estimate(
-        cls(
-            found.share,
-            found.amplitude,
-            found.switching_s,
-            found.shape,
-            found.switching_decades,
-            found.upper,
-        ),
+        effect,
         {
             "share": found.share_error,
             "amplitude_e": found.amplitude_error,
@@ -141,14 +184,24 @@ def _estimate(cls: type[TelegraphNoise], found: Telegraph) -> Estimate:
             "staying_sigmas": found.signs.staying,
             "noisy": found.signs.noisy,
         },
+        law="" if effect == by_law else _LAW,
+        by_law=None if effect == by_law else by_law,
     )
 
 
 @lru_cache(maxsize=4)
 def _pixels(
-    detector: SimulatedDetector, block: int, share: float, shape: float
-) -> tuple[Indices, Indices, F32, F32]:
-    """Pixels of a block that have it: rows, columns, amplitudes of mean one, places among stays."""
+    detector: SimulatedDetector,
+    block: int,
+    share: float,
+    shape: float,
+    upper: float,
+    measured: tuple[MeasuredPixels, ...],
+) -> tuple[Indices, Indices, F32, F32, F32]:
+    """Pixels of a block that have it.
+
+    Their rows, columns, amplitudes over the mean, places among stays, shares of the time above.
+    """
     rows = block * BLOCK_ROWS, min((block + 1) * BLOCK_ROWS, detector.shape[0])
 
     def draw(rng: np.random.Generator) -> F64:
@@ -159,18 +212,27 @@ def _pixels(
 
     amplitudes = chip_map(detector, rows, TelegraphNoise.name, draw)
     places = chip_map(detector, rows, f"{TelegraphNoise.name} stays", lambda rng: rng.random(TILE))
+    uppers = np.full_like(amplitudes, upper)
+    for some in measured:
+        inside = slice(*(max(r - rows[0], 0) for r in some.rows)), slice(*some.columns)
+        part = amplitudes[inside]
+        part[part >= some.faintest] = 0
+        at = np.array([some.row, some.column])
+        here = (at[0] >= rows[0]) & (at[0] < rows[1]) & (at[1] < amplitudes.shape[1])
+        y, x = at[0, here] - rows[0], at[1, here]
+        amplitudes[y, x], uppers[y, x] = np.array([some.amplitude, some.upper])[:, here]
     y, x = np.nonzero(amplitudes)
-    return y + rows[0], x, amplitudes[y, x], places[y, x]
+    return y + rows[0], x, amplitudes[y, x], places[y, x], uppers[y, x]
 
 
 @lru_cache(maxsize=4)
-def _states(seed: int, frames: int, kept: bytes, upper: float) -> U8:
+def _states(seed: int, frames: int, kept: bytes, upper: bytes) -> U8:
     """Whether each pixel is in its upper level, in bits: (frame, pixel / 8).
 
-    ``kept``: of each pixel, float64, the correlation from frame to frame. ``upper``: share of the
-    time in the upper level.
+    ``kept``: of each pixel, float64, the correlation from frame to frame. ``upper``: of each,
+    float32, the share of the time in the upper level.
     """
-    rng, keep = np.random.default_rng(seed), np.frombuffer(kept)
+    rng, keep, share = np.random.default_rng(seed), np.frombuffer(kept), np.frombuffer(upper, "f4")
     pixels = len(keep)
     up = np.zeros(pixels, bool)
     packed = []
@@ -180,7 +242,7 @@ def _states(seed: int, frames: int, kept: bytes, upper: float) -> U8:
         states = np.empty((count, pixels), bool)
         for n, (anew, coin) in enumerate(drawn):
             draw = anew >= keep if first + n else np.ones(pixels, bool)
-            up = np.where(draw, coin < upper, up)
+            up = np.where(draw, coin < share, up)
             states[n] = up
         packed.append(np.packbits(states, axis=1))
     return np.concatenate(packed)
@@ -231,8 +293,17 @@ def _lit(evidence: Evidence, pixels: Indices) -> list[LitSeries]:
         left = freedom.left_over(freedom.of_good(chosen.residual))
         charge = np.where(freedom.weight > 0, left, 0.0).astype(float)
         period = _period(fringes.time_s) if len(fringes.time_s) > 1 else 0.0
-        found.append(LitSeries(charge, freedom.weight.astype(float), fringes.frame, period))
+        weight = freedom.weight.astype(float)
+        found.append(LitSeries(charge, weight, fringes.frame, period, np.flatnonzero(own)))
     return found
+
+
+def _turned_away(evidence: Evidence) -> Indices:
+    """Pixels that the fit left out for their noise."""
+    noisy = np.zeros(evidence.good.shape, bool)
+    for fringes in evidence.fringes.values():
+        noisy |= evidence.good & np.isfinite(fringes.theta).all(axis=0) & ~fringes.good
+    return np.flatnonzero(noisy)
 
 
 def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Series:

@@ -35,6 +35,7 @@ class LitSeries:
     weight: F64  # (t, n) inverse of its variance without jumps, e-⁻²; 0 where there is none
     frame: Indices  # (t,) numbers of the frames
     period_s: float
+    pixel: Indices  # (n,) which pixels
 
 
 def find_stays(

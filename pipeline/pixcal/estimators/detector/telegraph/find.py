@@ -7,8 +7,9 @@ import numpy as np
 
 from pixcal.estimators.detector.telegraph.classes import Stays
 from pixcal.estimators.detector.telegraph.dwell import LitSeries, find_stays
-from pixcal.estimators.detector.telegraph.levels import find_upper
+from pixcal.estimators.detector.telegraph.levels import OwnLevels, find_upper, own_levels
 from pixcal.estimators.detector.telegraph.moments import (
+    NOISY,
     Moments,
     Series,
     Signs,
@@ -29,6 +30,7 @@ ROUNDS = 3  # most, in which population and time are found, each with the other 
 # decades over which stays differ where they do, and the chi-square by which frames further apart
 # must say so (equal stays: at most 1.9 in eight draws of 3-sigma jumps in 3 % of 16,000 pixels)
 SPREAD, DIFFER = 1.5, 2.0
+MOST_OWN = 3000  # pixels that are measured one by one: a millisecond each
 SETTLED = 0.5  # change of the time, over its error, after which no other round is needed
 
 
@@ -49,20 +51,31 @@ class Telegraph:
     shape_error: float
     switching_error: float
     signs: Signs  # that noisy pixels jump
+    # own, faintest: levels of single pixels, where the fringes tell; of jumps of so many electrons
+    own: OwnLevels | None = None
+    faintest: float = 0.0
 
 
 def find_telegraph(
-    series: Sequence[Series], lit: Callable[[Indices], Sequence[LitSeries]] = lambda _: ()
+    series: Sequence[Series],
+    lit: Callable[[Indices], Sequence[LitSeries]] = lambda _: (),
+    noisy: Indices | None = None,
 ) -> Telegraph | None:
     """Telegraph noise from one or several series of the same pixels; None without samples.
 
-    ``lit``: gives the frames of fringes of some pixels, which tell how long they stay.
+    Parameters
+    ----------
+    series
+    lit : gives the frames of fringes of some pixels, which tell how long they stay
+    noisy : pixels that are noisy in these
     """
     parts = [m for s in series if (m := moments_of(s)) is not None]
     if not parts:
         return None
     told = signs(parts)
     longest, upper, known = max(parts, key=lambda m: m.frames), 0.5, None
+    single: OwnLevels | None = None
+    faintest = 0.0
     if told.significance > SIGNIFICANT and told.noisy:
         own = max(series, key=lambda s: len(s.noise))
         upper = _upper(lit, own, longest, told)
@@ -72,6 +85,9 @@ def find_telegraph(
             longest = max(parts, key=lambda m: m.frames)
             upper = _upper(lit, own, longest, told)
         known = find_stays(lit(_chosen(longest)), longest, upper)
+        clear = NOISY * float(np.sqrt(2 / longest.dof)) / (upper * (1 - upper))
+        faintest = longest.sigma * clear**0.5
+        single = _single(lit, own, longest, noisy, faintest)
     parts = thinned(parts)
     if known is not None:
         found = _Found(find_population(parts, known[0]), *known, 0.0)
@@ -80,8 +96,14 @@ def find_telegraph(
     p = found.population
     return Telegraph(
         p.share, p.amplitude, p.shape, found.stays.mean_s, found.stays.decades, found.stays.upper,
-        p.share_error, p.amplitude_error, p.shape_error, found.error, told,
+        p.share_error, p.amplitude_error, p.shape_error, found.error, told, single, faintest,
     )  # fmt: skip
+
+
+def significance(series: Sequence[Series]) -> float | None:
+    """Of the signs that noisy pixels jump; None without samples."""
+    parts = [m for s in series if (m := moments_of(s)) is not None]
+    return signs(parts).significance if parts else None
 
 
 def _chosen(m: Moments) -> Indices:
@@ -97,10 +119,32 @@ def _upper(
     if upper != 0.5 or abs(told.one_sided) < SIGNIFICANT:
         return upper
     # Pixels were chosen for what they do in these, so a rare level is taken for a less rare one.
-    noise = np.nan_to_num(own.noise[:, np.isin(own.pixel, pixels)]) * own.sigma
+    return find_upper([_in_the_dark(own, pixels)], seen.sigma)
+
+
+def _in_the_dark(own: Series, pixels: Indices) -> LitSeries:
+    some = np.isin(own.pixel, pixels)
+    noise = np.nan_to_num(own.noise[:, some]) * own.sigma
     noise -= noise.mean(axis=0)
-    dark = LitSeries(noise, np.full(noise.shape, own.sigma**-2), own.frame, own.period_s)
-    return find_upper([dark], seen.sigma)
+    weight = np.full(noise.shape, own.sigma**-2)
+    return LitSeries(noise, weight, own.frame, own.period_s, own.pixel[some])
+
+
+def _single(
+    lit: Callable[[Indices], Sequence[LitSeries]],
+    own: Series,
+    seen: Moments,
+    noisy: Indices | None,
+    faintest: float,
+) -> OwnLevels | None:
+    """Levels of each pixel that jumps so far; None where the fringes do not tell."""
+    pixels = _chosen(seen) if noisy is None else np.union1d(_chosen(seen), noisy)
+    bright = lit(pixels) if len(pixels) <= MOST_OWN else ()
+    if not bright:
+        return None
+    found = own_levels([_in_the_dark(own, pixels), *bright], seen.sigma)
+    far = found.amplitude >= faintest
+    return OwnLevels(found.pixel[far], found.amplitude[far], found.upper[far])
 
 
 @dataclass(frozen=True)
