@@ -121,14 +121,14 @@ class BiasDrift(Effect):
         if shot.recording.kind == "fringes":
             offset = self._in_run(shot)
         elif any(track.set == own for track in self.tracks):
-            offset = float(at(self.tracks, own, shot.frame * shot.recording.period_s))
+            offset = float(at(self.tracks, own, shot.recording.times_s[shot.frame]))
         else:
             offset = self.offset(shot.time_s, shot.bench.seed, shot.rng(self.name))
         return adu + np.float32(offset / shot.bench.detector.gain_e_per_adu)
 
     def _in_run(self, shot: Shot) -> float:
         """Offset of a frame of fringes, e-: as measured, or by the laws where it was not."""
-        time = shot.frame * shot.recording.period_s
+        time = float(shot.recording.times_s[shot.frame])
         name = shot.bench.frames.fringes[shot.recording.number].name
         rng = shot.rng(self.name)
         if any(track.set == name for track in self.tracks):

@@ -78,7 +78,7 @@ class FringeDrift(Effect):
         return np.asarray(np.outer(time_s / HOUR_S, self.ramp) + np.outer(fade, self.settle))
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
-        time = np.arange(recording.count, dtype=float) * recording.period_s
+        time = recording.times_s
         steps = recording.rng(self.name).standard_normal((recording.count, 2))
         walk = np.cumsum(steps, axis=0) * np.sqrt(recording.period_s / HOUR_S)
         change = self.vector_change(time) + walk * self.walk

@@ -56,7 +56,7 @@ class FringeJitter(Effect):
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         drawn = recording.rng(self.name).standard_normal((recording.count, 2))
-        time = np.arange(recording.count, dtype=float) * recording.period_s
+        time = recording.times_s
         phase = 2 * np.pi * recording.rng(self.name, 1).random()
         swung = swing(time, self.vibration_hz, phase, recording.exptime_s)
         change = drawn * np.array(self.rms) + np.outer(swung, self.vibration)

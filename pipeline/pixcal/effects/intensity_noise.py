@@ -78,7 +78,7 @@ class IntensityNoise(Effect):
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         drawn = recording.rng(self.name).standard_normal(recording.count)
         keep = np.exp(-recording.period_s / self.correlation_s) if self.correlation_s else 0.0
-        time = np.arange(recording.count, dtype=float) * recording.period_s
+        time = recording.times_s
         phase = 2 * np.pi * recording.rng(self.name, 1).random()
         change = self.rms * damped_walk(drawn, keep)
         change += self.line * swing(time, self.line_hz, phase, recording.exptime_s)

@@ -67,7 +67,9 @@ class WavelengthDrift(Effect):
         hours = recording.period_s / HOUR_S
         steps = recording.rng(self.name).standard_normal(count)
         hops = recording.rng(self.name, 1).poisson(self.hops_per_h * hours, count)
-        change = self.ramp * hours * np.arange(count) + self.walk * np.sqrt(hours) * steps.cumsum()
+        change = (
+            self.ramp * recording.times_s / HOUR_S + self.walk * np.sqrt(hours) * steps.cumsum()
+        )
         change = change + self.hop * (np.cumsum(hops) % 2)
         # One over the wavelength, less what it was.
         shrunk = -change / (1 + change)

@@ -87,7 +87,7 @@ class _Shot:
     @property
     def time_s(self) -> float:
         """Start of the frame after that of the acquisition."""
-        return self.recording.start_s + self.frame * self.recording.period_s
+        return self.recording.start_s + float(self.recording.times_s[self.frame])
 
     @property
     def states(self) -> FrameStates:

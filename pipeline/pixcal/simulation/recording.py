@@ -1,6 +1,6 @@
 """What a bench records: sequences of frames, in order of time."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from zlib import crc32
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from pixcal.kernels.normals import Key
 from pixcal.kernels.scene import electrons_per_unit
 from pixcal.kernels.synthesis import Stream, generator, pixel_key
+from pixcal.model.arrays import F64
 from pixcal.model.bench import Bench
 
 KINDS = ("bias", "dark", "flat", "fringes")
@@ -34,6 +35,15 @@ class Recording:
     # happens to a frame, and not the noise of their pixels
     window: int = 0
     before: "Recording | None" = None  # that ended when this one began, where it is known
+    # start of each frame after the first, where frames were lost or late; else a period apart
+    stamps_s: tuple[float, ...] = field(default=(), repr=False, hash=False)
+
+    @property
+    def times_s(self) -> F64:
+        """Start (count,) of each frame after the first."""
+        if self.stamps_s:
+            return np.array(self.stamps_s)
+        return np.arange(self.count, dtype=float) * self.period_s
 
     @property
     def key(self) -> tuple[int, int]:

@@ -18,6 +18,7 @@ from pixcal.simulation.replica import plain_bench
 from pixcal.stages.diagnose.nominal import SetTruth
 from pixcal.stages.diagnose.parts import Half, Table, groups
 
+_LATE = 0.05  # of a period, from which frames are late
 _LIFTED = 8.0  # read noise that the level without light is lifted to
 
 
@@ -110,10 +111,15 @@ def recordings_of(
                 lit = np.isfinite(light[n])
                 # Of flats that are not looked at nothing is known.
                 electrons = float(light[n][lit].mean()) if lit.any() else 0.0
+            after = times[numbers] - times[numbers[0]]
+            known = bool(np.isfinite(after).all())
+            even = np.arange(len(after)) * period
+            late = known and not np.allclose(after, even, rtol=0, atol=_LATE * period)
             recordings.append(
                 Recording(
                     bench, kind, listed.get(name, n), name, name, len(numbers), exposure,
                     start[name] + float(times[numbers[0]]), period, electrons,
+                    stamps_s=tuple(after.tolist()) if late else (),
                 )
             )  # fmt: skip
             places.append((name, numbers))
