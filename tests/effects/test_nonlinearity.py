@@ -2,12 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import galsim
 import numpy as np
 import pytest
 
-from pixcal.effects.nonlinearity import Bend, Nonlinearity
+from pixcal.effects.nonlinearity import Bend, Nonlinearity, _straight_on
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
@@ -244,3 +246,23 @@ def test_moving_boundaries_are_not_taken_for_it(acquired: Callable[..., Evidence
     found = Nonlinearity.estimate(acquired(None, {"brighter_fatter": {"shift_px_per_e": 1e-6}}))
     assert found is not None
     assert found.significance < 4
+
+
+def test_beyond_the_brightest_fringe_a_measured_response_goes_straight_on() -> None:
+    """Where its polynomial, which darker samples gave, would fall by 6 % of the charge."""
+    points = Bend(0.0, 0.0), Bend(500.0, 28.0), Bend(9000.0, -9.0), Bend(18_000.0, 40.0)
+    curve = Nonlinearity(0.16, -0.3, bends=points)
+
+    def beside(brightest: float) -> Any:
+        flat = SimpleNamespace(adu=np.full((2, 5, 7), brightest))
+        return SimpleNamespace(bias=0.0, gain=1.0, of_kind=lambda _: [flat])
+
+    assert _straight_on(curve, beside(17_000.0)) == []
+    whole = replace(curve, bends=(*points, *_straight_on(curve, beside(30_000.0))))
+    at = np.float32([9000, 18_000, 19_000, 22_000, 26_000, 30_000])
+    signal = whole.response(at).astype(float)
+    straight = signal[1] + (signal[1] - signal[0]) / 9000 * (at[2:] - 18_000)
+    np.testing.assert_allclose(signal[2:], straight, atol=8)
+    below = np.linspace(0, 17_000, 100, dtype=np.float32)
+    np.testing.assert_allclose(whole.response(below), curve.response(below), atol=20)
+    assert abs(curve.response(at)[-1] - straight[-1]) > 1500

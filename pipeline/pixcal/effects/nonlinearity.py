@@ -27,6 +27,7 @@ FALLOFF_PX = 0.5  # of the shift of boundaries by the brighter-fatter effect bes
 # levels at which a response is measured, as shares of the way from the darkest samples to the
 # brightest
 KNOTS = np.array([0, 1 / 64, 1 / 32, *np.arange(1, 17) / 16])
+BEYOND = 4  # points beyond the brightest fringe, up to the brightest flat
 TAIL = 1e-3  # share of the samples that are darker, and brighter
 # chi-square of a measured response beside a polynomial, over that of the polynomial, from which it
 # is told
@@ -174,8 +175,9 @@ class Nonlinearity(Effect):
         if more is None:
             return Estimate(effect, named, *told, refused=refused)
         named |= {f"bends[{n}].change_e": error for n, error in enumerate(more[1])}
+        curve = replace(effect, bends=more[0])
         return Estimate(
-            replace(effect, bends=more[0]), named, *told,
+            replace(curve, bends=(*more[0], *_straight_on(curve, evidence))), named, *told,
             law="response curve of second and third order", by_law=effect, refused=refused,
         )  # fmt: skip
 
@@ -254,6 +256,23 @@ def _bends(
         return None, agreement
     bends = tuple(Bend(float(k), float(c)) for k, c in zip(knots, [0.0, *change], strict=True))
     return (bends, [0.0, *map(float, np.sqrt(np.diag(covariance)))]), agreement
+
+
+def _straight_on(curve: Nonlinearity, evidence: Evidence) -> list[Bend]:
+    """Points beyond the fringes, up to the brightest flats, where the response goes straight on.
+
+    The polynomial beside the points is a fit to darker samples, and may bend anywhere.
+    """
+    flats = [(s.adu[0] - evidence.bias) * evidence.gain for s in evidence.of_kind("flat")]
+    top = curve.bends[-1].level_e
+    brightest = max((float(np.quantile(f, 1 - TAIL)) for f in flats), default=0.0)
+    if brightest <= top:
+        return []
+    levels = np.array([top / 2, top, *np.linspace(top, brightest, BEYOND + 1)[1:]], np.float32)
+    middle, end = curve.response(levels[:2]).astype(float)
+    straight = end + (end - middle) * (levels[2:] / top - 1) * 2
+    change = straight - replace(curve, bends=()).response(levels[2:])
+    return [Bend(float(at), float(c)) for at, c in zip(levels[2:], change, strict=True)]
 
 
 def _full_scale(evidence: Evidence, usual: float) -> float:
