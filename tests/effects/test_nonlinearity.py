@@ -249,7 +249,7 @@ def test_moving_boundaries_are_not_taken_for_it(acquired: Callable[..., Evidence
 
 
 def test_beyond_the_brightest_fringe_a_measured_response_goes_straight_on() -> None:
-    """Where its polynomial, which darker samples gave, would fall by 6 % of the charge."""
+    """Where its polynomial, which darker samples gave, would be 3 % lower."""
     points = Bend(0.0, 0.0), Bend(500.0, 28.0), Bend(9000.0, -9.0), Bend(18_000.0, 40.0)
     curve = Nonlinearity(0.16, -0.3, bends=points)
 
@@ -265,4 +265,4 @@ def test_beyond_the_brightest_fringe_a_measured_response_goes_straight_on() -> N
     np.testing.assert_allclose(signal[2:], straight, atol=8)
     below = np.linspace(0, 17_000, 100, dtype=np.float32)
     np.testing.assert_allclose(whole.response(below), curve.response(below), atol=20)
-    assert abs(curve.response(at)[-1] - straight[-1]) > 1500
+    assert abs(curve.response(at)[-1] - straight[-1]) > 900
