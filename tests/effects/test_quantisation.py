@@ -235,6 +235,18 @@ def test_widths_of_a_converter_of_sixteen_bits_are_measured() -> None:
     assert 0.63 < measured[wide].mean() < 0.71  # shrunk, by less than a tenth
 
 
+def test_widths_of_displaced_thresholds_are_measured_and_do_not_wander() -> None:
+    rng = np.random.default_rng(6)
+    begins = np.sort(np.arange(4096) - 0.5 + rng.normal(0, 0.5, 4096))
+    widths = code_widths(codes_of(begins), 3.0)
+    assert widths is not None
+    measured, true = widths.measured, np.diff(begins) - 1
+    inner = slice(560, 3430)
+    # The local fit divides by what uneven codes make of its mean, which leaves some scatter.
+    assert np.std(measured[inner] - true[inner]) < 0.2 * np.std(true[inner])
+    assert np.abs(np.cumsum(measured)[600:3400:100]).max() < 3
+
+
 @pytest.mark.parametrize("step", [0.8, -0.6, -1.3, -2.8, -3.5])
 def test_where_a_bit_leaves_several_codes_out_its_weight_is_told(step: float) -> None:
     """Codes by successive approximation of noisy light; bit 10 turns over at 1024 and 3072."""

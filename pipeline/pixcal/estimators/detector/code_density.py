@@ -41,6 +41,9 @@ MIN_NOISE = 1.4
 # than chance the squares of the widths are then, and how many codes below may be as uneven
 _SPLITS, _CLEAR, _EVEN = (0.03, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75), 25.0, 0.05
 _WIDTH_FITS = 12  # of widths whose variances are found by the fit before
+_FEW = 0.15  # median over mean square of the widths (0.45 if normal) below which few are uneven
+_TOLD = 4.0  # median square of the widths over that of chance, above which most are uneven
+_SLOW = 101  # codes over which widths add up to nothing, of thresholds displaced each by itself
 BELOW = 0.0, 0.5  # where thresholds may lie between two levels
 LOWEST_RIPPLE = 1 / 16  # turns a code
 
@@ -217,9 +220,10 @@ class CodeWidths:
     def measured(self) -> F64:
         """The true width of every code from 0 on, less one.
 
-        What a local fit takes of the widths is given back as far as few codes explain it: each
-        width has a variance of its own, which is as large as it is found to be (Tipping 2001,
-        sparse Bayesian learning, without the posterior variances).
+        What a local fit takes of the widths is given back as far as thresholds explain it that are
+        displaced, each by itself. Where few codes are uneven, each width has a variance of its own
+        instead, which is as large as it is found to be (Tipping 2001, sparse Bayesian learning,
+        without the posterior variances).
         """
         top = int(self.number[-1]) + 1
         half = len(self.kernel) // 2
@@ -228,18 +232,28 @@ class CodeWidths:
         there = diags_array(np.where(self.gap[:top], 0.0, 1.0))
         gaps = diags_array(np.where(self.gap[:top], 1.0, 0.0))
         design = diags_array(bands, offsets=range(-half, half + 1), shape=(top, top)) @ there + gaps
-        design = csr_array(design)[self.number]
+        square = self.width**2
+        few = float(np.median(square)) < _FEW * float(np.mean(square))
+        few |= float(np.median(square / self.variance)) < _TOLD
+        ends = [-np.ones(top), (0.0 if few else 1.0) * np.ones(top - 1)]
+        widths_of = csr_array(diags_array(ends, offsets=[0, 1], shape=(top, top)))
+        design = csr_array(design @ widths_of)[self.number]
         weight = diags_array(1 / self.variance)
         normal, data = design.T @ weight @ design, self.width
-        own = np.full(top, float(np.mean(data**2)))
+        own = np.full(top, float(np.mean(square)) * (1.0 if few else 0.5))
         for _ in range(_WIDTH_FITS):
             right = design.T @ (weight @ data)
-            found = spsolve(csc_array(normal + diags_array(1 / own)), right)
-            own = found**2 + float(np.median(self.variance))
+            solved = spsolve(csc_array(normal + diags_array(1 / own)), right)
+            found = widths_of @ solved
+            if few:
+                own = found**2 + float(np.median(self.variance))
             raised = self._raised(np.where(self.gap[:top], 0.0, found))
             data = self.width * np.where(self.gap[:top], 1.0, raised)[self.number]
-        found[self.number] -= found[self.number].mean()  # a slope is a gain
-        return np.asarray(np.maximum(found, -1))
+        # A slope is a gain; thresholds that are displaced each by itself do not wander either.
+        for _ in range(_WIDTH_FITS):
+            slow = found[self.number].mean() if few else uniform_filter1d(found, _SLOW)
+            found = np.maximum(np.where(np.arange(top) < self.number[0], found, found - slow), -1)
+        return np.asarray(found)
 
     @property
     def uneven_above(self) -> bool:
