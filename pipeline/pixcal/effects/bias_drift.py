@@ -33,6 +33,7 @@ from pixcal.kernels.synthesis import Stream, generator
 from pixcal.model.arrays import F32, F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
+from pixcal.simulation.recording import KINDS
 from pixcal.simulation.shot import Shot
 from pixcal.simulation.track import Track, at
 
@@ -157,9 +158,12 @@ class BiasDrift(Effect):
 
     def undo(self, maps: FringeMaps) -> FringeMaps | None:
         """As in `Effect.undo`: the mean offset of a replayed run is no light."""
-        level = sum(float(np.mean(t.value)) for t in self.tracks if t.set == maps.name and t.value)
-        if not level:
+        others = [f"{kind} frames" for kind in KINDS]
+        tracks = [track for track in self.tracks if track.value and track.set not in others]
+        levels = {track.set: float(np.mean(track.value)) for track in tracks}
+        if not any(levels.values()):
             return None
+        level = levels.get(maps.name, 0.0)
         theta = maps.theta.copy()
         theta[0] -= level / (1.0 if maps.flat is None else maps.flat)
         return replace(maps, theta=theta)
