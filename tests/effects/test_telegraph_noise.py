@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pixcal.effects.telegraph_noise import MeasuredPixels, TelegraphNoise
+from pixcal.effects.telegraph_noise import MeasuredPixels, TelegraphNoise, _pixels
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.model.bench import Bench
+from pixcal.kernels.synthesis import BLOCK_ROWS
+from pixcal.model.bench import Bench, SimulatedDetector
 from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import Recording, recordings
 
@@ -112,7 +113,9 @@ def test_it_belongs_to_the_pixels_of_the_chip(make_effect_bench: Callable[..., B
     ],
 )
 def test_share_amplitude_and_time_are_found(
-    acquired: Callable[..., Evidence], truth: TelegraphNoise
+    acquired: Callable[..., Evidence],
+    make_effect_bench: Callable[..., Bench],
+    truth: TelegraphNoise,
 ) -> None:
     names = ("share", "amplitude_e", "switching_s", "amplitude_shape")
     parameters = {n: getattr(truth, n) for n in names}
@@ -123,13 +126,35 @@ def test_share_amplitude_and_time_are_found(
     assert TelegraphNoise.detect(evidence) == found.significance
     for name, value in parameters.items():
         assert abs(getattr(found.effect, name) - value) <= 4 * found.errors.get(name, 0.0), name
+    assert_measured_pixels_jump(found.effect, truth, make_effect_bench().detector)
     assert found.errors["share"] < 0.4 * truth.share
     assert found.errors["amplitude_e"] < 0.4 * truth.amplitude_e
     assert found.significance > 5
 
 
+def assert_measured_pixels_jump(
+    found: TelegraphNoise, truth: TelegraphNoise, detector: SimulatedDetector
+) -> None:
+    """Most of those that were measured one by one do, and by as much."""
+    (own,) = found.measured
+    rows, columns, amplitudes, *_ = _pixels(
+        detector, 0, truth.share, truth.amplitude_shape, truth.upper, ()
+    )
+    true = np.zeros((BLOCK_ROWS, detector.shape[1]))
+    true[rows, columns] = amplitudes * truth.amplitude_e
+    row, column, seen = np.array([own.row, own.column, own.amplitude])[
+        :, np.array(own.row) < BLOCK_ROWS
+    ]
+    there = true[row.astype(int), column.astype(int)]
+    assert np.count_nonzero(there) > 0.7 * len(row) > 5
+    off = (seen * found.amplitude_e / np.maximum(there, 1) - 1)[there > 0]
+    assert np.median(np.abs(off)) < 0.2
+
+
 @pytest.mark.long
-def test_strong_jumps_show_in_fringes_alone(acquired: Callable[..., Evidence]) -> None:
+def test_strong_jumps_show_in_fringes_alone(
+    acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench]
+) -> None:
     # With so few bias frames the noisy pixels were not left out of the fit.
     few = {"frames.bias": 4, "frames.darks": []}
     evidence = acquired(few, {"telegraph_noise": {"amplitude_e": 300.0}})
@@ -139,6 +164,8 @@ def test_strong_jumps_show_in_fringes_alone(acquired: Callable[..., Evidence]) -
     assert abs(found.effect.amplitude_e - 300) < 4 * found.errors["amplitude_e"] < 300
     assert abs(found.effect.share - 0.02) < 4 * found.errors["share"] < 0.04
     assert found.significance > 10
+    truth = TelegraphNoise(amplitude_e=300.0)
+    assert_measured_pixels_jump(found.effect, truth, make_effect_bench().detector)
     nothing = TelegraphNoise.estimate(replace(acquired(), stacks=()))
     assert nothing is not None
     assert nothing.significance < 4

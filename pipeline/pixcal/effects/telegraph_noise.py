@@ -58,9 +58,8 @@ class TelegraphNoise(Effect):
 
     Both states are equally likely unless ``upper`` says otherwise; the mean level does not change.
     Amplitudes have a gamma distribution, by default an exponential one, but for pixels that were
-    measured by themselves. Nothing of it is constant
-    in time, so maps of the fit neither show it nor can be mended; the pixels are those that
-    `reduce` flags as noisy.
+    measured by themselves. Nothing of it is constant in time, so maps of the fit neither show it
+    nor can be mended; the pixels are those that `reduce` flags as noisy.
     """
 
     name = "telegraph_noise"
