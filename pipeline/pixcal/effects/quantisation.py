@@ -232,6 +232,10 @@ class _ByLaw:
 
 
 def _by_law(evidence: Evidence, far: bool = False) -> _ByLaw | None:
+    """What the counts of the codes say; None where samples are no codes, or too few.
+
+    ``far``: as in `_uneven`.
+    """
     lit = [f.adu for f in evidence.fringes.values()]
     counts = histogram([*(s.adu for s in evidence.stacks), *lit], evidence.good)
     if counts is None or not counts.any():
@@ -292,8 +296,8 @@ def _uneven(
 ) -> tuple[dict[str, Any], dict[str, float], list[float], tuple[dict[str, float], ...]]:
     """Wrong bits, scatter and ripple of the widths, their errors, and how sure they are.
 
-    With independent steps of the bits, of one sigma each. ``far``: whether levels may overlap by
-    many codes; else their weights are found to what tells that they are wrong.
+    With independent steps of the bits, of one sigma each. ``far``: levels that overlap by many
+    codes are tried too, which takes longer; the significance does not need it.
     """
     variance, error, scatter_sigmas = widths.scatter()
     line = widths.ripple(variance)
