@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pixcal.effects.quantisation import Quantisation, _uneven
-from pixcal.estimators.detector.code_density import code_widths, histogram, level_errors, step_of
+from pixcal.estimators.detector.code_density import code_widths, histogram, moved_by_bits, step_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 
 TOP = 65535.0
@@ -170,21 +170,6 @@ def test_the_nearest_of_levels_with_wrong_bits_is_taken() -> None:
     assert np.mean(codes != expected) < 1e-3
 
 
-@pytest.mark.parametrize("below", [0.0, 0.5])
-def test_bits_by_which_levels_overlap_are_found(below: float) -> None:
-    """By a dozen codes and more, of light that is spread evenly."""
-    off = np.array([0.0, 0.0, 0.1, 0.1, 0.2, 0.0, 1.0, 0.7, 1.5, 8.2, -0.8, -15.0])
-    rng = np.random.default_rng(8)
-    light = rng.normal(rng.uniform(500, 3500, 4_000_000), 3.0).astype(np.float32)
-    codes = Quantisation(0.0, 0.0, 0.0, bits=tuple(off), below=below).converted(light, 0, TOP)
-    widths = code_widths(np.bincount(codes.astype(int), minlength=4096).astype(float), 3.0)
-    assert widths is not None
-    bits, _ = widths.bits(0.0, below, far=True)
-    assert widths.level(bits) == pytest.approx(widths.level(off), abs=0.4)
-    near, _ = widths.bits(0.0, below)
-    assert np.abs(widths.level(near) - widths.level(off)).max() > 2
-
-
 def test_codes_have_the_widths_that_were_measured() -> None:
     widths = np.zeros(3000)
     widths[[500, 1024, 2047]] = 2.5, -0.4, -1.0
@@ -214,8 +199,8 @@ def test_it_is_told_which_level_a_converter_with_wrong_bits_takes(below: float) 
         error = np.sqrt(over @ found.covariance @ over)
         assert over @ (found.bits - off) == pytest.approx(0, abs=4 * error + 0.03)
     # A response without a slope of its own.
-    flat = widths.level(found.bits)
-    moved = level_errors(flat, 4096)[widths.number]
+    flat = widths.level(found.bits, below)
+    moved = moved_by_bits(flat, below, 4096)[widths.number]
     assert abs(np.polyfit(widths.number, moved, 1)[0]) < 1e-9
 
 

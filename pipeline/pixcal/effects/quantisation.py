@@ -9,10 +9,10 @@ import numpy as np
 from pixcal.estimators.detector.code_density import (
     MIN_NOISE,
     CodeWidths,
-    code_cells,
     code_widths,
     converter_counts,
     histogram,
+    moved_by_bits,
     step_of,
 )
 from pixcal.estimators.diagnosis.evidence import Evidence
@@ -117,7 +117,7 @@ class Quantisation(Effect):
         return 1 + self.coarse_adu
 
     def thresholds(self, specimen: int, codes: int) -> F64:
-        """Where codes begin, in steps, in the order of their levels; code n near ``n - 1/2``.
+        """Where codes 0 to ``codes - 1`` begin, in steps; those of code n near ``n - 1/2``.
 
         Parameters
         ----------
@@ -136,13 +136,11 @@ class Quantisation(Effect):
             # Sum of the ripple of all codes below.
             phase = turn * (number - 0.5) + self.ripple_phase_rad
             shift += self.ripple * np.sin(phase) / (2 * np.sin(turn / 2))
-        begins, order = code_cells(np.array(self.bits), self.below, codes)
-        begins += np.clip(shift, -FARTHEST, FARTHEST)[order]
+        begins = number - 0.5 + np.clip(shift, -FARTHEST, FARTHEST)
+        begins += moved_by_bits(np.array(self.bits), self.below, codes)
         wider = np.zeros(codes)
-        wider[: len(measured)] = measured[:codes]
-        # A code that is wider moves those above it.
-        begins[1:] += np.cumsum(wider[order])[:-1]
-        return np.asarray(begins)
+        wider[1:][: len(measured)] = measured[: codes - 1]
+        return np.asarray(begins + np.cumsum(wider))
 
     def converted(self, adu: F32, specimen: int, top_adu: float, normals: F32 | None = None) -> F32:
         """Codes in ADU: each sample passes the thresholds that it reaches.
@@ -162,12 +160,12 @@ class Quantisation(Effect):
         """
         codes = int(top_adu / self.step_adu) + 3
         if any(self.bits) or any(self.widths):
-            edges, order, lowest = _reached(self, specimen, codes)
+            edges, lowest = _reached(self, specimen, codes)
             reached = adu / np.float32(self.step_adu)
             code = lowest[np.clip(reached * _CELLS, 0, len(lowest) - 1).astype(np.int32)]
             while (passed := reached >= edges[code + 1]).any():
                 code += passed
-            return np.asarray(order[code] * self.step_adu, np.float32)
+            return np.asarray(code * self.step_adu, np.float32)
         begins = _thresholds(self, specimen, codes)
         level = np.clip(adu / np.float32(self.step_adu), 0, np.float32(codes - 2))
         nearest = (level + np.float32(0.5)).astype(np.int32)
@@ -193,7 +191,7 @@ class Quantisation(Effect):
         light is no smooth function of the code: then fringes tell, or flats, from where shot noise
         is as large as a step.
         """
-        found = _by_law(evidence, far=True)
+        found = _by_law(evidence)
         if found is None:
             return None
         by_law, significance = cls(**found.values), sigmas_of_best(*found.sigmas)
@@ -231,11 +229,8 @@ class _ByLaw:
     widths: CodeWidths | None
 
 
-def _by_law(evidence: Evidence, far: bool = False) -> _ByLaw | None:
-    """What the counts of the codes say; None where samples are no codes, or too few.
-
-    ``far``: as in `_uneven`.
-    """
+def _by_law(evidence: Evidence) -> _ByLaw | None:
+    """What the counts of the codes say; None where samples are no codes, or too few."""
     lit = [f.adu for f in evidence.fringes.values()]
     counts = histogram([*(s.adu for s in evidence.stacks), *lit], evidence.good)
     if counts is None or not counts.any():
@@ -263,7 +258,7 @@ def _by_law(evidence: Evidence, far: bool = False) -> _ByLaw | None:
     errors = {"coarse_adu": step_error}
     if widths is None:
         return _ByLaw(values, errors, sigmas, (), None)
-    known, its_errors, chances, together = _uneven(widths, far)
+    known, its_errors, chances, together = _uneven(widths)
     return _ByLaw(values | known, errors | its_errors, sigmas + chances, together, widths)
 
 
@@ -274,16 +269,15 @@ def _thresholds(effect: Quantisation, specimen: int, codes: int) -> F32:
 
 
 @lru_cache(maxsize=4)
-def _reached(effect: Quantisation, specimen: int, codes: int) -> tuple[F64, Indices, Indices]:
-    """From where on a sample has a code or one of a higher level, and the codes in this order.
+def _reached(effect: Quantisation, specimen: int, codes: int) -> tuple[F64, Indices]:
+    """From where on a sample is given a code or a higher one: a bit is taken if it fits.
 
-    With the place in it of the lowest code of each of `_CELLS` to a step.
+    With the lowest code of each of `_CELLS` to a step.
     """
     begins = effect.thresholds(specimen, codes)
-    order = code_cells(np.array(effect.bits), effect.below, codes)[1]
     begins = np.minimum.accumulate(begins[::-1])[::-1]
     lowest = np.searchsorted(begins, np.arange(codes * _CELLS) / _CELLS, "right") - 1
-    return np.append(begins, np.inf), order, np.maximum(lowest, 0)
+    return np.append(begins, np.inf), np.maximum(lowest, 0)
 
 
 def _has_wrong_bits(widths: CodeWidths | None) -> bool:
@@ -292,12 +286,11 @@ def _has_wrong_bits(widths: CodeWidths | None) -> bool:
 
 
 def _uneven(
-    widths: CodeWidths, far: bool = False
+    widths: CodeWidths,
 ) -> tuple[dict[str, Any], dict[str, float], list[float], tuple[dict[str, float], ...]]:
     """Wrong bits, scatter and ripple of the widths, their errors, and how sure they are.
 
-    With independent steps of the bits, of one sigma each. ``far``: levels that overlap by many
-    codes are tried too, which takes longer; the significance does not need it.
+    With independent steps of the bits, of one sigma each.
     """
     variance, error, scatter_sigmas = widths.scatter()
     line = widths.ripple(variance)
@@ -312,9 +305,9 @@ def _uneven(
     # Bits repeat too: the least of them as a ripple of two or four codes.
     clearer = 2 * rest < variance - share * line.amplitude**2
     if wrong > SIGNIFICANT and (wrong > sure or clearer):
-        bits, covariance = widths.bits(2 * rest, found.below, far)
+        bits, covariance = widths.bits(2 * rest, found.below)
         values, errors, others, _ = _uneven(widths.without(bits, found.below))
-        levelled = np.stack([widths.level(one) for one in np.eye(len(bits))], 1)
+        levelled = np.stack([widths.level(one, found.below) for one in np.eye(len(bits))], 1)
         covariance = levelled @ covariance @ levelled.T
         values |= {"bits": tuple(map(float, levelled @ bits)), "below": found.below}
         spread = np.sqrt(np.diag(covariance))

@@ -35,11 +35,6 @@ _MISSED = 3.0
 _UNEVEN = 2e-3
 # fits of the weights of bits, until the misfit falls by less than
 _BIT_FITS, _SETTLED = 12, 0.1
-# how far apart levels may be where a bit turns over, of its weight; codes up to which this is
-# tried, in steps of so many
-_WRONG, _TRIED = 0.05, ((40.0, 0.25), (0.5, 0.05))
-_SMALL = 0.25  # changes (codes) for derivatives, of the nearest of all levels
-_CLEARLY = 25.0  # chi-square by which levels that are far apart must fit better
 # codes of noise below which the peak of dark frames is too narrow for a local fit
 MIN_NOISE = 1.4
 # shares of the codes below which they may be even and above which they may not; how much larger
@@ -175,25 +170,15 @@ class WrongBits:
     chi2: float  # of the bits
 
 
-def level_errors(bits: F64, codes: int) -> F64:
-    """By how much (codes) wrong weights of bits move the levels of codes 0 to ``codes - 1``."""
-    return np.asarray((np.arange(codes)[:, None] >> np.arange(len(bits)) & 1) @ bits)
-
-
-def code_cells(bits: F64, below: float, codes: int) -> tuple[F64, I64]:
-    """Where each code begins, half a code below its level where that is right; in which order.
+def moved_by_bits(bits: F64, below: float, codes: int) -> F64:
+    """By how much (codes) wrong weights of bits move where codes 0 to ``codes - 1`` begin.
 
     A code begins at its own level if a bit is taken where it fits, as in a converter by successive
-    approximation: one that begins after a higher one is never reached. If the nearest level is
-    taken, a code begins half-way (``below``) from the level below, whichever code has that.
+    approximation, and half-way from the level below if the nearest level is taken.
     """
-    level = np.arange(codes) + level_errors(bits, codes)
-    if not below:
-        return np.minimum.accumulate(level[::-1])[::-1] - 0.5, np.arange(codes)
-    order = np.argsort(level, kind="stable")
-    level = level[order]
-    lower = np.concatenate([[level[0] - 1], level[:-1]])
-    return level - 0.5 + below * (lower + 1 - level), order
+    number = np.arange(codes)
+    level = (number[:, None] >> np.arange(len(bits)) & 1) @ bits
+    return np.asarray(level + below * (level[np.maximum(number - 1, 0)] - level))
 
 
 @dataclass(frozen=True)
@@ -298,42 +283,25 @@ class CodeWidths:
             tried.append((misfit, WrongBits(bits, below, covariance, float(bits @ inverse @ bits))))
         return min(tried, key=lambda one: one[0])[1]
 
-    def bits(self, scatter: float, below: float = 0.0, far: bool = False) -> tuple[F64, F64]:
+    def bits(self, scatter: float, below: float = 0.0) -> tuple[F64, F64]:
         """By how much each bit's weight is off, in codes, the least first; and the covariance.
 
         A bit that does not change within the codes at hand gets nothing. The common factor of all
         weights, a gain, does not change the local widths: the smallest errors are given (`level`
         gives others). A weight that is more than a code too small leaves several codes out, which
-        is no linear change, so the fit is repeated about what was found, by changes of a code;
-        where the nearest level is taken, by small ones.
-
-        Parameters
-        ----------
-        scatter : variance of the widths beside
-        below : share of a threshold that the level of the code below sets
-        far : begin with levels of many codes that overlap, or lie apart
+        is no linear change, so the fit is repeated about what was found, by changes of a code.
+        ``below``: share of a threshold that the level of the code below sets.
         """
+        number = (len(self.gap) - 1).bit_length()
         weight = 1 / (self.variance + max(scatter, 0.0))
-        none = np.zeros((len(self.gap) - 1).bit_length())
-        bits, covariance, misfit = self._fitted_bits(none, weight, below)
-        if far:
-            other = self._fitted_bits(self._far(below), weight, below)
-            if other[2] < misfit - _CLEARLY:
-                bits, covariance, _ = other
-        return bits, covariance
-
-    def _fitted_bits(self, bits: F64, weight: F64, below: float) -> tuple[F64, F64, float]:
-        """Wrong bits, their covariance, and what misfit they leave, from where a fit begins."""
-        number = len(bits)
-        change = 1.0 if below == 0 else _SMALL
-        left = self.width - self._left_out(bits, below)
+        bits, left = np.zeros(number), self.width
         misfit = float(weight @ left**2)
         for _ in range(_BIT_FITS):
             slopes = [
                 self._left_out(bits + e, below) - self._left_out(bits - e, below)
-                for e in change * np.eye(number)
+                for e in np.eye(number)
             ]
-            design = np.stack(slopes, 1) / (2 * change)
+            design = np.stack(slopes, 1) / 2
             normal = (design.T * weight) @ design
             scale = 1 / np.sqrt(np.maximum(np.diag(normal), _NO_CHANGE))
             gain = np.where(np.diag(normal) > _NO_CHANGE, 2.0 ** np.arange(number) / scale, 0.0)
@@ -349,42 +317,25 @@ class CodeWidths:
             bits, left, misfit = moved, after, misfit - better
             if better < _SETTLED:
                 break
-        return bits, covariance, misfit
+        return bits, covariance
 
-    def _far(self, below: float) -> F64:
-        """Wrong bits by trying how far apart the levels are where each of them turns over.
-
-        From the highest bit down. As far apart as all higher ones are then too, which stay where
-        they were against each other.
-        """
-        number = (len(self.gap) - 1).bit_length()
-        bits = np.zeros(number)
-        for reach, step in _TRIED:
-            for bit in reversed(range(number)):
-                above = np.arange(number) - bit
-                way = np.where(above > 0, 2.0 ** (above - 1), np.where(above == 0, 1.0, 0.0))
-                most = min(_WRONG * 2.0**bit, reach)
-                tried = np.vstack([bits, bits + np.outer(np.arange(-most, most, step), way)])
-                left = [(self.width - self._left_out(one, below)) ** 2 for one in tried]
-                bits = tried[np.argmin([float(np.sum(rest / self.variance)) for rest in left])]
-        return np.asarray(bits)
-
-    def level(self, bits: F64) -> F64:
+    def level(self, bits: F64, below: float) -> F64:
         """Bits with a common factor by which the response has no slope over the codes at hand."""
         changing = np.ptp(self.number[:, None] >> np.arange(len(bits)) & 1, axis=0) > 0
         gain = np.where(changing, 2.0 ** np.arange(len(bits)), 0.0)
         of_bits, of_gain = (
-            np.polyfit(self.number, level_errors(own, len(self.gap))[self.number], 1)[0]
+            np.polyfit(self.number, moved_by_bits(own, below, len(self.gap))[self.number], 1)[0]
             for own in (bits, gain)
         )
         return np.asarray(bits - of_bits / of_gain * gain)
 
     def _left_out(self, bits: F64, below: float) -> F64:
         """Widths (n,) that wrong weights of bits bring about, less what the local fit takes."""
-        begins, order = code_cells(bits, below, len(self.gap))
-        width = np.ones(len(begins))
-        width[order[:-1]] = np.diff(begins)
-        return self._after_fit(width[:-1] - 1)[self.number]
+        codes = np.arange(len(self.gap))
+        begins = codes + moved_by_bits(bits, below, len(codes))
+        # A code that begins after a higher one is never reached.
+        reached = np.minimum.accumulate(begins[::-1])[::-1]
+        return self._after_fit(np.diff(reached) - 1)[self.number]
 
     def _after_fit(self, width: F64) -> F64:
         """Widths of codes 0, 1, ..., less one, as they come out relative to a local fit."""
