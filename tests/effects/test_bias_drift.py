@@ -402,5 +402,8 @@ def test_the_level_of_a_replayed_run_is_no_light() -> None:
     same = drift.undo(replace(maps, name="horizontal"))
     assert same is not None
     np.testing.assert_array_equal(same.theta, theta)
+    twice = replace(drift, tracks=2 * drift.tracks).undo(maps)
+    assert twice is not None
+    np.testing.assert_allclose(twice.theta[0], 5000 - 400 / 0.8)
     in_the_dark = replace(drift, tracks=(replace(drift.tracks[0], set="bias frames"),))
     assert in_the_dark.undo(maps) is None

@@ -160,10 +160,9 @@ class BiasDrift(Effect):
         """As in `Effect.undo`: the mean offset of a replayed run is no light."""
         others = [f"{kind} frames" for kind in KINDS]
         tracks = [track for track in self.tracks if track.value and track.set not in others]
-        levels = {track.set: float(np.mean(track.value)) for track in tracks}
-        if not any(levels.values()):
+        if not any(np.mean(track.value) for track in tracks):
             return None
-        level = levels.get(maps.name, 0.0)
+        level = sum(float(np.mean(track.value)) for track in tracks if track.set == maps.name)
         theta = maps.theta.copy()
         theta[0] -= level / (1.0 if maps.flat is None else maps.flat)
         return replace(maps, theta=theta)
