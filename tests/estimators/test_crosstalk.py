@@ -12,7 +12,7 @@ from pixcal.estimators.crosstalk.hot_pixels import HotPixels
 from pixcal.estimators.crosstalk.information import MeasuredLinks
 from pixcal.estimators.crosstalk.links import PixelClasses, class_sums, links, periods, sums_of
 from pixcal.estimators.crosstalk.pattern import visibility_pattern
-from pixcal.estimators.crosstalk.support import Choice, choose
+from pixcal.estimators.crosstalk.support import INDEPENDENT, Choice, Looks, choose
 from pixcal.estimators.fringe_fit.modes import solve_modes
 from pixcal.estimators.maps.corrected import (
     corrected_offsets,
@@ -65,7 +65,7 @@ def test_significance_is_that_of_the_best_of_many_looks():
     """The largest of N squares of normals; a million draws against the formula's quantiles."""
 
     def of(best, looks):
-        return Choice((), PixelClasses(1, 1, (0, 0)), best, looks).significance
+        return Choice((), PixelClasses(1, 1, (0, 0)), (Looks(best, looks),)).significance
 
     rng = np.random.default_rng(2)
     looks, drawn = 1000, []
@@ -79,14 +79,31 @@ def test_significance_is_that_of_the_best_of_many_looks():
     assert np.all(np.diff(ladder) > 0)
 
 
-def noise_shared(steps, alike):
-    """Products of residuals in which pixels some steps apart share noise, by the hundredth."""
+def test_significance_is_that_of_the_better_of_two_groups_of_looks():
+    rng = np.random.default_rng(3)
+    drawn = [
+        Choice(
+            (),
+            PixelClasses(1, 1, (0, 0)),
+            tuple(
+                Looks(float((rng.standard_normal(n) ** 2).max()), round(n / INDEPENDENT))
+                for n in (700, 7)
+            ),
+        ).significance
+        for _ in range(400)
+    ]
+    assert np.mean(drawn) == pytest.approx(0, abs=0.2)
+    assert np.std(drawn) == pytest.approx(1, abs=0.15)
+
+
+def noise_shared(steps, alike, share=0.01):
+    """Products of residuals in which pixels some steps apart share noise, by some part of it."""
     shape = (24, 24)
     normal = np.zeros((len(steps), NORMALS, *shape))
     normal[:, NORMAL[0, 0]] = normal[:, NORMAL[1, 1]] = 1e4
     right = np.zeros((len(steps), TERMS, *shape))
     for n, step in enumerate(steps):
-        right[n, :2] = 1e2 if step in alike else 0.0
+        right[n, :2] = 1e4 * share if step in alike else 0.0
     return MeasuredLinks(
         Products(right, normal, 1.0, 1e-3, 0.0, 1e-3, 0.02), None, steps, shape, (0, 0)
     )
@@ -100,6 +117,21 @@ def test_noise_that_far_pixels_share_is_refused_at_once():
     assert found.classes.count == 1
     with pytest.raises(InputError, match=r"^not decided: .* 48 of them beyond 2 pixels"):
         choose(noise_shared(steps, steps), lambda classes: 0.0)
+
+
+def test_less_is_enough_for_adjacent_pixels_that_couple_alike():
+    """Chi-square of 15 for a link by itself, or 16 for those of both axes as one number."""
+    steps = links((24, 24))
+
+    def taken(alike, chi2):
+        # Of the share there and back as one number: 2 × 576 pixels of weight 1e4.
+        share = (chi2 / (2 * 576 * 1e4)) ** 0.5
+        return [steps[n] for n in choose(noise_shared(steps, alike, share), lambda c: 0.0).links]
+
+    assert taken([(0, 1)], 15.0) == [(0, 1)]
+    assert taken([(0, 2)], 15.0) == []
+    assert taken([(0, 1), (1, 0)], 8.0) == [(0, 1), (1, 0)]
+    assert taken([(0, 1), (1, 0)], 5.0) == []
 
 
 def test_a_period_that_only_the_visibility_shows_is_taken_once_there_is_crosstalk():
@@ -139,6 +171,15 @@ def test_visibility_of_rows_has_the_chi_square_of_its_period():
     # Pixels scatter by 0.2 % too: 2/9 a pixel, less what the pattern adds to the scatter.
     assert with_pattern[1] == pytest.approx(2 / 9 * 51 * 57, rel=0.3)
     assert max(with_pattern[0], with_pattern[2]) < 0.1 * with_pattern[1]
+
+
+def test_a_patch_of_low_contrast_is_no_period_of_columns():
+    """It moves what is fitted as smooth and as fringes, of a period that is nearly that of 7 px."""
+    maps = striped(np.random.default_rng(6), period=3, depth=0.0)
+    theta = maps.fringes["vertical"].theta
+    theta[1:, 20:33, 30:36] *= 0.5
+    gain = visibility_pattern(maps)
+    assert max(gain(PixelClasses(1, n, (0, 0))) for n in range(1, 9)) < 25
 
 
 def hot(value, charge=None, sigma=2e-4):

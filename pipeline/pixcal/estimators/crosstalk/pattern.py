@@ -28,6 +28,7 @@ from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.arrays import C128, F64, Mask
 
 CLIP = 5.0  # offsets and visibilities beyond so many robust deviations do not count
+ROUNDS = 4  # in which these are found: without them, what is smooth is known better
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def visibility_pattern(evidence: Evidence) -> Callable[[PixelClasses], float]:
         return lambda classes: 0.0
     y, x = np.nonzero(good)
     smooth = smooth_modes(sets, good)
-    maps = [_clipped(without(log_visibility(one.theta, good), smooth)) for one in sets]
+    maps = [_clipped(log_visibility(one.theta, good), smooth) for one in sets]
 
     def gain(classes: PixelClasses) -> float:
         number = classes.of(y, x)
@@ -113,8 +114,8 @@ def _of_set(
     theta = uncouple_fringes(read, couplings, found.origin)
     k = float(np.hypot(*found.k))
     delta = found.delta[good] + phase_change(read, theta)[good] / k
-    delta, scatter = _clipped(without(delta, smooth))
-    visibility, spread = _clipped(without(log_visibility(theta, good), smooth))
+    delta, scatter = _clipped(delta, smooth)
+    visibility, spread = _clipped(log_visibility(theta, good), smooth)
     noise = float(np.median(found.sigma[good])) / k
     return _Pattern(
         np.array(found.k) / k, members @ delta, members @ visibility, noise, scatter, spread,
@@ -122,9 +123,15 @@ def _of_set(
     )  # fmt: skip
 
 
-def _clipped(values: F64) -> tuple[F64, float]:
-    sigma = float(median_and_sigma(values)[1])
-    return np.where(np.abs(values) < CLIP * sigma, values, 0.0), sigma
+def _clipped(values: F64, modes: F64) -> tuple[F64, float]:
+    """Values freed of modes, zero where they are outliers, and their robust scatter."""
+    # Outliers would move all modes, and those of fringes look like a period of rows.
+    for _ in range(ROUNDS):
+        rest = without(values, modes)
+        sigma = float(median_and_sigma(rest)[1])
+        usual = np.abs(rest) < CLIP * sigma
+        values = np.where(usual, values, values - rest)
+    return np.where(usual, rest, 0.0), sigma
 
 
 def _visibility(one: _Pattern, gram: F64) -> tuple[F64, F64]:

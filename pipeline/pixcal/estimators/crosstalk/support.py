@@ -2,8 +2,10 @@
 
 Every pair of pixels a step apart, and every period of rows and columns, is tried. For a link to be
 taken it must stand out by so much that, with all that was tried, chance takes anything at all in
-one acquisition of a hundred. A capacitance couples both ways alike, and a kernel repeats; so shares
-there and back, and of many classes, are one number until the data tell them apart.
+one acquisition of a hundred. Half of that chance is left to what crosstalk mostly is: adjacent
+pixels that couple alike everywhere. They are few looks, so that less is enough for them. A
+capacitance couples both ways alike, and a kernel repeats; so shares there and back, and of many
+classes, are one number until the data tell them apart.
 """
 
 from collections.abc import Callable
@@ -24,7 +26,33 @@ FALSE_ALARM = 0.01  # chance that noise alone gives any coupling
 INDEPENDENT = 0.35
 WORTH = 16.0  # fall in chi-square for which another share is taken, once a link is known to couple
 NEAR, MAX_FAR = 2, 12  # of a kernel few couplings reach over more pixels than that
+NEAREST = (0, 1), (1, 0)  # links that a capacitance makes alike
 NOTHING = 1e-6  # weight of a share below which it is not measured at all
+
+
+@dataclass(frozen=True)
+class Looks:
+    """Numbers that were tried together."""
+
+    best: float  # largest chi-square of one of them
+    count: int
+
+    @property
+    def log_none(self) -> float:
+        """Logarithm of the chance that none is as large without couplings."""
+        return float(INDEPENDENT * self.count * np.log1p(-np.exp(self._log_one)))
+
+    @property
+    def log_any(self) -> float:
+        """That of the chance that one of them is."""
+        # A small chance, which looks multiply.
+        none = self.log_none
+        few = self._log_one + np.log(INDEPENDENT * self.count)
+        return float(np.log(-np.expm1(none)) if none < -1e-9 else few)
+
+    @property
+    def _log_one(self) -> float:
+        return float(np.log(2) + log_ndtr(-np.sqrt(self.best)))
 
 
 @dataclass(frozen=True)
@@ -33,19 +61,16 @@ class Choice:
 
     links: tuple[int, ...]  # that stand out
     classes: PixelClasses  # of the period
-    best: float  # largest chi-square of one number
-    looks: int  # numbers that were tried
+    looks: tuple[Looks, ...]  # groups that have the same share of the chance
 
     @property
     def significance(self) -> float:
         """Sigmas of a normal variate as rare as the best of so many looks."""
-        looks = INDEPENDENT * self.looks
-        one = np.log(2) + log_ndtr(-np.sqrt(self.best))
-        none = looks * np.log1p(-np.exp(one))
+        rarest = min(self.looks, key=lambda own: own.log_any)
+        none = len(self.looks) * rarest.log_none
         if none < -0.5:
             return float(ndtri_exp(none))
-        # A small chance, which looks multiply.
-        return float(-ndtri_exp(np.log(-np.expm1(none)) if none < -1e-9 else one + np.log(looks)))
+        return float(-ndtri_exp(rarest.log_any + np.log(len(self.looks))))
 
 
 def choose(measured: MeasuredLinks, pattern: Callable[[PixelClasses], float]) -> Choice:
@@ -59,8 +84,18 @@ def choose(measured: MeasuredLinks, pattern: Callable[[PixelClasses], float]) ->
     """
     looks = len(measured.links) * sum(3 * n * m for n, m in periods(measured.shape))
     critical = _critical(looks)
-    gains = np.stack([_best_gains(*i.total) for _, i in measured.every_period()])
-    there = tuple(int(n) for n in np.nonzero(gains.max(axis=0) > critical)[0])
+    totals = [i.total for _, i in measured.every_period()]
+    gains = np.stack([_best_gains(*total) for total in totals])
+    best = gains.max(axis=0)
+    close = [n for n, step in enumerate(measured.links) if max(map(abs, step)) == 1]
+    nearest = [n for n in close if measured.links[n] in NEAREST]
+    # Each link there, back and both; and the nearest ones as one number.
+    few = 3 * len(close) + 1
+    alike = _gain_alike(*(part[nearest] for part in totals[0]))
+    taken = best > critical
+    taken[close] |= gains[0, close] > _critical(few)
+    taken[nearest] |= alike > _critical(few)
+    there = tuple(int(n) for n in np.flatnonzero(taken))
     far = sum(max(map(abs, measured.links[n])) > NEAR for n in there)
     if far > MAX_FAR:
         raise InputError(
@@ -70,11 +105,13 @@ def choose(measured: MeasuredLinks, pattern: Callable[[PixelClasses], float]) ->
         )
     none = PixelClasses(1, 1, measured.first)
     classes = _period(measured.of(there), pattern, critical) if there else none
-    return Choice(there, classes, max(float(gains.max()), 1e-9), looks)
+    anywhere = Looks(max(float(best.max()), 1e-9), looks)
+    adjacent = Looks(max(float(gains[0, close].max()), alike, 1e-9), few)
+    return Choice(there, classes, (anywhere, adjacent))
 
 
 def _critical(looks: int) -> float:
-    return float(ndtri(FALSE_ALARM / looks / 2) ** 2)
+    return float(ndtri(FALSE_ALARM / 2 / looks / 2) ** 2)
 
 
 def _period(
@@ -112,6 +149,11 @@ def _best_gains(normal: F64, right: F64) -> F64:
     weight = np.concatenate([own[..., ::2] + own[..., 1::2] + 2 * mixed, own], axis=-1)
     value = np.concatenate([right[..., ::2] + right[..., 1::2], right], axis=-1)
     return np.asarray(_fall(value, weight).max(axis=-1))
+
+
+def _gain_alike(normal: F64, right: F64) -> float:
+    """Fall in chi-square where all shares (link, u) of all links are one number."""
+    return float(_fall(right.sum(), normal.sum()))
 
 
 def _fall(value: F64, weight: F64) -> F64:
