@@ -140,17 +140,17 @@ def _told(dense: Dense, about: Kernel) -> Kernel:
 def _plain(dense: Dense) -> tuple[F64, list[Coupling]]:
     """Basis (share, number) of the significant couplings of a kernel, and these couplings."""
     # Where noise alone tells, it tells the sum of the shares there and back: a pair of pixels whose
-    # sum is significant has both, even if neither is by itself.
+    # sum is significant has both, even if neither is by itself, or one of them only just is.
     columns: list[F64] = []
     couplings: list[Coupling] = []
     steps = dict.fromkeys((c.dy, c.dx) for c in dense.couplings)
     for step in (s for s in steps if s > (0, 0)):
-        both = [_of_step(dense, one) for one in (step, (-step[0], -step[1]))]
-        directed = [part for group in both for part in _significant(dense, group)]
-        if not directed:
-            together = np.sum([column for group in both for column, _ in group], axis=0)
-            if _sigmas(dense, together) > THERE:
-                directed = [_alike(group) for group in both]
+        ways = [_of_step(dense, one) for one in (step, (-step[0], -step[1]))]
+        found = [_significant(dense, way) for way in ways]
+        there, back = (np.sum([column for column, _ in way], axis=0) for way in ways)
+        if _sigmas(dense, there + back) > THERE > _sigmas(dense, there - back):
+            found = [own or [_alike(way)] for own, way in zip(found, ways, strict=True)]
+        directed = [part for own in found for part in own]
         columns += [column for column, _ in directed]
         couplings += [coupling for _, coupling in directed]
     return np.array(columns).T, couplings
