@@ -53,7 +53,8 @@ def _without_gradient(steps: F32, evidence: Evidence) -> F32:
     return np.asarray((flat - flat @ basis @ basis.T).reshape(steps.shape))
 
 
-def _stacks(evidence: Evidence, kind: str) -> tuple[Stack, ...]:
+def repeated(evidence: Evidence, kind: str) -> tuple[Stack, ...]:
+    """Stacks of a kind whose frames can be subtracted, and whose noise codes do not hide."""
     if kind != "flat" and not evidence.dithered:
         return ()
     stacks = evidence.ladder if kind == "flat" else evidence.of_kind(kind)
@@ -90,7 +91,7 @@ def _repeats(rest: F32, good: Mask, axis: int) -> F64:
 )
 def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
     """Of the brighter half of the levels less that of the others."""
-    stacks = _stacks(evidence, "flat")
+    stacks = repeated(evidence, "flat")
     if len(stacks) < 2:
         return None
     levels = [float(s.adu.mean()) for s in stacks]
@@ -110,7 +111,7 @@ def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
 )  # fmt: skip
 def bias_change(evidence: Evidence) -> Curve | None:
     """Power of the change from the first half of the frames to the second, over that of noise."""
-    stacks = [s for s in _stacks(evidence, "bias") if len(s.adu) >= 4]
+    stacks = [s for s in repeated(evidence, "bias") if len(s.adu) >= 4]
     if not stacks:
         return None
     adu, good = stacks[0].adu, evidence.good
@@ -137,7 +138,7 @@ KINDS = (("bias",), ("dark",), ("flat",))
 )  # fmt: skip
 def neighbours(kind: str, evidence: Evidence) -> Curve | None:
     """Of the differences of two frames."""
-    stacks = _stacks(evidence, kind)
+    stacks = repeated(evidence, kind)
     if not stacks:
         return None
     value = _neighbours((differences(evidence, s) for s in stacks), evidence.good)
@@ -150,7 +151,7 @@ def neighbours(kind: str, evidence: Evidence) -> Curve | None:
 )  # fmt: skip
 def line_repeats(kind: str, evidence: Evidence) -> Curve | None:
     """Correlation of the means of lines some lines apart."""
-    stacks = _stacks(evidence, kind)
+    stacks = repeated(evidence, kind)
     if not stacks:
         return None
     rest = np.concatenate([differences(evidence, s) for s in stacks])

@@ -12,6 +12,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.maps.structure import (
     fit_terms,
     flattened,
+    legendre,
     smooth_surface,
     without_outliers,
 )
@@ -158,6 +159,11 @@ class Look:
         }
 
     @cached_property
+    def pattern_sizes(self) -> F64:
+        """Sizes (t, pattern) of smooth patterns in the residuals (`pattern_sizes`)."""
+        return pattern_sizes(self.residual, self.good)
+
+    @cached_property
     def frames(self) -> dict[str, F64]:
         """Per frame (t,): relative intensity and contrast, and changes of the fringe vector.
 
@@ -184,6 +190,7 @@ CELLS = 4  # cells of the window along each side
 # rows and columns to a neighbour
 STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0), (0, 4), (4, 0))
 MAX_FRAMES = 120  # frames for statistics of pairs of pixels
+PATTERN_DEGREE = 3  # of the Legendre polynomials that smooth patterns are made of
 SPARSE = 7  # one of so many pixels tells the range of the levels
 
 
@@ -229,3 +236,15 @@ def by_cell(values: F64, good: Mask) -> F64 | None:
     if count.min() < 8:
         return None
     return np.asarray(np.bincount(cell[good], values[good], minlength=CELLS**2) / count)
+
+
+def pattern_sizes(noise: F32, good: Mask) -> F64:
+    """Sizes (t, pattern) of smooth patterns in frames (t, y, x), less their means over the frames.
+
+    Of white noise of unit variance they are independent, of unit variance.
+    """
+    terms = legendre(good.shape, PATTERN_DEGREE) * good
+    # The first is the level.
+    patterns = np.linalg.qr(terms.reshape(len(terms), -1).T)[0][:, 1:].astype(np.float32)
+    sizes = (noise.reshape(len(noise), -1) @ patterns).astype(float)
+    return np.asarray(sizes - sizes.mean(axis=0))

@@ -1,0 +1,101 @@
+"""Statistics of patterns in single frames: tones of the noise, and smooth light or offsets.
+
+A tone with another phase in every frame is no part of any map, and neighbours hardly share it. Of
+smooth patterns a frame's fit takes up its level and its fringes, and leaves the others.
+"""
+
+import numpy as np
+from scipy.fft import rfft2
+
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.test_statistics import Curve, family, statistic
+from pixcal.estimators.diagnosis.test_statistics.detector_frames import differences, repeated
+from pixcal.estimators.diagnosis.test_statistics.look import Look, pattern_sizes
+from pixcal.estimators.diagnosis.test_statistics.time import DISTINCT
+from pixcal.model.arrays import F32, F64, Mask
+
+KINDS = (("bias",), ("dark",))
+
+
+def highest_ordinate(noise: F32, good: Mask) -> Curve:
+    """Highest ordinate of the mean periodogram of frames (t, y, x), beside rows and columns.
+
+    Noise is in units of its standard deviation and zero in bad pixels. White noise has ordinates of
+    mean 1; a tone of the amplitude A adds N A² / 4, N being the number of good pixels.
+    """
+    power = np.zeros((noise.shape[1], noise.shape[2] // 2 + 1))
+    for frame in noise:
+        power += np.abs(rfft2(frame)) ** 2
+    power /= len(noise) * np.count_nonzero(good)
+    # What whole rows or columns share has its own statistics.
+    power[0] = power[:, 0] = 0
+    y, x = np.unravel_index(int(np.argmax(power)), power.shape)
+    frequency = float(np.hypot(np.fft.fftfreq(noise.shape[1])[y], x / noise.shape[2]))
+    return Curve(np.array([frequency]), np.array([float(power[y, x])]))
+
+
+def strongest(sizes: F64) -> float:
+    """Largest singular value of sizes (n, pattern) of patterns.
+
+    An amplitude, not a power: its scatter is nearly normal, and the same for many values and few.
+    """
+    return float(np.linalg.svd(sizes, compute_uv=False)[0])
+
+
+@statistic(
+    "noise", "strongest tone in fringe frames", "noise / white noise", x="cycles a pixel",
+    power=True,
+)  # fmt: skip
+def tone(look: Look) -> Curve:
+    """Of the residuals."""
+    return highest_ordinate(look.residual[:: look.thinned], look.good)
+
+
+@family(
+    "{0}_tone", KINDS, "noise", "strongest tone in {0} frames", "noise / white noise",
+    x="cycles a pixel", power=True, sets=False,
+)  # fmt: skip
+def tones(kind: str, evidence: Evidence) -> Curve | None:
+    """Of the differences of two frames."""
+    noise = _all_differences(kind, evidence)
+    return None if noise is None else highest_ordinate(noise, evidence.good)
+
+
+@statistic("time", "smooth patterns that vary over the frames", "strongest / noise of one frame")
+def smooth_patterns(look: Look) -> Curve:
+    """Root mean square of the strongest pattern in the residuals."""
+    sizes = look.pattern_sizes
+    return Curve(np.zeros(1), np.array([strongest(sizes) / np.sqrt(len(sizes))]))
+
+
+@family(
+    "{0}_smooth_patterns", KINDS, "time", "smooth patterns that vary over {0} frames",
+    "strongest / noise of one frame", sets=False,
+)  # fmt: skip
+def smooth_patterns_of(kind: str, evidence: Evidence) -> Curve | None:
+    """The same of the differences of two frames."""
+    noise = _all_differences(kind, evidence)
+    if noise is None:
+        return None
+    sizes = pattern_sizes(noise, evidence.good)
+    return Curve(np.zeros(1), np.array([strongest(sizes) / np.sqrt(len(sizes))]))
+
+
+@statistic("time", "smooth patterns that follow the phase", "strongest", unit="σ")
+def smooth_patterns_by_phase(look: Look) -> Curve | None:
+    """Size of the strongest pattern that goes with two and three times the frame's phase."""
+    phi = look.found.phi
+    # The pixels' fit takes up what goes with the phase itself.
+    taken = np.linalg.qr(np.stack([np.ones_like(phi), np.cos(phi), np.sin(phi)], axis=1))[0]
+    turns = np.stack([f(n * phi) for n in (2, 3) for f in (np.cos, np.sin)], axis=1)
+    shapes, size, _ = np.linalg.svd(turns - taken @ (taken.T @ turns), full_matrices=False)
+    shapes = shapes[:, size > DISTINCT * np.sqrt(len(phi))]
+    if not shapes.size:
+        return None
+    sizes = shapes.T @ look.pattern_sizes
+    return Curve(np.zeros(1), np.array([strongest(sizes)]))
+
+
+def _all_differences(kind: str, evidence: Evidence) -> F32 | None:
+    stacks = repeated(evidence, kind)
+    return np.concatenate([differences(evidence, s) for s in stacks]) if stacks else None
