@@ -8,7 +8,17 @@ import pytest
 from numpy.typing import NDArray
 
 from pixcal.effects.quantisation import Quantisation, _uneven
-from pixcal.estimators.detector.code_density import code_widths, histogram, moved_by_bits, step_of
+from pixcal.estimators.detector.code_density import (
+    FITS,
+    NEAREST,
+    NEAREST_OF_ALL,
+    CodeWidths,
+    Law,
+    code_widths,
+    histogram,
+    level_errors,
+    step_of,
+)
 from pixcal.estimators.diagnosis.evidence import Evidence
 
 TOP = 65535.0
@@ -143,31 +153,70 @@ def test_step_and_widths_are_found(
         assert found.effect.ripple_codes == pytest.approx(given.get("ripple_codes", 2), rel=1e-3)
 
 
+Bits = tuple[float, ...]
 BITS = (0.07, 0.1, 0.1, -0.2, -0.14, 0.2, -0.1, 0.6, 0.3, -0.1, -1.3, 1.1)
 
 
-def test_wrong_bits_give_the_codes_of_successive_approximation() -> None:
-    samples = ramp(300.0, 3900.0, 50)
-    left, expected = samples.astype(float) + 0.5, np.zeros(samples.size)
-    for bit in reversed(range(12)):
-        weight = 2**bit + BITS[bit]
+# Levels overlap by a dozen codes where bits 9 and 11 turn over.
+OVERLAPPING = (0.0, 0.0, 0.1, 0.1, 0.2, 0.0, 1.0, 0.7, 1.5, -8.2, -0.8, -15.0)
+
+
+def levels(bits: Bits) -> NDArray[np.float64]:
+    weights = 2.0 ** np.arange(len(bits)) + np.array(bits)
+    return np.array((np.arange(2 ** len(bits))[:, None] >> np.arange(len(bits)) & 1) @ weights)
+
+
+def by_successive_approximation(samples: NDArray[np.float64], bits: Bits) -> NDArray[np.int64]:
+    left, codes = samples + 0.5, np.zeros(samples.size, np.int64)
+    for bit in reversed(range(len(bits))):
+        weight = 2**bit + bits[bit]
         taken = left >= weight
-        left -= weight * taken
-        expected += taken * 2**bit
-    codes = Quantisation(0.0, 0.0, 0.0, bits=BITS).converted(samples, 0, TOP)
-    assert np.mean(codes != expected) < 1e-4
+        left = left - weight * taken
+        codes += taken << bit
+    return codes
+
+
+def between_neighbours(samples: NDArray[np.float64], bits: Bits) -> NDArray[np.int64]:
+    level = levels(bits)
+    edges = np.minimum.accumulate((level[1:] + level[:-1])[::-1] / 2)[::-1]
+    return np.searchsorted(edges, samples, "right")
+
+
+def nearest_of_all(samples: NDArray[np.float64], bits: Bits) -> NDArray[np.int64]:
+    level = levels(bits)
+    order = np.argsort(level, kind="stable")
+    level = level[order]
+    return order[np.searchsorted((level[1:] + level[:-1]) / 2, samples)]
+
+
+Converter = Callable[[NDArray[np.float64], Bits], NDArray[np.int64]]
+CONVERTERS: dict[Law, Converter] = {
+    FITS: by_successive_approximation,
+    NEAREST: between_neighbours,
+    NEAREST_OF_ALL: nearest_of_all,
+}
+each_law = pytest.mark.parametrize(
+    "law", CONVERTERS, ids=[one.__name__ for one in CONVERTERS.values()]
+)
+
+
+@each_law
+@pytest.mark.parametrize("bits", [BITS, OVERLAPPING])
+def test_wrong_bits_give_the_codes_of_each_converter(law: Law, bits: Bits) -> None:
+    samples = ramp(300.0, 3900.0, 50)
+    expected = CONVERTERS[law](samples.astype(float), bits)
+    effect = Quantisation(0.0, 0.0, 0.0, bits=bits, **law._asdict())
+    assert np.mean(effect.converted(samples, 0, TOP) != expected) < 1e-3
 
 
 def test_the_nearest_of_levels_with_wrong_bits_is_taken() -> None:
-    samples = ramp(300.0, 3900.0, 50)
-    # No level below that of a lower code, of which either may be the nearest.
-    bits = tuple(0.4 * bit for bit in BITS)
-    levels = np.arange(4096) + (np.arange(4096)[:, None] >> np.arange(12) & 1) @ np.array(bits)
-    assert np.diff(levels).min() > 0
-    apart = np.abs(samples[:, None] - levels[250:3950])
-    expected = 250 + np.argmin(apart, axis=1)
-    codes = Quantisation(0.0, 0.0, 0.0, bits=bits, below=0.5).converted(samples, 0, TOP)
-    assert np.mean(codes != expected) < 1e-3
+    samples = ramp(300.0, 3900.0, 5)[::9]
+    apart = np.abs(samples[:, None] - levels(OVERLAPPING))
+    bits = {"bits": OVERLAPPING, **NEAREST_OF_ALL._asdict()}
+    codes = Quantisation(0.0, 0.0, 0.0, **bits).converted(samples, 0, TOP)
+    np.testing.assert_array_less(
+        np.take_along_axis(apart, codes.astype(int)[:, None], 1)[:, 0], apart.min(axis=1) + 1e-3
+    )
 
 
 def test_codes_have_the_widths_that_were_measured() -> None:
@@ -185,23 +234,67 @@ def codes_of(begins: NDArray[np.float64], noise: float = 3.0) -> NDArray[np.floa
     return np.bincount(np.searchsorted(begins, light, "right") - 1, minlength=4096).astype(float)
 
 
-@pytest.mark.parametrize("below", [0.0, 0.5])
-def test_it_is_told_which_level_a_converter_with_wrong_bits_takes(below: float) -> None:
+def widths_of(law: Law, bits: Bits, noise: float = 3.0) -> CodeWidths:
+    """Of light spread evenly."""
+    rng = np.random.default_rng(8)
+    codes = CONVERTERS[law](rng.normal(rng.uniform(500, 3500, 4_000_000), noise), bits)
+    widths = code_widths(np.bincount(codes, minlength=4096).astype(float), noise)
+    assert widths is not None
+    return widths
+
+
+@pytest.mark.parametrize("law", [FITS, NEAREST])
+def test_it_is_told_which_level_a_converter_with_wrong_bits_takes(law: Law) -> None:
     off = np.zeros(12)
     off[[5, 7, 10]] = 0.3, -0.5, 1.5
-    begins = Quantisation(0.0, 0.0, 0.0, bits=tuple(off), below=below).thresholds(0, 4096)
-    widths = code_widths(codes_of(np.minimum.accumulate(begins[::-1])[::-1]), 3.0)
-    assert widths is not None
+    widths = widths_of(law, tuple(off))
     found = widths.wrong_bits(0.0)
-    assert found.below == below
+    assert found.law == law
     for bit in (5, 7, 10):
         over = np.where(np.arange(12) == bit, 1.0, np.where(np.arange(12) < bit, -1.0, 0.0))
         error = np.sqrt(over @ found.covariance @ over)
         assert over @ (found.bits - off) == pytest.approx(0, abs=4 * error + 0.03)
     # A response without a slope of its own.
-    flat = widths.level(found.bits, below)
-    moved = moved_by_bits(flat, below, 4096)[widths.number]
+    moved = level_errors(widths.level(found.bits), 4096)[widths.number]
     assert abs(np.polyfit(widths.number, moved, 1)[0]) < 1e-9
+
+
+@each_law
+def test_the_law_is_told_where_levels_overlap_and_where_they_do_not(law: Law) -> None:
+    """Where they do not, the nearest level is that of the code or of a neighbour."""
+    apart, over = np.zeros(12), np.zeros(12)
+    apart[[5, 7, 10]] = 0.3, -0.5, 0.5
+    over[[5, 7, 10]] = 0.3, -1.6, -2.6
+    for off, expected in ((apart, law._replace(any_code=False)), (over, law)):
+        widths = widths_of(law, tuple(off))
+        values, errors, _, _ = _uneven(widths, far=True)
+        assert (values["below"], values["any_code"]) == expected
+        away = np.abs(values["bits"] - widths.level(off))
+        assert np.all(away < 4 * np.array([errors.get(f"bits[{n}]", 0) for n in range(12)]) + 0.05)
+        assert values["dnl_rms"] < 0.02
+
+
+def test_weights_are_found_where_levels_overlap_by_many_codes() -> None:
+    widths = widths_of(NEAREST_OF_ALL, OVERLAPPING)
+    true = widths.level(np.array(OVERLAPPING))
+    values, near = _uneven(widths, far=True)[0], _uneven(widths)[0]
+    assert values["any_code"]
+    assert values["bits"] == pytest.approx(true, abs=0.4)
+    assert np.abs(near["bits"] - true).max() > 2
+
+
+def test_bits_that_do_not_turn_over_are_not_told() -> None:
+    """Codes below 2048 say nothing of bit 11, whatever its weight."""
+    rng = np.random.default_rng(4)
+    light = rng.normal(rng.uniform(500, 1900, 2_000_000), 3.0)
+    codes = nearest_of_all(light, OVERLAPPING)
+    assert codes.max() < 2048
+    widths = code_widths(np.bincount(codes, minlength=4096).astype(float), 3.0)
+    assert widths is not None
+    values = _uneven(widths, far=True)[0]
+    true = widths.level(np.array((*OVERLAPPING[:11], 0.0))[: len(values["bits"])])
+    assert values["any_code"]
+    assert values["bits"][:11] == pytest.approx(true[:11], abs=0.4)
 
 
 def test_single_wide_codes_are_measured_whatever_the_converter_does() -> None:
@@ -252,15 +345,7 @@ def test_where_a_bit_leaves_several_codes_out_its_weight_is_told(step: float) ->
     """Codes by successive approximation of noisy light; bit 10 turns over at 1024 and 3072."""
     off = np.zeros(12)
     off[[7, 10]] = 0.4, step
-    rng = np.random.default_rng(8)
-    left = rng.normal(rng.uniform(500, 3500, 4_000_000), 3.0)
-    codes = np.zeros(left.size, int)
-    for bit in reversed(range(12)):
-        taken = left >= 2**bit + off[bit]
-        left -= (2**bit + off[bit]) * taken
-        codes += taken << bit
-    widths = code_widths(np.bincount(codes, minlength=4096).astype(float), 3.0)
-    assert widths is not None
+    widths = widths_of(FITS, tuple(off))
     bits, covariance = widths.bits(0.0)
     # A common factor of all weights does not show; what a bit adds over all lower ones does.
     for bit in (7, 10):

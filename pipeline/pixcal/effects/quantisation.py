@@ -9,10 +9,11 @@ import numpy as np
 from pixcal.estimators.detector.code_density import (
     MIN_NOISE,
     CodeWidths,
+    Law,
+    code_cells,
     code_widths,
     converter_counts,
     histogram,
-    moved_by_bits,
     step_of,
 )
 from pixcal.estimators.diagnosis.evidence import Evidence
@@ -98,6 +99,11 @@ class Quantisation(Effect):
         doc="share of a threshold that the level of the code below sets; 0: a bit is taken if it "
         "fits; 0.5: the nearest level is taken",
     )
+    any_code: bool = quantity(
+        False,
+        doc="whether that is the code of the next lower level, where levels of wrong bits overlap; "
+        "else it is the code before",
+    )
     widths: tuple[float, ...] = quantity(
         (),
         unit="codes",
@@ -116,8 +122,13 @@ class Quantisation(Effect):
         """Mean width of a code."""
         return 1 + self.coarse_adu
 
+    @property
+    def law(self) -> Law:
+        """Where codes begin by the levels that their bits make."""
+        return Law(self.below, self.any_code)
+
     def thresholds(self, specimen: int, codes: int) -> F64:
-        """Where codes 0 to ``codes - 1`` begin, in steps; those of code n near ``n - 1/2``.
+        """Where codes begin, in steps, in the order of `code_cells`; code n near ``n - 1/2``.
 
         Parameters
         ----------
@@ -136,11 +147,13 @@ class Quantisation(Effect):
             # Sum of the ripple of all codes below.
             phase = turn * (number - 0.5) + self.ripple_phase_rad
             shift += self.ripple * np.sin(phase) / (2 * np.sin(turn / 2))
-        begins = number - 0.5 + np.clip(shift, -FARTHEST, FARTHEST)
-        begins += moved_by_bits(np.array(self.bits), self.below, codes)
+        begins, order = code_cells(np.array(self.bits), self.law, codes)
+        begins += np.clip(shift, -FARTHEST, FARTHEST)[order]
         wider = np.zeros(codes)
-        wider[1:][: len(measured)] = measured[: codes - 1]
-        return np.asarray(begins + np.cumsum(wider))
+        wider[: len(measured)] = measured[:codes]
+        # A code that is wider moves those above it.
+        begins[1:] += np.cumsum(wider[order])[:-1]
+        return np.asarray(begins)
 
     def converted(self, adu: F32, specimen: int, top_adu: float, normals: F32 | None = None) -> F32:
         """Codes in ADU: each sample passes the thresholds that it reaches.
@@ -160,12 +173,12 @@ class Quantisation(Effect):
         """
         codes = int(top_adu / self.step_adu) + 3
         if any(self.bits) or any(self.widths):
-            edges, lowest = _reached(self, specimen, codes)
+            edges, order, lowest = _reached(self, specimen, codes)
             reached = adu / np.float32(self.step_adu)
             code = lowest[np.clip(reached * _CELLS, 0, len(lowest) - 1).astype(np.int32)]
             while (passed := reached >= edges[code + 1]).any():
                 code += passed
-            return np.asarray(code * self.step_adu, np.float32)
+            return np.asarray(order[code] * self.step_adu, np.float32)
         begins = _thresholds(self, specimen, codes)
         level = np.clip(adu / np.float32(self.step_adu), 0, np.float32(codes - 2))
         nearest = (level + np.float32(0.5)).astype(np.int32)
@@ -191,13 +204,13 @@ class Quantisation(Effect):
         light is no smooth function of the code: then fringes tell, or flats, from where shot noise
         is as large as a step.
         """
-        found = _by_law(evidence)
+        found = _by_law(evidence, far=True)
         if found is None:
             return None
         by_law, significance = cls(**found.values), sigmas_of_best(*found.sigmas)
         effect, widths = by_law, found.widths
         if widths is not None and significance > SIGNIFICANT:
-            rest = widths.without(np.array(by_law.bits), by_law.below) if by_law.bits else widths
+            rest = widths.without(np.array(by_law.bits), by_law.law) if by_law.bits else widths
             effect = replace(by_law, widths=tuple(map(float, rest.measured)))
         errors = found.errors
         return Estimate(
@@ -229,8 +242,11 @@ class _ByLaw:
     widths: CodeWidths | None
 
 
-def _by_law(evidence: Evidence) -> _ByLaw | None:
-    """What the counts of the codes say; None where samples are no codes, or too few."""
+def _by_law(evidence: Evidence, far: bool = False) -> _ByLaw | None:
+    """What the counts of the codes say; None where samples are no codes, or too few.
+
+    ``far``: as `_uneven` says.
+    """
     lit = [f.adu for f in evidence.fringes.values()]
     counts = histogram([*(s.adu for s in evidence.stacks), *lit], evidence.good)
     if counts is None or not counts.any():
@@ -258,7 +274,7 @@ def _by_law(evidence: Evidence) -> _ByLaw | None:
     errors = {"coarse_adu": step_error}
     if widths is None:
         return _ByLaw(values, errors, sigmas, (), None)
-    known, its_errors, chances, together = _uneven(widths)
+    known, its_errors, chances, together = _uneven(widths, far)
     return _ByLaw(values | known, errors | its_errors, sigmas + chances, together, widths)
 
 
@@ -269,15 +285,16 @@ def _thresholds(effect: Quantisation, specimen: int, codes: int) -> F32:
 
 
 @lru_cache(maxsize=4)
-def _reached(effect: Quantisation, specimen: int, codes: int) -> tuple[F64, Indices]:
-    """From where on a sample is given a code or a higher one: a bit is taken if it fits.
+def _reached(effect: Quantisation, specimen: int, codes: int) -> tuple[F64, Indices, Indices]:
+    """From where on a sample has a code or one that begins higher, and the codes in this order.
 
-    With the lowest code of each of `_CELLS` to a step.
+    With the place in it of the lowest code of each of `_CELLS` to a step.
     """
     begins = effect.thresholds(specimen, codes)
+    order = code_cells(np.array(effect.bits), effect.law, codes)[1]
     begins = np.minimum.accumulate(begins[::-1])[::-1]
     lowest = np.searchsorted(begins, np.arange(codes * _CELLS) / _CELLS, "right") - 1
-    return np.append(begins, np.inf), np.maximum(lowest, 0)
+    return np.append(begins, np.inf), order, np.maximum(lowest, 0)
 
 
 def _has_wrong_bits(widths: CodeWidths | None) -> bool:
@@ -286,11 +303,12 @@ def _has_wrong_bits(widths: CodeWidths | None) -> bool:
 
 
 def _uneven(
-    widths: CodeWidths,
+    widths: CodeWidths, far: bool = False
 ) -> tuple[dict[str, Any], dict[str, float], list[float], tuple[dict[str, float], ...]]:
     """Wrong bits, scatter and ripple of the widths, their errors, and how sure they are.
 
-    With independent steps of the bits, of one sigma each.
+    With independent steps of the bits, of one sigma each. ``far``: whether levels may overlap by
+    many codes; to tell that bits are wrong nobody need know by how much.
     """
     variance, error, scatter_sigmas = widths.scatter()
     line = widths.ripple(variance)
@@ -301,15 +319,19 @@ def _uneven(
     found = widths.wrong_bits(2 * variance)
     wrong = sigmas_of_chi2(found.chi2, max(int((np.diag(found.covariance) > 0).sum()), 1))
     share = 1.0 if line.period == 2 else 0.5
-    rest = widths.without(found.bits, found.below).scatter()[0]
+    rest = widths.without(found.bits, found.law).scatter()[0]
     # Bits repeat too: the least of them as a ripple of two or four codes.
     clearer = 2 * rest < variance - share * line.amplitude**2
     if wrong > SIGNIFICANT and (wrong > sure or clearer):
-        bits, covariance = widths.bits(2 * rest, found.below)
-        values, errors, others, _ = _uneven(widths.without(bits, found.below))
-        levelled = np.stack([widths.level(one, found.below) for one in np.eye(len(bits))], 1)
+        start = None
+        if far and (other := widths.far_bits(found.law)):
+            found, start = other, other.bits
+            rest = widths.without(found.bits, found.law).scatter()[0]
+        bits, covariance = widths.bits(2 * rest, found.law, start)
+        values, errors, others, _ = _uneven(widths.without(bits, found.law))
+        levelled = np.stack([widths.level(one) for one in np.eye(len(bits))], 1)
         covariance = levelled @ covariance @ levelled.T
-        values |= {"bits": tuple(map(float, levelled @ bits)), "below": found.below}
+        values |= {"bits": tuple(map(float, levelled @ bits)), **found.law._asdict()}
         spread = np.sqrt(np.diag(covariance))
         errors |= {f"bits[{n}]": float(e) for n, e in enumerate(spread) if e}
         size, ways = np.linalg.eigh(covariance)

@@ -7,6 +7,7 @@ changes quickly from code to code is the converter: the counts against a local f
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,11 @@ _MISSED = 3.0
 _UNEVEN = 2e-3
 # fits of the weights of bits, until the misfit falls by less than
 _BIT_FITS, _SETTLED = 12, 0.1
+# how far apart levels may be where a bit turns over, of its weight; codes up to which this is
+# tried, in steps of so many
+_WRONG, _TRIED = 0.05, ((40.0, 0.25), (0.5, 0.05))
+_SMALL = 0.25  # changes (codes) for derivatives, where levels change places
+_CLEARLY = 25.0  # chi-square by which levels in an order of their own must fit better
 # codes of noise below which the peak of dark frames is too narrow for a local fit
 MIN_NOISE = 1.4
 # shares of the codes below which they may be even and above which they may not; how much larger
@@ -44,7 +50,6 @@ _WIDTH_FITS = 12  # of widths whose variances are found by the fit before
 _FEW = 0.15  # median over mean square of the widths (0.45 if normal) below which few are uneven
 _TOLD = 4.0  # median square of the widths over that of chance, above which most are uneven
 _SLOW = 101  # codes over which widths add up to nothing, of thresholds displaced each by itself
-BELOW = 0.0, 0.5  # where thresholds may lie between two levels
 LOWEST_RIPPLE = 1 / 16  # turns a code
 
 
@@ -160,25 +165,55 @@ class Ripple:
     log_chance: float  # logarithm of the chance of one as strong anywhere
 
 
+class Law(NamedTuple):
+    """Where a code begins, by the levels that the weights of its bits make."""
+
+    below: float  # share of a threshold that the level of the code below sets
+    any_code: bool = False  # whether that is the code of the next lower level, whatever its number
+
+
+# By successive approximation a bit is taken if it fits; or the nearest of the levels is taken, that
+# of the code itself or of the next, or of all levels.
+FITS, NEAREST, NEAREST_OF_ALL = Law(0.0), Law(0.5), Law(0.5, any_code=True)
+
+
 @dataclass(frozen=True)
 class WrongBits:
     """Weights of bits that are off, and how sure that is."""
 
     bits: F64  # (n,) by how much, codes, the least bit first
-    below: float  # share of a threshold that the level of the code below sets
+    law: Law
     covariance: F64  # (n, n)
     chi2: float  # of the bits
+    misfit: float  # chi-square of the widths, once they are taken out
 
 
-def moved_by_bits(bits: F64, below: float, codes: int) -> F64:
-    """By how much (codes) wrong weights of bits move where codes 0 to ``codes - 1`` begin.
+def level_errors(bits: F64, codes: int) -> F64:
+    """By how much (codes) wrong weights of bits move the levels of codes 0 to ``codes - 1``."""
+    errors = np.zeros(1)
+    for bit in bits:
+        errors = np.concatenate([errors, errors + bit])
+    return np.resize(errors, codes)
 
-    A code begins at its own level if a bit is taken where it fits, as in a converter by successive
-    approximation, and half-way from the level below if the nearest level is taken.
+
+def code_cells(bits: F64, law: Law, codes: int) -> tuple[F64, I64]:
+    """Where each code begins, and the codes in this order.
+
+    A code whose level is right begins half a code below it. One that begins after a higher one is
+    never reached.
+
+    Parameters
+    ----------
+    bits : ndarray of float64, shape (n,)
+        By how much (codes) the weight of each bit is off, lowest bit first.
+    law : Law
+    codes : int
     """
-    number = np.arange(codes)
-    level = (number[:, None] >> np.arange(len(bits)) & 1) @ bits
-    return np.asarray(level + below * (level[np.maximum(number - 1, 0)] - level))
+    level = np.arange(codes) + level_errors(bits, codes)
+    order = np.argsort(level, kind="stable") if law.any_code else np.arange(codes)
+    level = level[order]
+    lower = np.concatenate([[level[0] - 1], level[:-1]])
+    return level - 0.5 + law.below * (lower + 1 - level), order
 
 
 @dataclass(frozen=True)
@@ -273,35 +308,52 @@ class CodeWidths:
         return False
 
     def wrong_bits(self, scatter: float) -> WrongBits:
-        """Errors of the bits' weights (codes) and where thresholds lie between levels."""
-        weight = 1 / (self.variance + max(scatter, 0.0))
-        tried = []
-        for below in BELOW:
-            bits, covariance = self.bits(scatter, below)
-            inverse = np.linalg.pinv(covariance, rcond=1e-9, hermitian=True)
-            misfit = float(weight @ self.without(bits, below).width ** 2)
-            tried.append((misfit, WrongBits(bits, below, covariance, float(bits @ inverse @ bits))))
-        return min(tried, key=lambda one: one[0])[1]
+        """Errors of the bits' weights (codes), and which level is taken, of nearby ones."""
+        tried = [self._wrong_bits(scatter, law) for law in (FITS, NEAREST)]
+        return min(tried, key=lambda one: one.misfit)
 
-    def bits(self, scatter: float, below: float = 0.0) -> tuple[F64, F64]:
+    def far_bits(self, near: Law) -> WrongBits | None:
+        """The nearest of all levels; None unless it explains clearly more than the law ``near``."""
+        start = self._far(NEAREST_OF_ALL)
+        scatter = 2 * self.without(start, NEAREST_OF_ALL).scatter()[0]
+        far = self._wrong_bits(scatter, NEAREST_OF_ALL, start)
+        again = self._wrong_bits(scatter, near)
+        return far if far.misfit < again.misfit - _CLEARLY else None
+
+    def _wrong_bits(self, scatter: float, law: Law, start: F64 | None = None) -> WrongBits:
+        bits, covariance = self.bits(scatter, law, start)
+        inverse = np.linalg.pinv(covariance, rcond=1e-9, hermitian=True)
+        weight = 1 / (self.variance + max(scatter, 0.0))
+        misfit = float(weight @ self.without(bits, law).width ** 2)
+        return WrongBits(bits, law, covariance, float(bits @ inverse @ bits), misfit)
+
+    def bits(self, scatter: float, law: Law = FITS, start: F64 | None = None) -> tuple[F64, F64]:
         """By how much each bit's weight is off, in codes, the least first; and the covariance.
 
         A bit that does not change within the codes at hand gets nothing. The common factor of all
         weights, a gain, does not change the local widths: the smallest errors are given (`level`
         gives others). A weight that is more than a code too small leaves several codes out, which
-        is no linear change, so the fit is repeated about what was found, by changes of a code.
-        ``below``: share of a threshold that the level of the code below sets.
+        is no linear change, so the fit is repeated about what was found, by changes of a code;
+        where levels change places, by small ones.
+
+        Parameters
+        ----------
+        scatter : variance of the widths beside
+        law : of the converter
+        start : (n,) errors of the weights from where the fit begins
         """
-        number = (len(self.gap) - 1).bit_length()
+        number = self._bits
+        change = _SMALL if law.any_code else 1.0
         weight = 1 / (self.variance + max(scatter, 0.0))
-        bits, left = np.zeros(number), self.width
+        bits = np.zeros(number) if start is None else start
+        left = self.width - self._left_out(bits, law)
         misfit = float(weight @ left**2)
         for _ in range(_BIT_FITS):
             slopes = [
-                self._left_out(bits + e, below) - self._left_out(bits - e, below)
-                for e in np.eye(number)
+                self._left_out(bits + e, law) - self._left_out(bits - e, law)
+                for e in change * np.eye(number)
             ]
-            design = np.stack(slopes, 1) / 2
+            design = np.stack(slopes, 1) / (2 * change)
             normal = (design.T * weight) @ design
             scale = 1 / np.sqrt(np.maximum(np.diag(normal), _NO_CHANGE))
             gain = np.where(np.diag(normal) > _NO_CHANGE, 2.0 ** np.arange(number) / scale, 0.0)
@@ -310,7 +362,7 @@ class CodeWidths:
             inverse = np.linalg.pinv(scaled, rcond=1e-6, hermitian=True)
             covariance = inverse * np.outer(scale, scale)
             moved = bits + covariance @ (design.T @ (weight * left))
-            after = self.width - self._left_out(moved, below)
+            after = self.width - self._left_out(moved, law)
             better = misfit - float(weight @ after**2)
             if better <= 0:
                 break
@@ -319,23 +371,45 @@ class CodeWidths:
                 break
         return bits, covariance
 
-    def level(self, bits: F64, below: float) -> F64:
+    def _far(self, law: Law) -> F64:
+        """Wrong bits by trying how far apart the levels are where each of them turns over.
+
+        From the highest bit down. As far apart as all higher ones are then too, which stay where
+        they were against each other. Only those count that turn over within the codes at hand.
+        """
+        bits, place = np.zeros(self._bits), np.arange(self._bits)
+        turning = np.isin(2**place, (self.number & -self.number)[1:])
+        for reach, step in _TRIED:
+            for bit in np.flatnonzero(turning)[::-1]:
+                way = np.where(place > bit, 2.0 ** (place - bit - 1), place == bit)
+                most = min(_WRONG * 2.0**bit, reach)
+                tried = np.vstack([bits, bits + np.outer(np.arange(-most, most, step), way)])
+                left = [self.width - self._left_out(one, law) for one in tried]
+                bits = tried[np.argmin([float(np.sum(w**2 / self.variance)) for w in left])]
+        return np.asarray(bits)
+
+    @property
+    def _bits(self) -> int:
+        return (len(self.gap) - 1).bit_length()
+
+    def level(self, bits: F64) -> F64:
         """Bits with a common factor by which the response has no slope over the codes at hand."""
         changing = np.ptp(self.number[:, None] >> np.arange(len(bits)) & 1, axis=0) > 0
         gain = np.where(changing, 2.0 ** np.arange(len(bits)), 0.0)
         of_bits, of_gain = (
-            np.polyfit(self.number, moved_by_bits(own, below, len(self.gap))[self.number], 1)[0]
+            np.polyfit(self.number, level_errors(own, len(self.gap))[self.number], 1)[0]
             for own in (bits, gain)
         )
         return np.asarray(bits - of_bits / of_gain * gain)
 
-    def _left_out(self, bits: F64, below: float) -> F64:
+    def _left_out(self, bits: F64, law: Law) -> F64:
         """Widths (n,) that wrong weights of bits bring about, less what the local fit takes."""
-        codes = np.arange(len(self.gap))
-        begins = codes + moved_by_bits(bits, below, len(codes))
+        begins, order = code_cells(bits, law, len(self.gap))
         # A code that begins after a higher one is never reached.
-        reached = np.minimum.accumulate(begins[::-1])[::-1]
-        return self._after_fit(np.diff(reached) - 1)[self.number]
+        begins = np.minimum.accumulate(begins[::-1])[::-1]
+        width = np.ones(len(begins))
+        width[order[:-1]] = np.diff(begins)
+        return self._after_fit(width[:-1] - 1)[self.number]
 
     def _after_fit(self, width: F64) -> F64:
         """Widths of codes 0, 1, ..., less one, as they come out relative to a local fit."""
@@ -349,9 +423,9 @@ class CodeWidths:
         taken = width - np.convolve(width, self.kernel, "same")
         return np.asarray(np.maximum(1 + uniform_filter1d(taken, len(self.kernel)), 0.1))
 
-    def without(self, bits: F64, below: float = 0.0) -> "CodeWidths":
+    def without(self, bits: F64, law: Law = FITS) -> "CodeWidths":
         """The rest, once the wrong weights of bits (codes) are taken out."""
-        return replace(self, width=self.width - self._left_out(bits, below))
+        return replace(self, width=self.width - self._left_out(bits, law))
 
     def ripple(self, scatter: float) -> Ripple:
         """The strongest line, over chance and a scatter of the widths (variance)."""
