@@ -13,6 +13,7 @@ from pixcal.estimators.diagnosis.test_statistics.patterns import (
     smooth_patterns,
     smooth_patterns_by_phase,
     strongest,
+    tone_sigmas,
 )
 from pixcal.model.arrays import F32, Mask
 
@@ -56,6 +57,14 @@ def test_of_white_noise_the_highest_ordinate_is_the_largest_of_independent_ones(
     expected = law.ppf(0.5 ** (1 / ordinates))
     assert np.median(found) == pytest.approx(expected, rel=0.015)
     assert np.max(found) < law.ppf((1 - 1e-4) ** (1 / ordinates))
+
+
+@pytest.mark.parametrize("frames", [2, 10, FRAMES])
+def test_of_white_noise_the_significance_of_a_tone_is_a_standard_normal(frames: int) -> None:
+    found = [float(tone_sigmas(noise(seed, frames), GOOD).value[0]) for seed in range(200)]
+    assert np.mean(found) == pytest.approx(0, abs=4 / np.sqrt(200))
+    assert np.std(found) == pytest.approx(1, abs=4 / np.sqrt(400))
+    assert np.max(found) < 4.5
 
 
 def test_a_tone_in_the_order_of_readout_adds_to_one_ordinate() -> None:

@@ -37,8 +37,13 @@ def sigmas_of_count(count: int, expected: float) -> float:
 
 def sigmas_of_best(*sigmas: float) -> float:
     """Standard deviations that the largest of several independent standard normals is worth."""
-    chance = float(log_ndtr(-max(sigmas)))
+    return sigmas_of_largest(max(sigmas), len(sigmas))
+
+
+def sigmas_of_largest(largest: float, count: int) -> float:
+    """The same, given the largest of ``count`` of them."""
+    chance = float(log_ndtr(-max(largest, -8.0)))
     # One minus the chance that none of them is as large.
-    none = len(sigmas) * math.log1p(-math.exp(min(chance, -1e-300)))
-    log_any = math.log(-math.expm1(none)) if none < -1e-12 else chance + math.log(len(sigmas))
-    return -float(ndtri_exp(log_any))
+    none = count * math.log1p(-math.exp(chance))
+    log_any = math.log(-math.expm1(none)) if none < -1e-12 else chance + math.log(count)
+    return -float(ndtri_exp(min(log_any, -1e-300)))

@@ -12,9 +12,11 @@ from pixcal.estimators.diagnosis.test_statistics import Curve, family, statistic
 from pixcal.estimators.diagnosis.test_statistics.detector_frames import differences, repeated
 from pixcal.estimators.diagnosis.test_statistics.look import Look, pattern_sizes
 from pixcal.estimators.diagnosis.test_statistics.time import DISTINCT
+from pixcal.kernels.significance import sigmas_of_largest
 from pixcal.model.arrays import F32, F64, Mask
 
 KINDS = (("bias",), ("dark",))
+FLOOR = 0.7  # standard deviation of a significance, by chance, at least
 
 
 def highest_ordinate(noise: F32, good: Mask) -> Curve:
@@ -34,6 +36,19 @@ def highest_ordinate(noise: F32, good: Mask) -> Curve:
     return Curve(np.array([frequency]), np.array([float(power[y, x])]))
 
 
+def tone_sigmas(noise: F32, good: Mask) -> Curve:
+    """Significance of the highest ordinate, which of white noise is a standard normal.
+
+    The largest of many has a long tail, which no scale of powers makes normal. An ordinate's own
+    distribution is that of Wilson and Hilferty (1931), of two degrees of freedom a frame.
+    """
+    highest = highest_ordinate(noise, good)
+    ninth = 1 / (9 * len(noise))
+    own = (float(np.cbrt(highest.value[0])) - (1 - ninth)) / np.sqrt(ninth)
+    count = (noise.shape[1] - 1) * (noise.shape[2] // 2)
+    return Curve(highest.x, np.array([sigmas_of_largest(own, count)]))
+
+
 def strongest(sizes: F64) -> float:
     """Largest singular value of sizes (n, pattern) of patterns.
 
@@ -43,22 +58,22 @@ def strongest(sizes: F64) -> float:
 
 
 @statistic(
-    "noise", "strongest tone in fringe frames", "noise / white noise", x="cycles a pixel",
-    power=True,
+    "noise", "strongest tone in fringe frames", "significance", unit="σ", x="cycles a pixel",
+    floor=FLOOR,
 )  # fmt: skip
 def tone(look: Look) -> Curve:
     """Of the residuals."""
-    return highest_ordinate(look.residual[:: look.thinned], look.good)
+    return tone_sigmas(look.residual[:: look.thinned], look.good)
 
 
 @family(
-    "{0}_tone", KINDS, "noise", "strongest tone in {0} frames", "noise / white noise",
-    x="cycles a pixel", power=True, sets=False,
+    "{0}_tone", KINDS, "noise", "strongest tone in {0} frames", "significance", unit="σ",
+    x="cycles a pixel", floor=FLOOR, sets=False,
 )  # fmt: skip
 def tones(kind: str, evidence: Evidence) -> Curve | None:
     """Of the differences of two frames."""
     noise = _all_differences(kind, evidence)
-    return None if noise is None else highest_ordinate(noise, evidence.good)
+    return None if noise is None else tone_sigmas(noise, evidence.good)
 
 
 @statistic("time", "smooth patterns that vary over the frames", "strongest / noise of one frame")
