@@ -30,6 +30,7 @@ _SIGMAS = ("−5", "−7", "−10", "+5", "+7", "+10")
 # by `x_label` of `curves.json`, where numbers alone would say little
 _AXES = {
     "neighbour": _Axis("neighbour", "neighbour {}", _STEPS),
+    "far neighbour": _Axis("neighbour", "neighbour {}", _STEPS[4:]),
     "row of four, down then right": _Axis("neighbour, row modulo 4", "neighbour {}", _ROWS_OF_FOUR),
     "left, right, above, below": _Axis("neighbour", "neighbour {}", _SIDES),
     "rows, columns": _Axis("", "{}", ("rows", "columns")),

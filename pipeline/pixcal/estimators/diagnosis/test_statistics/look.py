@@ -189,7 +189,8 @@ CODES = 64  # codes whose remainders are told apart, a power of two
 CELLS = 4  # cells of the window along each side
 # rows and columns to a neighbour
 STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0), (0, 4), (4, 0))
-MAX_FRAMES = 120  # frames for statistics of pairs of pixels
+ADJACENT = 4  # of these, to pixels that touch
+MAX_FRAMES = 300  # frames for statistics of pairs of pixels
 PATTERN_DEGREE = 3  # of the Legendre polynomials that smooth patterns are made of
 SPARSE = 7  # one of so many pixels tells the range of the levels
 

@@ -8,6 +8,7 @@ from scipy.ndimage import maximum_filter
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.test_statistics import Curve, family, statistic
 from pixcal.estimators.diagnosis.test_statistics.look import (
+    ADJACENT,
     CELLS,
     LEVELS,
     OUTLIERS,
@@ -70,11 +71,19 @@ def variance_by_time(look: Look) -> Curve:
     return Curve(np.arange(1.0, 9.0), np.array(value))
 
 
-@statistic("noise", "correlation of neighbours", "correlation", x="neighbour")
+@statistic("noise", "correlation of adjacent pixels", "correlation", x="neighbour")
 def neighbours(look: Look) -> Curve:
-    """Correlation of the residuals of pixels some rows and columns apart."""
+    """Correlation of the residuals of pixels that touch: by itself, for most crosstalk is there."""
     sums, count = look.neighbours
-    return Curve(np.arange(len(STEPS), dtype=float), _mean_product(sums, count))
+    return Curve(np.arange(float(ADJACENT)), _mean_product(sums, count)[:ADJACENT])
+
+
+@statistic("noise", "correlation of pixels further apart", "correlation", x="far neighbour")
+def far_neighbours(look: Look) -> Curve:
+    """Correlation of the residuals of pixels two to four rows or columns apart."""
+    sums, count = look.neighbours
+    every = np.arange(float(len(STEPS)))
+    return Curve(every[ADJACENT:], _mean_product(sums, count)[ADJACENT:])
 
 
 @statistic(
@@ -97,9 +106,9 @@ def neighbours_by_row(look: Look) -> Curve:
 def neighbours_by_level(look: Look) -> Curve:
     """Covariance over shot noise in bright samples less that in dark ones."""
     (bright, dark), count = neighbour_sums_by_level(
-        look.residual, look.found.model, look.good, STEPS[:4], look.thinned
+        look.residual, look.found.model, look.good, STEPS[:ADJACENT], look.thinned
     )
-    return Curve(np.arange(4.0), 2 * _mean_product(bright - dark, count))
+    return Curve(np.arange(float(ADJACENT)), 2 * _mean_product(bright - dark, count))
 
 
 def _mean_product(sums: F64, count: F64) -> F64:
