@@ -99,6 +99,19 @@ def test_a_shift_is_a_gap_that_its_cause_closes_and_another_does_not() -> None:
     assert log_likelihood(data, wrong) < log_likelihood(data, nominal) + MIN_LOGLIK_GAIN
 
 
+def test_a_weak_effect_is_found_beside_a_strong_one() -> None:
+    """How uncertain its strength is widens what it does itself, not what the strong one does."""
+    known = reference()
+    data = known.on_scale(drawn(7, shift=40, power=6))
+    strong = expect_with(known, [drawn(s, shift=40) for s in range(100, 108)])
+    both = [drawn(s, shift=40, power=6) for s in range(100, 108)]
+    beside, alone = (expect_with(known, both, 1 / 3, start) for start in (strong, None))
+    np.testing.assert_allclose(beside.variance[LINEAR], strong.variance[LINEAR], rtol=1e-9)
+    np.testing.assert_allclose(beside.variance[POWER], alone.variance[POWER], rtol=1e-9)
+    before = log_likelihood(data, strong)
+    assert log_likelihood(data, beside) > before + MIN_LOGLIK_GAIN > log_likelihood(data, alone)
+
+
 def test_half_of_a_gap_is_half_closed() -> None:
     """One of two curves that count about alike."""
     known = reference()

@@ -86,12 +86,16 @@ def expect_nominal(reference: Reference) -> Expectation:
 
 
 def expect_with(
-    reference: Reference, simulated: Sequence[Curves], error: float = 0.0
+    reference: Reference,
+    simulated: Sequence[Curves],
+    error: float = 0.0,
+    beside: Expectation | None = None,
 ) -> Expectation:
-    """What a bench with effects, of this relative ``error`` of their strength, lets expect.
+    """What a bench with effects lets expect.
 
     The simulations have the first seeds of the reference, in the same order: what differs is due to
-    effects.
+    effects. ``error``: relative, of the strength of what is new on top of ``beside``, by default
+    the nominal bench.
     """
     nominal = expect_nominal(reference)
     scaled_ones = [reference.on_scale(s) for s in simulated]
@@ -111,7 +115,8 @@ def expect_with(
         shift = change.mean(axis=0)
         certain = _certain(shift, apart * noise / count)
         mean[key] = nominal.mean[key] + certain * shift
-        more = (TOLERANCE**2 + error**2) * (certain * shift) ** 2 + certain * paired / count
+        added = mean[key] - (beside or nominal).mean[key]
+        more = (TOLERANCE * certain * shift) ** 2 + (error * added) ** 2 + certain * paired / count
         if count > 1:
             # What the effects add to the scatter, beyond what few seeds have by chance.
             chance = noise * np.sqrt(4 * apart * (1 - apart / 4) / (count - 1))

@@ -102,15 +102,20 @@ class Comparison:
         self.nominal = self._trial((), expect_nominal(reference))
 
     def trial(
-        self, effects: Effects, curves: Sequence[Curves], significance: float = np.inf
+        self,
+        effects: Effects,
+        curves: Sequence[Curves],
+        significance: float = np.inf,
+        beside: Trial | None = None,
     ) -> Trial:
         """A bench with some effects, from the curves of its simulations.
 
-        The strength of the added effect has a relative error of one over its ``significance``,
-        sigma.
+        The strength of the effect that is added to those of ``beside`` has a relative error of one
+        over its ``significance``, sigma.
         """
         error = 1 / max(significance, 1.0)
-        return self._trial(effects, expect_with(self.reference, curves, error))
+        start = None if beside is None else beside.expected
+        return self._trial(effects, expect_with(self.reference, curves, error, start))
 
     def allowing_for_laws(self, trial: Trial, accepted: Trial) -> Trial:
         """A trial that allows for other laws of the effects accepted before."""

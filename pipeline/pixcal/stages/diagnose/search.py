@@ -265,9 +265,8 @@ class Search:
     ) -> list[Addition]:
         """Variants added to the causes; log-likelihoods allow for other laws of these."""
         # Candidates none of whose variants can be simulated are no longer among the remaining.
-        start = self.comparison.allowing_for_laws(
-            self._start(causes.bench, simulations), causes.current
-        )
+        beside = self._start(causes.bench, simulations)
+        start = self.comparison.allowing_for_laws(beside, causes.current)
         benches = [(*causes.bench, effect) for _, effect in options]
         simulated = self._simulate(benches, simulations, label, ())
         made: list[Addition] = []
@@ -279,7 +278,7 @@ class Search:
             sure = remaining[name].significance
             if simulations == 1:
                 sure = min(sure, KNOWN_TO)
-            trial = self.comparison.trial(bench, curves, sure)
+            trial = self.comparison.trial(bench, curves, sure, beside)
             trial = self.comparison.allowing_for_laws(trial, causes.current)
             gain = trial.log_likelihood - start.log_likelihood
             if remaining[name].in_maps_alone:
