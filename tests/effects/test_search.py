@@ -58,6 +58,7 @@ PATTERNS: Mapping[str, Mapping[int, float]] = {
     "little": {5: 1.0},
     "more": {4: 1.0, 5: 1.0},
     "left, measured": {0: 1.0, 1: 0.5, 5: 10.0},
+    "curve": {0: 1.0, 1: 0.5, 2: 1 / 3, 3: -1 / 6, 4: 0.5},
     **{f"single {row}": {row: 1.0} for row in range(len(KEYS))},
 }
 SINGLE = tuple(f"single {row}" for row in range(len(KEYS)))
@@ -167,6 +168,27 @@ def test_two_effects_are_both_found_in_any_order() -> None:
         assert left < 0.05
         assert set(found.without) == {"left", "right"}
     assert results[0][1] == pytest.approx(results[1][1])
+
+
+@pytest.mark.parametrize("truth", [{"left": 0.03, "right": 0.01}, {"curve": 0.03}])
+def test_two_effects_are_found_that_a_curve_takes_up_together(truth: Mapping[str, float]) -> None:
+    """Neither adds to the curve; both together in its place leave less."""
+    sizes = {"curve": 0.03, "left": 0.03, "right": 0.01, "little": 0.02}
+    found, left = search(truth, [candidate(label, size) for label, size in sizes.items()])
+    assert set(found.accepted) == set(truth)
+    assert left < 0.05
+    if "curve" not in truth:
+        told = found.candidates["curve"].reason
+        assert told == "left and right together explain the held-out frames better"
+        assert set(found.without) == set(truth)
+
+
+def test_a_curve_stays_where_no_two_others_leave_less() -> None:
+    sizes = {"curve": 0.03, "left": 0.03, "little": 0.02}
+    found, _ = search(
+        {"left": 0.03, "right": 0.01}, [candidate(label, size) for label, size in sizes.items()]
+    )
+    assert found.accepted == ("curve",)
 
 
 def test_of_two_that_are_alike_the_one_that_opens_no_gap_is_taken() -> None:

@@ -29,6 +29,11 @@ class Candidate:
         return 0.0 if self.estimate is None else self.estimate.significance
 
     @property
+    def usable(self) -> bool:
+        """Whether there is an estimate of something."""
+        return self.estimate is not None and not self.estimate.refused and self.significance > 0
+
+    @property
     def in_maps_alone(self) -> bool:
         """Whether it shows in static maps alone, whose pattern all frames have in common."""
         # What offsets look like by chance is then the same in the held-out frames.

@@ -25,6 +25,7 @@ from pixcal.stages.diagnose.candidates import (
     likeliest,
 )
 from pixcal.stages.diagnose.comparison import MIN_LOGLIK_GAIN, Comparison, Trial
+from pixcal.stages.diagnose.exchange import exchanges
 from pixcal.stages.diagnose.rejection import (
     MIN_LOGLIK_GAIN_WEAK,
     doubtful,
@@ -90,12 +91,22 @@ class Search:
         """Search; ``reason`` of the rejected candidates is filled in."""
         remaining = {n: c for n, c in candidates.items() if c.estimate and not c.reason}
         causes = Accepted(self.comparison.nominal, dict.fromkeys(remaining, 1.0))
-        while len(causes.effects) < MAX_CAUSES and self._accept_one(causes, remaining, candidates):
-            pass
+        self._accept_all(causes, remaining, candidates)
+        if self._exchange(causes, remaining, candidates):
+            self._accept_all(causes, remaining, candidates)
         if len(causes.effects) == MAX_CAUSES:
             for candidate in remaining.values():
                 candidate.reason = f"not tested: the search stops after {MAX_CAUSES} causes"
         return self._each_weighed(causes, candidates)
+
+    def _accept_all(
+        self,
+        causes: Accepted,
+        remaining: dict[str, Candidate],
+        candidates: Mapping[str, Candidate],
+    ) -> None:
+        while len(causes.effects) < MAX_CAUSES and self._accept_one(causes, remaining, candidates):
+            pass
 
     def _accept_one(
         self,
@@ -123,10 +134,59 @@ class Search:
         candidates[best].reason = ""
         enough = max(gains[best] - MIN_LOGLIK_GAIN, MIN_LOGLIK_GAIN)
         causes.alike[best] = tuple(n for n, g in gains.items() if n != best and g > enough)
+        self._leave_explained(best, causes, remaining, candidates)
+        return True
+
+    def _leave_explained(
+        self,
+        cause: str,
+        causes: Accepted,
+        remaining: dict[str, Candidate],
+        candidates: Mapping[str, Candidate],
+    ) -> None:
+        """Leave out the candidates most of whose significance the causes produce."""
         causes.shares = self._unexplained(causes.bench, remaining)
         for name in [n for n, share in causes.shares.items() if share < 1 - SIMILAR]:
-            candidates[name].reason = similar_to(best)
+            candidates[name].reason = similar_to(cause)
             del remaining[name], causes.shares[name]
+
+    def _exchange(
+        self,
+        causes: Accepted,
+        remaining: dict[str, Candidate],
+        candidates: Mapping[str, Candidate],
+    ) -> bool:
+        """Where the data still differ, put two other candidates in the place of a cause."""
+        options = exchanges(causes.effects, candidates)
+        count = len(causes.effects) + 1
+        left = self._most - sum(self._made.values()) - CONFIRM * (1 + count * (count + 1) // 2)
+        if not options or len(options) + 1 > left or not self.comparison.differs(causes.current):
+            return False
+        benches = [tuple(one.effects.values()) for one in options]
+        tried = self._simulate([causes.bench, *benches], 1, "exchanged", ())
+        likely = [
+            -np.inf if isinstance(c, str) else self.comparison.trial(b, c).log_likelihood
+            for b, c in zip([causes.bench, *benches], tried, strict=True)
+        ]
+        best = options[int(np.argmax(likely[1:]))]
+        if max(likely[1:]) < likely[0]:
+            return False
+        trial = self._confirmed(tuple(best.effects.values()))
+        if isinstance(trial, str) or trial.log_likelihood < (
+            causes.current.log_likelihood + MIN_LOGLIK_GAIN_WEAK
+        ):
+            return False
+        causes.current, causes.effects = trial, dict(best.effects)
+        causes.alike = {name: causes.alike.get(name, ()) for name in causes.effects}
+        candidates[best.out].reason = best.reason
+        for name, one in candidates.items():
+            if name in causes.effects:
+                one.reason = ""
+            elif name != best.out and one.usable:
+                remaining[name] = one
+        for name in best.new:
+            remaining.pop(name, None)
+        self._leave_explained(" and ".join(best.new), causes, remaining, candidates)
         return True
 
     def _favoured(
