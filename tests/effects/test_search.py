@@ -312,6 +312,14 @@ def test_a_stand_in_for_an_unknown_cause_is_not_claimed(size: float) -> None:
     assert "stays unexplained" in found.candidates["little"].reason
 
 
+@pytest.mark.parametrize(("unknown", "claimed"), [(0.012, True), (0.06, False)])
+def test_no_cause_is_claimed_where_what_differs_most_stays(unknown: float, claimed: bool) -> None:
+    """However much of the rest it closes: the main cause is another."""
+    found, _ = search({"left": 0.03, "single 5": unknown}, [candidate("left", 0.03)])
+    assert found.accepted == (("left",) if claimed else ())
+    assert claimed or "what differs most stays" in found.candidates["left"].reason
+
+
 def test_a_small_remainder_of_what_another_cause_brings_about_is_not_claimed() -> None:
     both = [candidate("left", 0.03), candidate("little", 0.003)]
     truth = {"left": 0.03, "little": 0.003}

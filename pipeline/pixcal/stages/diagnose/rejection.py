@@ -12,6 +12,8 @@ OPEN = 0.15  # residual gap above which an unknown cause is assumed
 LITTLE = 0.1  # fraction of the gap that a doubtful cause must close,
 BESIDE_OPEN = 0.25  # and every cause, as a fraction of the residual gap
 
+UNTRIED = ("not decided", "not tested", "cannot be simulated")  # how such reasons begin
+
 Rejection = tuple[str, str]  # name of a cause, and why it is rejected
 
 
@@ -61,7 +63,8 @@ def doubtful(
 ) -> Rejection | None:
     """A cause that closes little of the gap and may stand in for another.
 
-    For an unknown cause, if much more of the gap remains than it closes. For another law of the
+    For an unknown cause, if much more of the gap remains than it closes, or if what differs most
+    stays: the main cause is then none of them. For another law of the
     other causes, if their laws produce a good part of its significance, or if it is not significant
     in the fitted frames. ``comparison, current, without``: as for `redundant`. ``candidates``: by
     name.
@@ -86,6 +89,11 @@ def doubtful(
     ):
         among = list(closed)
     least = min(among, key=lambda name: closed[name], default=None)
+    # What was not tried may be the cause of what differs most.
+    tried = not any(one.reason.startswith(UNTRIED) for one in candidates.values())
+    if closed and least is None and tried and comparison.strongest_stays(current):
+        least = min(closed, key=lambda name: closed[name])
+        return least, "what differs most stays as it is; it may stand in for an unknown cause"
     if least is None:
         return None
     closes = f"closes only {max(closed[least], 0):.1%} of the gap"
