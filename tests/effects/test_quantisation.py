@@ -340,6 +340,21 @@ def test_widths_of_displaced_thresholds_are_measured_and_do_not_wander() -> None
     assert np.abs(np.cumsum(measured)[600:3400:100]).max() < 3
 
 
+def test_codes_that_are_left_out_in_plenty_do_not_displace_the_others() -> None:
+    """One in eight: its samples have the code below, or the next one there is."""
+    rng = np.random.default_rng(8)
+    begins = np.arange(4096) - 0.5
+    for code in np.flatnonzero(rng.random(4096) < 0.125)[::-1]:
+        if 0 < code < 4095:
+            begins[code] = begins[code + 1]
+    widths = code_widths(codes_of(begins), 3.0)
+    assert widths is not None
+    measured = widths.measured
+    left_out = np.isclose(np.diff(begins), 0)[600:3400]
+    assert measured[600:3400][left_out].mean() < -0.9
+    assert np.abs(np.cumsum(measured)[600:3400:100]).max() < 3
+
+
 @pytest.mark.parametrize("step", [0.8, -0.6, -1.3, -2.8, -3.5])
 def test_where_a_bit_leaves_several_codes_out_its_weight_is_told(step: float) -> None:
     """Codes by successive approximation of noisy light; bit 10 turns over at 1024 and 3072."""

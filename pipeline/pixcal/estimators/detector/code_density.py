@@ -50,6 +50,7 @@ _WIDTH_FITS = 12  # of widths whose variances are found by the fit before
 _FEW = 0.15  # median over mean square of the widths (0.45 if normal) below which few are uneven
 _TOLD = 4.0  # median square of the widths over that of chance, above which most are uneven
 _SLOW = 101  # codes over which widths add up to nothing, of thresholds displaced each by itself
+_MANY = 0.02  # share of codes off by more than half a code, above which wrong bits are not why
 LOWEST_RIPPLE = 1 / 16  # turns a code
 
 
@@ -284,6 +285,12 @@ class CodeWidths:
                 own = found**2 + float(np.median(self.variance))
             raised = self._raised(np.where(self.gap[:top], 0.0, found))
             data = self.width * np.where(self.gap[:top], 1.0, raised)[self.number]
+        if few and float(np.mean(np.abs(found[self.number]) > 0.5)) > _MANY:
+            # Codes that are left out go to those beside them: thresholds stay where they are.
+            displaced = np.cumsum(found)
+            displaced -= uniform_filter1d(displaced, _SLOW)
+            found = np.maximum(np.diff(displaced, prepend=0), -1)
+            return found - np.where(found > -1, found.sum() / np.count_nonzero(found > -1), 0.0)
         # A slope is a gain; thresholds that are displaced each by itself do not wander either.
         for _ in range(_WIDTH_FITS):
             slow = found[self.number].mean() if few else uniform_filter1d(found, _SLOW)
