@@ -92,7 +92,7 @@ class Search:
         remaining = {n: c for n, c in candidates.items() if c.estimate and not c.reason}
         causes = Accepted(self.comparison.nominal, dict.fromkeys(remaining, 1.0))
         self._accept_all(causes, remaining, candidates)
-        if self._exchange(causes, remaining, candidates):
+        if len(causes.effects) < MAX_CAUSES and self._exchange(causes, remaining, candidates):
             self._accept_all(causes, remaining, candidates)
         if len(causes.effects) == MAX_CAUSES:
             for candidate in remaining.values():
