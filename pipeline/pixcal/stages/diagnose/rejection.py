@@ -64,10 +64,9 @@ def doubtful(
     """A cause that closes little of the gap and may stand in for another.
 
     For an unknown cause, if much more of the gap remains than it closes, or if what differs most
-    stays: the main cause is then none of them. For another law of the
-    other causes, if their laws produce a good part of its significance, or if it is not significant
-    in the fitted frames. ``comparison, current, without``: as for `redundant`. ``candidates``: by
-    name.
+    stays: the main cause is then none of them. For another law of the other causes, if their laws
+    produce a good part of its significance, or if it is not significant in the fitted frames.
+    ``comparison, current, without``: as for `redundant`. ``candidates``: by name.
     """
     where = comparison.gap_of(current)
     open_still = comparison.residual(current, where)
@@ -90,7 +89,8 @@ def doubtful(
         among = list(closed)
     least = min(among, key=lambda name: closed[name], default=None)
     # What was not tried may be the cause of what differs most.
-    tried = not any(one.reason.startswith(UNTRIED) for one in candidates.values())
+    strong = [one for one in candidates.values() if one.significance >= SIGNIFICANT]
+    tried = not any(one.reason.startswith(UNTRIED) for one in strong)
     if closed and least is None and tried and comparison.strongest_stays(current):
         least = min(closed, key=lambda name: closed[name])
         return least, "what differs most stays as it is; it may stand in for an unknown cause"
