@@ -20,12 +20,13 @@ from pixcal.estimators.maps.map_fit import (
     phase_map,
     polynomial,
 )
+from pixcal.estimators.maps.structure import stitched_fields, without_outliers
 from pixcal.kernels.beams import Light
 from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.robust import median
 from pixcal.kernels.scene import DetectorMaps
 from pixcal.kernels.significance import sigmas_of_chi2
-from pixcal.model.arrays import C128, F64, Mask
+from pixcal.model.arrays import C128, F64, Indices, Mask
 from pixcal.simulation.forward import ForwardModel
 from pixcal.simulation.numbers import field_of, numbers, with_numbers
 from pixcal.simulation.recording import Recording
@@ -33,6 +34,7 @@ from pixcal.simulation.replica import set_recordings
 
 CLIP = 8.0  # medians of the differences of pixels side by side, beyond which they do not count
 KINDS = ("the mean light", "the visibility", "the phase")
+PHASE = KINDS.index("the phase")
 MIN_PIXELS, MIN_SIDE = 200, 9
 ROUNDS = 3  # Gauss-Newton steps
 # change of a map (relative, or rad) by a step for a derivative; the first such step, and how often
@@ -114,6 +116,7 @@ class _Lit:
     gauge: F64 = field(repr=False)  # (4, y, x) fringe modes that the fit leaves open
     light: Light = field(repr=False)  # of all columns up to the part's last
     maps: DetectorMaps = field(repr=False)
+    stitched: Indices | None = field(default=None, repr=False)  # (y, x) fields of offsets
 
     @classmethod
     def of(cls, found: FringeEvidence, recording: Recording) -> "_Lit":
@@ -181,11 +184,21 @@ def _bent(turn: C128) -> F64:
 
 def _lit(evidence: Evidence) -> list[_Lit]:
     recordings = set_recordings(evidence)
-    return [
+    lit = [
         _Lit.of(found, recordings[name])
         for name, found in evidence.fringes.items()
         if np.count_nonzero(found.good) > MIN_PIXELS and min(found.good.shape) >= MIN_SIDE
     ]
+    # All sets of an evidence look at the same pixels.
+    stitched = _stitched(lit) if lit else None
+    return [replace(one, stitched=stitched) for one in lit]
+
+
+def _stitched(lit: Sequence[_Lit]) -> Indices | None:
+    """Fields (y, x) of the foundry's stitching in the phases of all sets; None without any."""
+    maps = [without_outliers(np.where(one.good, one.data[PHASE], np.nan)) for one in lit]
+    field = stitched_fields(maps, [one.gauge for one in lit])
+    return field if field.any() else None
 
 
 def _fitted(start: LightStart, lit: Sequence[_Lit], degree: int) -> LightFit:
@@ -263,7 +276,8 @@ def _least_squares(
     for one, data, own in zip(lit, rest, signals, strict=True):
         for kind in (k for k in kinds if _shows(own, k)):
             free = np.concatenate([polynomial(one.good.shape, degree), one.gauge])
-            parts.append(MapPart.of(own[:, kind], data[kind], free, one.good))
+            stitched = one.stitched if kind == PHASE else None
+            parts.append(MapPart.of(own[:, kind], data[kind], free, one.good, stitched))
             whole += (own[:, kind][:, one.good] ** 2).sum(axis=1)
             left += (parts[-1].signals ** 2).sum(axis=0)
     told = np.flatnonzero(left > UNTOLD * whole)

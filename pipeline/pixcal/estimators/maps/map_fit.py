@@ -13,6 +13,7 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid, polynomial_basis
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
+from pixcal.estimators.maps.stitching import within
 from pixcal.estimators.maps.structure import CELLS
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.robust import median
@@ -32,24 +33,37 @@ class MapPart:
     dof: int  # pixels less the terms that were taken off
 
     @classmethod
-    def of(cls, signals: F64, data: F64, free: F64, good: Mask) -> "MapPart":
-        """Data (y, x), signals (n, y, x), without outliers or free terms (m, y, x)."""
+    def of(
+        cls, signals: F64, data: F64, free: F64, good: Mask, field: Indices | None = None
+    ) -> "MapPart":
+        """Data (y, x), signals (n, y, x), without outliers or free terms (m, y, x).
+
+        Nor the mean of each ``field`` (y, x) of the foundry's stitching, where these are told.
+        """
         at = np.flatnonzero(good)
         terms, values = _taken(free, at), data.ravel()[at]
         for _ in range(2):
-            left = without(values[:, None], terms.T)[:, 0]
+            left = _left(values[:, None], terms.T, at, field)[:, 0]
             centre = median(left)
             kept = np.abs(left - centre) <= _CLIP * 1.4826 * median(np.abs(left - centre))
             if kept.all():
                 break
             at, terms, values = at[kept], terms[:, kept], values[kept]
-        rest = without(np.concatenate([_taken(signals, at), values[None]]).T, terms.T)
+        columns = np.concatenate([_taken(signals, at), values[None]]).T
+        rest = _left(columns, terms.T, at, field)
         y, x = np.divmod(at, good.shape[1])
         sides = [*CELLS, max(min(good.shape) // 4, 1)]
         blocks = np.stack([(y // n) * (good.shape[1] // n + 1) + x // n for n in sides])
         return cls(
             np.ascontiguousarray(rest[:, :-1]), rest[:, -1].copy(), blocks, len(at) - len(free)
         )
+
+
+def _left(columns: F64, free: F64, at: Indices, field: Indices | None) -> F64:
+    """Columns (pixel, n) less free terms (pixel, m) and means of fields (y, x)."""
+    if field is not None:
+        columns, free = (within(own, field.ravel()[at]) for own in (columns, free))
+    return without(columns, free)
 
 
 def _taken(maps: F64, at: Indices) -> F64:

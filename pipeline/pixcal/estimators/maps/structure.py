@@ -1,14 +1,16 @@
 """Structure of a map: smooth surfaces, rows and columns that repeat, fringes, scales."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
-from pixcal.kernels.normal_matrix import inverse_normal
+from pixcal.estimators.maps.stitching import FieldFit, fields
+from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
 from pixcal.kernels.robust import median_around
-from pixcal.model.arrays import C128, F64, Mask
+from pixcal.model.arrays import C128, F64, Indices, Mask
 
 DEGREE = 3  # of a smooth surface
 _BEYOND = 7  # degree up to which polynomials tell how red true offsets are
@@ -123,44 +125,85 @@ class OffsetModel:
     # (term, y, x) what was taken out: all that an effect of the bench or the readout would
     # bring about
     terms: F64
-    # (term,) of the coefficients of the terms, by chance, in offsets such as those that were kept
+    # (term, term) root of the covariance of the coefficients of the terms, by chance, in offsets
+    # such as those that were kept
     scatter: F64
     unknown: Mask  # (y, x) where there was no map,
     rms: float  # and offsets are drawn with this rms, px
 
     def drawn(self, rng: np.random.Generator) -> F64:
         """A map (y, x): kept as it was, and taken out as it may be by chance; px."""
-        size = self.scatter * rng.standard_normal(len(self.scatter))
+        size = self.scatter @ rng.standard_normal(len(self.scatter))
         drawn = self.kept + np.tensordot(size, self.terms, 1)
         drawn[self.unknown] += self.rms * rng.standard_normal(np.count_nonzero(self.unknown))
         return np.asarray(drawn)
+
+
+@lru_cache(maxsize=4)
+def bench_patterns(shape: tuple[int, ...]) -> F64:
+    """What the bench or the readout may do to any map (term, y, x): bending, repeating lines.
+
+    Bending first, the constant left out.
+    """
+    lines = []
+    for axis in (0, 1):
+        place = np.expand_dims(np.arange(shape[axis]), 1 - axis)
+        for period in PERIODS:
+            turn = np.broadcast_to(2 * np.pi * place / period, shape)
+            lines += [np.cos(turn)] if period == 2 else [np.cos(turn), np.sin(turn)]
+    terms = np.concatenate([legendre(shape, DEGREE)[1:], np.stack(lines)])
+    terms.flags.writeable = False  # the same for all who ask
+    return terms
+
+
+def stitched_fields(maps: Sequence[F64], fringes: Sequence[F64]) -> Indices:
+    """Fields (y, x) of the foundry's stitching in offsets or phases (y, x), NaN where masked.
+
+    Beside what the bench or the readout may do, and fringes (term, y, x) of each map.
+    """
+    patterns = bench_patterns(maps[0].shape)
+    bends = len(legendre(maps[0].shape, DEGREE)) - 1
+    rests = []
+    for values, own in zip(maps, fringes, strict=True):
+        terms = np.concatenate([patterns, own])
+        sizes = fit_terms(values - np.nanmean(values), terms)
+        rests.append(values - np.tensordot(sizes[bends:], terms[bends:], 1))
+    return fields(rests, [patterns[:bends]] * len(rests))
 
 
 def true_offsets(delta: F64, sigma: F64, psi: F64) -> OffsetModel:
     """Part a map of offsets with their errors (y, x), px, NaN where there is none; psi in rad.
 
     What is ``kept`` is shrunk by the share of its scatter that is noise; zero where there is none.
+    Steps between the fields of the foundry's stitching are kept as they are.
     """
-    bending = legendre(delta.shape, DEGREE)
-    lines = []
-    for axis in (0, 1):
-        place = np.expand_dims(np.arange(delta.shape[axis]), 1 - axis)
-        for period in PERIODS:
-            turn = np.broadcast_to(2 * np.pi * place / period, delta.shape)
-            lines += [np.cos(turn)] if period == 2 else [np.cos(turn), np.sin(turn)]
-    fringes = [np.cos(psi), np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)]
-    terms = np.concatenate([bending, np.stack([*lines, *fringes])])
-    rest = clipped(delta)
-    rest = rest - np.tensordot(fit_terms(rest, terms), terms, 1)
-    variance = float(np.nanvar(rest))
+    patterns = bench_patterns(delta.shape)
+    fringes = np.stack([np.cos(psi), np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)])
+    terms = np.concatenate([patterns, fringes])
+    values = clipped(delta)
+    fit = FieldFit.of(values, terms, stitched_fields([values], [fringes]))
+    variance = float(np.nanvar(fit.rest))
     noise = float(np.nanmedian(sigma[np.isfinite(delta)] ** 2))
     true = variance * max(0.0, 1 - noise / max(variance, 1e-300))
-    squares = np.full(len(terms), true)
+    squares = np.zeros(len(terms))
     if true:
-        squares[: len(bending)] += variance * _steps_at_large(rest)
-    scatter = np.sqrt(squares / (terms**2).sum(axis=(1, 2)))
-    kept = np.nan_to_num(rest * np.sqrt(true / max(variance, 1e-300)))
-    return OffsetModel(kept, terms, scatter, ~np.isfinite(rest), true**0.5)
+        at_large = _steps_at_large(fit.rest)
+        squares[: len(at_large)] = variance * at_large
+    scatter = true * fit.covariance + np.diag(squares / (terms**2).sum(axis=(1, 2)))
+    steps = values - np.tensordot(fit.values, terms, 1) - fit.rest
+    kept = steps + fit.rest * np.sqrt(true / max(variance, 1e-300))
+    kept = np.nan_to_num(kept - np.nanmean(kept))
+    return OffsetModel(kept, terms, _root(scatter), ~np.isfinite(values), true**0.5)
+
+
+def _root(covariance: F64) -> F64:
+    """Lower triangle whose square is a covariance that may be singular."""
+    size = root_diagonal(covariance)
+    correlation = covariance / np.outer(size, size) + 1e-9 * np.eye(len(size))
+    known = np.diag(covariance) > 0
+    correlation[~known], correlation[:, ~known] = 0.0, 0.0
+    correlation[~known, ~known] = 1.0
+    return np.asarray((size * known)[:, None] * np.linalg.cholesky(correlation))
 
 
 def _steps_at_large(rest: F64) -> F64:
@@ -169,8 +212,8 @@ def _steps_at_large(rest: F64) -> F64:
     # as one over the square of the degree. The degrees from which nothing was taken tell its size.
     degree = np.array([n for n in range(_BEYOND + 1) for _ in range(n + 1)])
     terms = legendre(rest.shape, _BEYOND)
-    low, high = degree <= DEGREE, degree > DEGREE
+    low, high = (degree > 0) & (degree <= DEGREE), degree > DEGREE
     squares = fit_terms(rest, terms)[high] ** 2 * (terms[high] ** 2).sum(axis=(1, 2))
     beyond, law = squares / np.nanvar(rest) - 1, degree[high] ** -2.0
     size = max(float(beyond @ law / (law @ law)), 0.0)
-    return np.asarray(size / np.maximum(degree[low], 1) ** 2.0)
+    return np.asarray(size / degree[low] ** 2.0)

@@ -14,6 +14,7 @@ from pixcal.estimators.maps.structure import (
     flattened,
     legendre,
     smooth_surface,
+    stitched_fields,
     without_outliers,
 )
 from pixcal.kernels.sample_sums import (
@@ -135,6 +136,11 @@ class Look:
             "contrast": without_outliers(contrast / np.nanmedian(contrast) - 1),
             "light": without_outliers(light - 1),
         }
+
+    @cached_property
+    def stitched(self) -> Indices:
+        """Fields (y, x) of the foundry's stitching, as the offsets show them."""
+        return stitched_fields([self.maps["offset"]], [self.fringe_terms])
 
     @cached_property
     def flat_maps(self) -> dict[str, F64]:

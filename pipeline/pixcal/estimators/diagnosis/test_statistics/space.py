@@ -7,6 +7,7 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.test_statistics import Curve, family, statistic
 from pixcal.estimators.diagnosis.test_statistics.look import CELLS, Look, by_cell
+from pixcal.estimators.maps.stitching import FieldFit
 from pixcal.estimators.maps.structure import (
     PERIODS,
     fit_terms,
@@ -123,14 +124,14 @@ def low_orders(name: str, look: Look) -> Curve:
     """Legendre terms, over what a map as red as this one has by chance."""
     values = look.maps[name]
     terms = legendre(values.shape, 4 if name == "contrast" else 3)
-    size = fit_terms(values, terms)
-    rest = values - np.tensordot(size, terms, 1)
-    good = np.isfinite(rest)
-    variance = float(np.nanvar(rest)) * redness(rest)
-    error = np.sqrt(variance / (terms[:, good] ** 2).sum(axis=1))
+    field = look.stitched if name == "offset" else np.zeros(values.shape, np.intp)
+    fit = FieldFit.of(values, terms[1:], field)
+    variance = float(np.nanvar(fit.rest)) * redness(fit.rest)
+    error = np.sqrt(variance * np.diag(fit.covariance))
     # Two Gaussian beams make a contrast that bends in any direction, but no more than that.
     first = 3 if name != "contrast" else 6
-    return Curve(np.arange(first, len(terms), dtype=float), (size / error)[first:])
+    pulls = fit.values / np.maximum(error, 1e-300)
+    return Curve(np.arange(first, len(terms), dtype=float), pulls[first - 1 :])
 
 
 def _power_beside_lines(values: F64) -> tuple[F64, F64, F64, Mask]:

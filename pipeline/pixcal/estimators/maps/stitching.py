@@ -1,0 +1,159 @@
+"""Fields of a detector whose masks the foundry laid side by side, each off by a little.
+
+A field moves all its pixels alike, so that offsets have steps along a grid of rows and columns.
+Steps have a share in every smooth pattern, and hide what bends a map by as much. With the fields
+known, the offset of each is a free term of a fit, and the map within them tells.
+
+Lines are looked for one after the other: the score test of a step of its own size in every field
+that a line would cut, smooth terms and the fields so far left free.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.stats import chi2
+
+from pixcal.kernels.normal_matrix import inverse_normal
+from pixcal.model.arrays import F64, Indices, Mask
+
+MIN_SIDE = 4  # pixels along a side of a field, at least
+CHANCE = 1e-3  # of a line at any place of a map without steps
+_MAX_LINES = 64
+_ROUNDS = 3  # in which lines are looked for again, each beside all others
+_STEADY = 1e-6  # share of a step's information by which its normal matrix is kept regular
+
+Lines = tuple[tuple[int, ...], tuple[int, ...]]  # first row, and first column, of later fields
+
+
+def fields(maps: Sequence[F64], free: Sequence[F64]) -> Indices:
+    """Number (y, x) of the field in which each pixel lies; zeros where no steps show.
+
+    Parameters
+    ----------
+    maps : sequence of ndarray (y, x)
+        Maps of the same pixels, each with steps of its own along the same lines; NaN where there
+        is none.
+    free : sequence of ndarray (term, y, x)
+        What smooth patterns each map may have, the constant left out.
+    """
+    lines: Lines = ((), ())
+    for _ in range(_MAX_LINES):
+        more = _with_line(maps, free, lines, (0, 1))
+        if more == lines:
+            break
+        lines = more
+    for _ in range(_ROUNDS):
+        before = lines
+        # A line that was found first may be needless, or off, once all are there.
+        for axis in (0, 1):
+            for place in before[axis]:
+                others = _replaced(lines, axis, set(lines[axis]) - {place})
+                lines = _with_line(maps, free, others, (axis,))
+        if lines == before:
+            break
+    return _numbers(maps[0].shape, lines)
+
+
+def _replaced(lines: Lines, axis: int, own: Iterable[int]) -> Lines:
+    ordered = tuple(sorted(own))
+    return (ordered, lines[1]) if axis == 0 else (lines[0], ordered)
+
+
+def _with_line(
+    maps: Sequence[F64], free: Sequence[F64], lines: Lines, axes: Sequence[int]
+) -> Lines:
+    """Lines, and the best one more along some axes, where it is not by chance."""
+    field = _numbers(maps[0].shape, lines)
+    fits = [FieldFit.of(values, terms, field) for values, terms in zip(maps, free, strict=True)]
+    found = {axis: _best_line(fits, lines, axis) for axis in axes}
+    axis = min(found, key=lambda one: found[one][0])
+    log_chance, place = found[axis]
+    if log_chance > np.log(CHANCE):
+        return lines
+    return _replaced(lines, axis, {*lines[axis], place})
+
+
+def within(columns: F64, field: Indices) -> F64:
+    """Columns (pixel, n) less their means in each field (pixel,)."""
+    count = np.maximum(np.bincount(field), 1)
+    means = np.stack([np.bincount(field, own) / count for own in columns.T], axis=1)
+    return np.asarray(columns - means[field])
+
+
+def _numbers(shape: tuple[int, ...], lines: Lines) -> Indices:
+    row, column = (
+        np.searchsorted(own, np.arange(n), side="right")
+        for own, n in zip(lines, shape, strict=True)
+    )
+    return np.asarray(row[:, None] * (len(lines[1]) + 1) + column)
+
+
+@dataclass(frozen=True)
+class FieldFit:
+    """Terms fitted to a map beside an offset of each field."""
+
+    values: F64  # (term,) their coefficients,
+    covariance: F64  # (term, term) for noise of 1 a pixel
+    # (1 + term, y, x) what is left of the map, and the terms within the fields; zero where masked
+    columns: F64
+    good: Mask
+
+    @classmethod
+    def of(cls, values: F64, terms: F64, field: Indices) -> "FieldFit":
+        """Terms (term, y, x) in a map (y, x) with NaN; fields (y, x)."""
+        good = np.isfinite(values)
+        own = within(np.stack([values, *terms])[:, good].T, field[good])
+        inside, rest = own[:, 1:], own[:, 0]
+        covariance = inverse_normal(inside.T @ inside)
+        size = covariance @ (inside.T @ rest)
+        own[:, 0] = rest - inside @ size
+        columns = np.zeros((own.shape[1], *values.shape))
+        columns[:, good] = own.T
+        return cls(size, covariance, columns, good)
+
+    @property
+    def rest(self) -> F64:
+        """What is left of the map (y, x); NaN where it was."""
+        return np.where(self.good, self.columns[0], np.nan)
+
+    def turned(self) -> "FieldFit":
+        """Rows for columns."""
+        return FieldFit(self.values, self.covariance, self.columns.swapaxes(1, 2), self.good.T)
+
+    def gains(self, begin: Indices, first: int, places: Indices, last: int) -> F64:
+        """Chi-square (place,) of a line before each of some columns between two lines.
+
+        With a step of its own in each of the rows of fields that ``begin``.
+        """
+        inside = slice(first, last)
+        sums = np.add.reduceat(self.columns[:, :, inside], begin, axis=1).cumsum(axis=2)
+        count = np.add.reduceat(self.good[:, inside], begin, axis=0, dtype=float).cumsum(axis=1)
+        left, whole = count[:, places - first - 1], count[:, -1:]
+        size = left * (whole - left) / np.maximum(whole, 1)
+        step, shared = np.split(np.moveaxis(sums[:, :, places - first - 1], 2, 0), [1], axis=1)
+        normal = np.eye(len(begin)) * ((1 + _STEADY) * size.T + 1e-9)[:, None, :]
+        normal -= np.einsum("pti,tu,puj->pij", shared, self.covariance, shared)
+        right = step[:, 0, :, None]
+        variance = float(np.mean(self.columns[0][self.good] ** 2))
+        found = (right * np.linalg.solve(normal, right)).sum(axis=(1, 2))
+        return np.asarray(found / max(variance, 1e-300))
+
+
+def _best_line(fits: Sequence[FieldFit], lines: Lines, axis: int) -> tuple[float, int]:
+    """Logarithm of the chance of the best new line along an axis, and its place."""
+    begin = np.array([0, *lines[1 - axis]])
+    turned = [one.turned() if axis == 0 else one for one in fits]
+    end = turned[0].good.shape[1]
+    gains = np.full(end, -np.inf)
+    edges = [0, *lines[axis], end]
+    for first, last in pairwise(edges):
+        places = np.arange(first + MIN_SIDE, last - MIN_SIDE + 1)
+        if len(places):
+            gains[places] = sum(one.gains(begin, first, places, last) for one in turned)
+    place = int(np.argmax(gains))
+    if not np.isfinite(gains[place]):
+        return 0.0, 0
+    log_chance = float(chi2.logsf(gains[place], len(begin) * len(fits)))
+    return log_chance + float(np.log(end)), place
