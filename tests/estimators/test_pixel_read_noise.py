@@ -63,5 +63,30 @@ def test_a_noisy_pixel_stays_noisy() -> None:
     assert drawn[7, 11] == pytest.approx(10, rel=0.4)
 
 
+def test_pixels_that_are_masked_for_their_noise_are_masked_again() -> None:
+    """As many others of their true noise as were not masked in the data."""
+    rng, count = np.random.default_rng(8), 24
+    shape = (231, 227)
+    sigma = 15 * (1 + rng.exponential(0.4, shape))
+    stack = (sigma * rng.standard_normal((count, *shape))).astype(np.float32)
+
+    def kept(frames: np.ndarray) -> np.ndarray:
+        noise = frames.std(axis=0, ddof=1)
+        return noise < 2 * np.median(noise)
+
+    def tail(frames: np.ndarray) -> float:
+        noise = frames.std(axis=0, ddof=1)
+        return float(np.quantile(noise[kept(frames)] / np.median(noise), 0.99))
+
+    off = []
+    for noisy in (~kept(stack), None):
+        drawn = PixelNoise.of([stack], kept(stack), noisy=noisy).drawn(np.random.default_rng(3))
+        again = drawn * rng.standard_normal((count, *shape))
+        off.append((tail(again) / tail(stack) - 1, (~kept(again)).sum() / (~kept(stack)).sum() - 1))
+    (with_them, masked), (without, too_few) = off
+    assert abs(with_them) < 0.01 < -without
+    assert abs(masked) < 0.1 < -too_few
+
+
 def test_too_few_frames_tell_nothing() -> None:
     assert PixelNoise.of([frames(0.1, FEWEST - 1)], GOOD) is None

@@ -32,8 +32,18 @@ class PixelNoise:
     rounding: float = 0.0  # share of the variance that the converter's rounding adds
 
     @classmethod
-    def of(cls, stacks: Sequence[F32], good: Mask, rounding: float = 0.0) -> "PixelNoise | None":
-        """From frames (t, y, x) without light, ADU; None of fewer than `FEWEST` frames."""
+    def of(
+        cls,
+        stacks: Sequence[F32],
+        good: Mask,
+        rounding: float = 0.0,
+        noisy: Mask | None = None,
+    ) -> "PixelNoise | None":
+        """From frames (t, y, x) without light, ADU; None of fewer than `FEWEST` frames.
+
+        Pixels that are masked for their ``noisy`` frames alone are drawn as well: others of their
+        true noise were not masked, by chance.
+        """
         stacks = [s for s in stacks if len(s) >= 2]
         freedom = sum(len(s) - 1 for s in stacks)
         if freedom + len(stacks) < FEWEST or good.sum() < FEWEST:
@@ -43,7 +53,8 @@ class PixelNoise:
             rest = frames - frames.mean(axis=0)
             rest -= np.median(rest[:, good], axis=1)[:, None, None]
             squares += np.einsum("tyx,tyx->yx", rest, rest, dtype=float)
-        seen = np.log(np.maximum(squares / freedom, 1e-12)[good])
+        told = good if noisy is None else good | (noisy & (squares >= np.median(squares[good])))
+        seen = np.log(np.maximum(squares / freedom, 1e-12)[told])
         half = freedom / 2
         # A variance of normal samples, about its true value, in logarithms.
         bias, error = float(digamma(half) - np.log(half)), float(polygamma(1, half))
@@ -64,7 +75,7 @@ class PixelNoise:
         ordinary = np.abs(seen) <= OUTLIER * np.sqrt(max(spread, error))
         mean = float(np.mean((posterior @ np.exp(log))[bins[ordinary]]))
         binned = np.full(good.shape, -1)
-        binned[good] = bins
+        binned[told] = bins
         return cls(binned, np.cumsum(posterior, axis=1), log - np.log(mean), rounding)
 
     def drawn(self, rng: np.random.Generator) -> F32:

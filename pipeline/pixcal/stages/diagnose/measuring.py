@@ -10,6 +10,7 @@ from pixcal.estimators.detector.amplifiers import relative_gain
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.diagnosis.test_statistics.look import Look
+from pixcal.estimators.diagnosis.test_statistics.noise import jumping
 from pixcal.estimators.maps.structure import flattened, smooth_surface
 from pixcal.kernels.processes import ramp_step
 from pixcal.kernels.robust import median_and_sigma
@@ -104,7 +105,9 @@ def _pixel_noise(
     # Where frames are too few to part, every part holds the same ones.
     parts = evidence if parted("bias", halves) else evidence[:1]
     bias = [s.adu for e in parts for s in e.of_kind("bias")]
-    return PixelNoise.of(bias, good, 1 - (one.amplifier_noise / one.read_noise) ** 2)
+    # Noise that jumps between levels is an effect; white noise is the detector's own.
+    white = ~np.logical_or.reduce([jumping(frames) for frames in bias])
+    return PixelNoise.of(bias, good, 1 - (one.amplifier_noise / one.read_noise) ** 2, white)
 
 
 def parted(name: str, halves: Sequence[Half]) -> bool:

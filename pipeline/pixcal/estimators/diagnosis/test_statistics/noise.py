@@ -211,11 +211,11 @@ def read_noise(evidence: Evidence) -> Curve | None:
     # Of whole numbers a median jumps by a code.
     frames = stacks[0].adu - stacks[0].adu[:, evidence.good].mean(axis=1)[:, None, None]
     variance = np.var(frames, axis=0, ddof=1) * (evidence.gain / evidence.read_noise) ** 2
-    counted = evidence.good | _jumping(frames)
+    counted = evidence.good | jumping(frames)
     return Curve(np.array(QUANTILES), ranges_about(variance[counted], QUANTILES))
 
 
-def _jumping(frames: F32) -> Mask:
+def jumping(frames: F32) -> Mask:
     """Pixels (y, x) of frames (t, y, x) that stay at a level, or whose noise has a flat top."""
     off = frames - frames.mean(axis=0)
     square = np.maximum((off**2).mean(axis=0), np.finfo(np.float32).tiny)
