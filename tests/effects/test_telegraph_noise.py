@@ -206,7 +206,26 @@ def test_what_looks_like_it_is_not_taken_for_it(
     assert found.significance < 4
 
 
-def test_noise_below_a_step_of_the_converter_says_nothing(
+@pytest.mark.parametrize("steps", [0.5, 0.73])
+def test_it_is_found_in_noise_of_less_than_a_step_of_the_converter(
+    acquired: Callable[..., Evidence], steps: float
+) -> None:
+    """Rows have noise of their own, too; without jumps nothing is found."""
+    coarse = {"detector.gain_e_per_adu": 16.0 / steps, "frames.darks": []}
+    effects = {"row_noise": {}}
+    nothing = TelegraphNoise.estimate(acquired(coarse, effects))
+    assert nothing is not None
+    assert nothing.significance < 4
+    truth = {"share": 0.03, "amplitude_e": 90.0}
+    found = TelegraphNoise.estimate(acquired(coarse, {**effects, "telegraph_noise": truth}))
+    assert found is not None
+    assert found.significance > 5
+    for name, value in truth.items():
+        error = found.errors[name]
+        assert abs(getattr(found.effect, name) - value) < 4 * error < 1.2 * value, name
+
+
+def test_noise_far_below_a_step_of_the_converter_says_nothing(
     acquired: Callable[..., Evidence],
 ) -> None:
     evidence = acquired()

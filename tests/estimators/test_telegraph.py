@@ -12,7 +12,7 @@ from pixcal.estimators.detector.telegraph.dwell import LitSeries, find_stays
 from pixcal.estimators.detector.telegraph.find import find_telegraph
 from pixcal.estimators.detector.telegraph.levels import find_upper, own_levels
 from pixcal.estimators.detector.telegraph.moments import QUIET, Series, moments_of, thinned
-from pixcal.model.arrays import Indices
+from pixcal.model.arrays import F64, Indices
 
 PERIOD_S = 0.14
 
@@ -137,21 +137,46 @@ def test_quiet_pixels_stand_for_those_left_out() -> None:
     assert abs(some.stands_for @ some.variance - whole.variance.sum()) < 4 * error
 
 
-@pytest.mark.parametrize(("time_s", "decades"), [(0.3, 0.0), (1.5, 0.0), (0.9, 1.5)])
-def test_frames_of_fringes_tell_how_long_pixels_stay(time_s: float, decades: float) -> None:
-    """Also where the few frames by which they were chosen let those that stay long go unseen."""
+def lit_series(
+    charge: F64, weight: F64 | float, pixels: Indices, fitted: F64 | None = None
+) -> LitSeries:
+    """Charge (t, n) less what fits of functions of time (t, k), or of a mean, take up."""
+    weight = np.broadcast_to(weight, charge.shape)
+    of_time = np.ones((len(charge), 1)) if fitted is None else fitted
+    root = np.sqrt(weight)
+    rest = np.empty_like(charge)
+    for n in range(charge.shape[1]):
+        (found, *_) = np.linalg.lstsq(root[:, n, None] * of_time, root[:, n] * charge[:, n])
+        rest[:, n] = charge[:, n] - of_time @ found
+    return LitSeries(rest, weight, np.arange(len(charge)), PERIOD_S, pixels, of_time)
+
+
+@pytest.mark.parametrize(
+    ("time_s", "decades", "noisier"),
+    [(0.3, 0.0, 9.0), (1.5, 0.0, 9.0), (0.9, 1.5, 9.0), (0.3, 0.0, 20.0), (1.5, 0.0, 20.0)],
+)
+def test_frames_of_fringes_tell_how_long_pixels_stay(
+    time_s: float, decades: float, noisier: float
+) -> None:
+    """Also where the few frames by which they were chosen let those that stay long go unseen.
+
+    And where the fit of fringes of four phases takes up much of the light's own noise.
+    """
     rng = np.random.default_rng(5)
     dark, bright = jumping(rng, 1.0, 8.0, time_s, decades, (21, 311), 420, tail=0.3)
     for quiet in (dark, bright):
         quiet.noise[:, 400:] = rng.standard_normal((len(quiet.noise), 20))
-    noisier = 9.0  # the light's own noise, over that of the dark frames
-    charge = bright.noise + rng.normal(0, noisier, bright.noise.shape)
-    weight = np.full(charge.shape, 1 / (1 + noisier**2))
+    # The light's own noise, over that of the dark frames: the brighter, the more.
+    phase = np.pi / 2 * (np.arange(311) % 4)[:, None]
+    sigma = noisier * np.sqrt(1 + 0.5 * np.cos(phase + 6 * rng.random(420)))
+    charge = bright.noise + sigma * rng.standard_normal(bright.noise.shape)
+    weight = 1 / (1 + sigma**2)
+    fitted = np.hstack([np.ones((311, 1)), np.cos(phase), np.sin(phase)])
     seen = moments_of(with_quiet(dark, rng))
     assert seen is not None
     chosen = seen.pixel[seen.excess > 0]
     chosen = chosen[chosen < 400]
-    lit = LitSeries(charge[:, chosen], weight[:, chosen], bright.frame, PERIOD_S, chosen)
+    lit = lit_series(charge[:, chosen], weight[:, chosen], chosen, fitted)
     found = find_stays([lit], seen)
     assert found is not None
     stays, error = found
@@ -167,8 +192,7 @@ def test_frames_of_fringes_tell_how_much_of_the_time_pixels_are_in_the_upper_lev
     (bright,) = jumping(rng, 1.0, 12.0, 0.3, 0.0, (311,), 200, tail=0.3, upper=upper)
     noisier = rng.uniform(3.0, 9.0, bright.noise.shape)
     charge = bright.noise + noisier * rng.standard_normal(noisier.shape)
-    charge -= charge.mean(axis=0)
-    lit = LitSeries(charge, 1 / (1 + noisier**2), bright.frame, PERIOD_S, np.arange(200))
+    lit = lit_series(charge, 1 / (1 + noisier**2), np.arange(200))
     assert find_upper([lit], 1.0) == pytest.approx(upper, rel=0.15)
     # Another set may lack some of the pixels.
     fewer = replace(lit, charge=lit.charge[:, 7:], weight=lit.weight[:, 7:], pixel=lit.pixel[7:])
@@ -188,9 +212,7 @@ def test_levels_of_single_pixels_are_those_that_they_have() -> None:
         if frames == 40:
             up[:, 70:80] = False  # they stayed in the lower one
         x = up * amplitude + noise * rng.standard_normal(up.shape)
-        x -= x.mean(axis=0)
-        pixels = 3 * np.arange(len(amplitude))
-        series.append(LitSeries(x, np.full(x.shape, noise**-2), np.arange(frames), 0.14, pixels))
+        series.append(lit_series(x, noise**-2, 3 * np.arange(len(amplitude))))
     lacking = replace(
         series[2], charge=series[2].charge[:, 5:], weight=series[2].weight[:, 5:],
         pixel=series[2].pixel[5:],
@@ -216,8 +238,7 @@ def test_pixels_that_are_rarely_in_the_upper_level_are_counted() -> None:
     charge = bright.noise + 6 * rng.standard_normal(bright.noise.shape)
 
     def lit(pixels: Indices) -> list[LitSeries]:
-        own = charge[:, pixels]
-        return [LitSeries(own, np.full(own.shape, 1 / 37), bright.frame, PERIOD_S, pixels)]
+        return [lit_series(charge[:, pixels], 1 / 37, pixels)]
 
     found = find_telegraph([dark], lit)
     assert found is not None
@@ -232,8 +253,7 @@ def test_noise_without_jumps_tells_no_stays() -> None:
     seen = moments_of(dark)
     assert seen is not None
     charge = rng.standard_normal((307, 60))
-    series = LitSeries(charge, np.ones((307, 60)), np.arange(307), 0.14, np.arange(60))
-    assert find_stays([series], seen) is None
+    assert find_stays([lit_series(charge, 1.0, np.arange(60))], seen) is None
     assert find_stays([], seen) is None
 
 

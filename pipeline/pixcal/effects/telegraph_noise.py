@@ -11,7 +11,7 @@ from pixcal.estimators.detector.telegraph.dwell import LitSeries
 from pixcal.estimators.detector.telegraph.find import Telegraph, find_telegraph, significance
 from pixcal.estimators.detector.telegraph.moments import Series
 from pixcal.estimators.diagnosis.distortions import Freedom
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.diagnosis.evidence import DITHER, Evidence, FringeEvidence, Stack
 from pixcal.kernels.scene import TILE, chip_map
 from pixcal.kernels.synthesis import BLOCK_ROWS
 from pixcal.model.arrays import F32, F64, U8, Indices
@@ -24,7 +24,6 @@ HARMONICS = 5  # of the phase that are taken out of fringe residuals before they
 LIT_HARMONICS = 1  # of pixels that are known to jump
 _MIN_FRAMES = 10
 _ENOUGH = 20
-_MIN_NOISE_ADU = 0.8
 _HOT = 4.0
 _WIDE = 16
 _FRAMES_AT_ONCE = 256
@@ -264,15 +263,16 @@ def _of_stack(stack: Stack, evidence: Evidence) -> Series | None:
     seconds = float(np.nan_to_num(stack.exptime_s))
     dark = np.maximum(evidence.dark_rate, 0) * seconds
     pixels = (dark < _HOT * evidence.read_noise**2) & (stack.adu < evidence.saturation_adu).all(0)
-    rest = (stack.adu - np.median(stack.adu, axis=0)).astype(float)
+    # Medians of a few steps of the converter are steps too, and hide what rows have in common.
+    rest = (stack.adu - stack.adu.mean(axis=0)).astype(float)
     wide = rest.shape[2] >= _WIDE
     rest -= np.median(rest, axis=2 if wide else (1, 2), keepdims=True)
     rest = rest[:, pixels] * evidence.gain
     if rest.shape[1] < _ENOUGH:
         return None
-    spread = 1.4826 * float(np.median(np.abs(rest)))
-    if spread < _MIN_NOISE_ADU * evidence.gain:
-        # Of noise below a step of the converter the shape is that of the steps.
+    spread = float(np.sqrt(np.median(rest.var(axis=0, ddof=1))))
+    if spread**2 < (DITHER**2 + 1 / 12) * (evidence.gain * evidence.step_adu) ** 2:
+        # Of noise far below a step of the converter the shape is that of the steps.
         return None
     return Series(
         rest / spread, stack.frame, np.flatnonzero(pixels), spread,
@@ -293,7 +293,8 @@ def _lit(evidence: Evidence, pixels: Indices) -> list[LitSeries]:
         charge = np.where(freedom.weight > 0, left, 0.0).astype(float)
         period = _period(fringes.time_s) if len(fringes.time_s) > 1 else 0.0
         weight = freedom.weight.astype(float)
-        found.append(LitSeries(charge, weight, fringes.frame, period, np.flatnonzero(own)))
+        fitted = freedom.of_time.T.astype(float)
+        found.append(LitSeries(charge, weight, fringes.frame, period, np.flatnonzero(own), fitted))
     return found
 
 

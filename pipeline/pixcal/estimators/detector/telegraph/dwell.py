@@ -36,6 +36,7 @@ class LitSeries:
     frame: Indices  # (t,) numbers of the frames
     period_s: float
     pixel: Indices  # (n,) which pixels
+    fitted: F64  # (t, k) functions of time that were fitted to each pixel, with its weights
 
 
 def find_stays(
@@ -105,10 +106,16 @@ def _products(series: LitSeries) -> tuple[F64, F64]:
     noise = series.charge * root
     shape = len(LAGS), noise.shape[1]
     sums, weights = np.full(shape, np.nan), np.full(shape, np.nan)
+    # White noise less what was fitted to it is unlike itself from frame to frame: of its
+    # covariance, times the weights, this is missing.
+    fitted = (root[:, None] * series.fitted[:, :, None]).astype(float)
+    normal = np.einsum("tkn,tln->nkl", fitted, fitted)
+    taken = np.einsum("nkl,tln->tkn", np.linalg.pinv(normal, hermitian=True), fitted)
     for n, lag in enumerate(LAGS):
         later = np.flatnonzero(follows(series.frame, int(lag)))
         if len(later) >= _FEWEST_PAIRS:
-            sums[n] = (noise[later] * noise[later - lag]).mean(axis=0)
+            missing = np.einsum("tkn,tkn->n", fitted[later], taken[later - lag]) / len(later)
+            sums[n] = (noise[later] * noise[later - lag]).mean(axis=0) + missing
             weights[n] = (root[later] * root[later - lag]).mean(axis=0)
     return sums, weights
 

@@ -128,7 +128,8 @@ def _in_the_dark(own: Series, pixels: Indices) -> LitSeries:
     noise = np.nan_to_num(own.noise[:, some]) * own.sigma
     noise -= noise.mean(axis=0)
     weight = np.full(noise.shape, own.sigma**-2)
-    return LitSeries(noise, weight, own.frame, own.period_s, own.pixel[some])
+    mean = np.ones((len(noise), 1))
+    return LitSeries(noise, weight, own.frame, own.period_s, own.pixel[some], mean)
 
 
 def _single(
