@@ -412,6 +412,18 @@ def test_of_two_that_gain_alike_the_one_that_does_so_by_its_law_is_taken(curve: 
     assert found.alike == {"left": ("other",)}
 
 
+def test_a_law_is_taken_that_is_likelier_than_the_curve_that_was_measured() -> None:
+    """Errors of a curve add up to a difference that the law does not have."""
+    curve, law = Toy("left, measured", 0.03), Toy("left", 0.0301)
+    for way in (curve, law):
+        object.__setattr__(way, "name", "left")
+    left = Candidate("left", Estimate(curve, {}, 50.0, "told", law="a good one", by_law=law))
+    for true, taken in (("left", law), ("left, measured", curve)):
+        found, rest = search({true: 0.03}, [replace(left)])
+        assert found.final.effects == (taken,)
+        assert rest < 0.05
+
+
 def test_of_a_vague_law_and_its_replay_the_one_that_leaves_less_of_the_gap_is_taken() -> None:
     data = REFERENCE.on_scale(curves((), 500, {"left": 0.03}))
     judged = Comparison(REFERENCE, data)

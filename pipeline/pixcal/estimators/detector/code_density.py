@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.sparse import csc_array, csr_array, diags_array
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu
 from scipy.special import log_ndtr
 
 from pixcal.model.arrays import F64, I64, Mask
@@ -48,9 +48,8 @@ MIN_NOISE = 1.4
 _SPLITS, _CLEAR, _EVEN = (0.03, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75), 25.0, 0.05
 _WIDTH_FITS = 12  # of widths whose variances are found by the fit before
 _FEW = 0.15  # median over mean square of the widths (0.45 if normal) below which few are uneven
+_FLOOR = 0.01  # least variance of a width, of that of chance, for how likely it is
 _TOLD = 4.0  # median square of the widths over that of chance, above which most are uneven
-_SLOW = 101  # codes over which widths add up to nothing, of thresholds displaced each by itself
-_MANY = 0.02  # share of codes off by more than half a code, above which wrong bits are not why
 LOWEST_RIPPLE = 1 / 16  # turns a code
 
 
@@ -256,10 +255,36 @@ class CodeWidths:
     def measured(self) -> F64:
         """The true width of every code from 0 on, less one.
 
-        What a local fit takes of the widths is given back as far as thresholds explain it that are
-        displaced, each by itself. Where few codes are uneven, each width has a variance of its own
-        instead, which is as large as it is found to be (Tipping 2001, sparse Bayesian learning,
-        without the posterior variances).
+        What a local fit takes of the widths is given back as far as codes explain it that are wide
+        or narrow, each by itself, or thresholds that are displaced, which leave the response where
+        it is: such as those beside codes that are left out. Where few codes are uneven, the
+        likelier of both is taken: a reference that is off widens one code, and displaces all
+        thresholds up to the next one.
+        """
+        square = self.width**2
+        few = float(np.median(square)) < _FEW * float(np.mean(square))
+        few |= float(np.median(square / self.variance)) < _TOLD
+        found, unlikely = self._measured(displaced=True, few=few)
+        if few:
+            wide, unlikely_so = self._measured(displaced=False, few=True)
+            if unlikely_so < unlikely:
+                # A slope is a gain.
+                above = np.arange(len(wide)) >= self.number[0]
+                for _ in range(_WIDTH_FITS):
+                    wide = np.maximum(wide - wide[self.number].mean() * above, -1)
+                return wide
+        # A code that begins after a higher one is never reached.
+        ends = np.arange(1, len(found) + 1) + np.cumsum(found)
+        ends = np.maximum(np.minimum.accumulate(ends[::-1])[::-1], 0)
+        return np.diff(ends, prepend=0) - 1
+
+    def _measured(self, displaced: bool, few: bool) -> tuple[F64, float]:
+        """Widths of all codes, less one, and how unlikely such are.
+
+        By thresholds that are ``displaced``, or by codes that are wide or narrow. Where these are
+        ``few``, each has a variance of its own, which is as large as it is found to be (Tipping
+        2001, sparse Bayesian learning, without the posterior variances). How unlikely: minus twice
+        the logarithm of the marginal likelihood.
         """
         top = int(self.number[-1]) + 1
         half = len(self.kernel) // 2
@@ -268,34 +293,27 @@ class CodeWidths:
         there = diags_array(np.where(self.gap[:top], 0.0, 1.0))
         gaps = diags_array(np.where(self.gap[:top], 1.0, 0.0))
         design = diags_array(bands, offsets=range(-half, half + 1), shape=(top, top)) @ there + gaps
-        square = self.width**2
-        few = float(np.median(square)) < _FEW * float(np.mean(square))
-        few |= float(np.median(square / self.variance)) < _TOLD
-        ends = [-np.ones(top), (0.0 if few else 1.0) * np.ones(top - 1)]
+        ends = [-np.ones(top), (1.0 if displaced else 0.0) * np.ones(top - 1)]
         widths_of = csr_array(diags_array(ends, offsets=[0, 1], shape=(top, top)))
         design = csr_array(design @ widths_of)[self.number]
         weight = diags_array(1 / self.variance)
         normal, data = design.T @ weight @ design, self.width
-        own = np.full(top, float(np.mean(square)) * (1.0 if few else 0.5))
+        chance = float(np.median(self.variance))
+        own = np.full(top, float(np.mean(self.width**2)) * (0.5 if displaced else 1.0))
+        evidence = design.T @ weight
         for _ in range(_WIDTH_FITS):
-            right = design.T @ (weight @ data)
-            solved = spsolve(csc_array(normal + diags_array(1 / own)), right)
+            solved = splu(csc_array(normal + diags_array(1 / own))).solve(evidence @ data)
             found = widths_of @ solved
             if few:
-                own = found**2 + float(np.median(self.variance))
+                own = solved**2 + chance
             raised = self._raised(np.where(self.gap[:top], 0.0, found))
             data = self.width * np.where(self.gap[:top], 1.0, raised)[self.number]
-        if few and float(np.mean(np.abs(found[self.number]) > 0.5)) > _MANY:
-            # Codes that are left out go to those beside them: thresholds stay where they are.
-            displaced = np.cumsum(found)
-            displaced -= uniform_filter1d(displaced, _SLOW)
-            found = np.maximum(np.diff(displaced, prepend=0), -1)
-            return found - np.where(found > -1, found.sum() / np.count_nonzero(found > -1), 0.0)
-        # A slope is a gain; thresholds that are displaced each by itself do not wander either.
-        for _ in range(_WIDTH_FITS):
-            slow = found[self.number].mean() if few else uniform_filter1d(found, _SLOW)
-            found = np.maximum(np.where(np.arange(top) < self.number[0], found, found - slow), -1)
-        return np.asarray(found)
+        own = solved**2 + _FLOOR * chance
+        factors = splu(csc_array(normal + diags_array(1 / own)))
+        likeliest = factors.solve(evidence @ data)
+        determinant = np.log(own).sum() + np.log(np.abs(factors.U.diagonal())).sum()
+        misfit = data @ (weight @ data) - likeliest @ (evidence @ data)
+        return found, float(misfit + determinant)
 
     @property
     def uneven_above(self) -> bool:

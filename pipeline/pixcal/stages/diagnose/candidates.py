@@ -45,13 +45,13 @@ class Candidate:
         return None if self.estimate is None else self.estimate.by_law
 
     def variants(self, share: float) -> list[Effect]:
-        """Effects to simulate: as estimated, with sure parameters alone, scaled down, replayed.
+        """Effects to simulate: as estimated, sure parameters alone, by law, scaled down, replayed.
 
         ``share``: fraction of its significance that the causes before it do not produce.
         """
         assert self.estimate is not None
         whole, sure = self.estimate.effect, self.estimate.sure
-        ways = [whole, *([sure] if sure != whole else [])]
+        ways = [whole, *([sure] if sure != whole else []), *([self.law] if self.law else [])]
         if share < NEARLY_ALL:
             ways += [way.scaled(share) for way in ways]
         if self.replay is not None:
