@@ -1,4 +1,4 @@
-"""Photon transfer: noise against level from pairs of frames, and the gain from its slope.
+"""Photon transfer: noise against level, from pairs of frames. `gain_fit` takes the gain from it.
 
 The difference of two frames of the same scene holds no scene and no response map, only noise. Half
 its variance, in ADU, is ``level / gain + read_variance``. It is measured in blocks of pixels, whose

@@ -153,7 +153,8 @@ class _Lit:
         """What a model does to the maps (3, y, x)."""
         own, light = model.light(self.light, self.recording, self.rows, self.maps), self.light
         found = np.zeros((3, *light.mean.shape))
-        found[0] = np.log(np.maximum(own.mean / light.mean, 1e-9))
+        lit = np.where(light.mean > 0, light.mean, np.inf)
+        found[0] = np.log(np.maximum(own.mean / lit, 1e-9))
         found[1] = -found[0]
         if own.beams is not light.beams:
             ratio = own.phasor / np.where(light.phasor == 0, 1e-9, light.phasor)

@@ -92,5 +92,6 @@ def contrast_surface(theta: F64, good: Mask) -> F64:
     """Contrast (y, x) of a fit's maps as two Gaussian beams can make it over a window."""
     alpha = np.hypot(*theta[1:])
     used = good & (alpha > 0) & (theta[0] > 0)
-    log = np.where(used, np.log(np.where(used, alpha / theta[0], 1.0)), np.nan)
+    contrast = np.divide(alpha, theta[0], out=np.full_like(alpha, np.nan), where=used)
+    log = np.log(contrast)
     return np.asarray(np.exp(smooth_surface(log, used, TWO_BEAMS)))

@@ -189,11 +189,11 @@ def _candidates(
 
 
 def _needs(kind: type[Effect], facts: FramesUsed) -> str:
-    """Frames without which an effect cannot be estimated."""
+    """Why these frames give no estimate of an effect, and which would."""
     frames = [words for name, words in facts.missing_frames.items() if name in kind.frames_needed]
     if not frames:
         frames = [MORE if facts.sets else "fringes"]
-    return f"needs frames that this acquisition lacks: {' or '.join(frames)}"
+    return f"these frames give no estimate; {' or '.join(frames)} would help"
 
 
 def _replayed(candidate: Candidate, unseen: Evidence) -> Effect | None:

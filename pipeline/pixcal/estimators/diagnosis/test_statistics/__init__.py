@@ -1,4 +1,4 @@
-"""What data and simulation are compared by: curves of statistics, one file for each domain.
+"""What data and simulation are compared by: curves of statistics, by domain or by kind of frame.
 
 A statistic is a function of an acquisition's evidence, marked by `statistic`; all that the files
 here hold are found by `test_statistics`. It gives a short curve: values that mean the same in every

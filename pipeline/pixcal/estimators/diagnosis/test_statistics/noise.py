@@ -23,6 +23,7 @@ from pixcal.model.arrays import F32, F64, Mask
 MIN_DARKS = 5
 CUT_OFF = 1e-3  # share of samples at code zero from which noise is cut off
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
+STILL = 1e-12  # ADU²: variance of pixels that do not change, whose square float32 still holds
 
 
 @statistic(
@@ -218,7 +219,7 @@ def read_noise(evidence: Evidence) -> Curve | None:
 def jumping(frames: F32) -> Mask:
     """Pixels (y, x) of frames (t, y, x) that stay at a level, or whose noise has a flat top."""
     off = frames - frames.mean(axis=0)
-    square = np.maximum((off**2).mean(axis=0), np.finfo(np.float32).tiny)
+    square = np.maximum((off**2).mean(axis=0), STILL)
     steps = (np.diff(off, axis=0) ** 2).mean(axis=0) / (2 * square)
     peak = (off**4).mean(axis=0) / square**2 - 3
     error = 1 / np.sqrt(len(frames))
