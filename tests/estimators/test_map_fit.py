@@ -44,3 +44,18 @@ def test_curvature_is_found_with_its_error() -> None:
         found = fit_maps([MapPart.of(CURVATURE, data, polynomial(GOOD.shape, 1), GOOD)])
         pulls.append((found.values - truth) / np.sqrt(np.diag(found.covariance)))
     assert 0.7 < np.std(pulls) < 1.2
+
+
+def test_pixels_that_stand_out_do_not_count() -> None:
+    rng, truth = np.random.default_rng(10), np.array([0.2, -0.1])
+    data = offsets(rng, 0) + np.tensordot(truth, CURVATURE, 1)
+    wild = data.copy()
+    wild[3, 90], wild[70, 8] = 1e4, -7e3
+    free = polynomial(GOOD.shape, 1)
+    without = GOOD.copy()
+    without[3, 90] = without[70, 8] = False
+    part, expected = (
+        MapPart.of(CURVATURE, one, free, good) for one, good in ((wild, GOOD), (data, without))
+    )
+    assert np.abs(part.data).max() < 6
+    np.testing.assert_allclose(fit_maps([part]).values, fit_maps([expected]).values, rtol=1e-6)

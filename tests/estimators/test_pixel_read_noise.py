@@ -88,5 +88,19 @@ def test_pixels_that_are_masked_for_their_noise_are_masked_again() -> None:
     assert abs(masked) < 0.1 < -too_few
 
 
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_pixels_masked_for_other_reasons_do_not_change_the_noise_of_good_ones(share: float) -> None:
+    rng = np.random.default_rng(4)
+    shape = (151, 149)
+    sigma = 15 * rng.lognormal(0, 0.1, shape)
+    stack = (sigma * rng.standard_normal((24, *shape))).astype(np.float32)
+    good = rng.random(shape) > share
+    one, other = (
+        PixelNoise.of([stack], good, noisy=noisy).drawn(np.random.default_rng(3))[good]
+        for noisy in (~good, None)
+    )
+    assert np.mean(one**2) == pytest.approx(np.mean(other**2), rel=2e-3)
+
+
 def test_too_few_frames_tell_nothing() -> None:
     assert PixelNoise.of([frames(0.1, FEWEST - 1)], GOOD) is None

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from pixcal.estimators.maps.map_fit import MapPart, fit_maps, polynomial
 from pixcal.estimators.maps.stitching import FieldFit, fields
@@ -92,3 +93,42 @@ def test_curvature_beside_fields_has_the_error_that_is_told() -> None:
         ratios.append(np.diag(one.covariance) / np.diag(other.covariance))
     assert np.std(pulls) == pytest.approx(1, abs=0.25)
     assert np.sqrt(np.median(ratios)) < 0.7
+
+
+def blurred(values: np.ndarray) -> np.ndarray:
+    return gaussian_filter(values, 0.7, mode="wrap")
+
+
+PATTERNS = {
+    "alike neighbours": lambda y, x, rng: blurred(rng.standard_normal(SHAPE)) * 2.5,
+    "short wave": lambda y, x, rng: rng.standard_normal(SHAPE) + 0.5 * np.cos(2 * np.pi * x / 20),
+    "long wave": lambda y, x, rng: rng.standard_normal(SHAPE) + np.cos(2 * np.pi * x / 40),
+    "columns": lambda y, x, rng: rng.standard_normal(SHAPE) + 0.3 * rng.standard_normal(SHAPE[1]),
+}
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_other_patterns_are_no_fields(pattern: str) -> None:
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    none = np.zeros((0, *SHAPE))
+    one = [
+        not stitched_fields(
+            [NOISE * PATTERNS[pattern](y, x, np.random.default_rng(seed))], [none]
+        ).any()
+        for seed in range(12)
+    ]
+    assert np.mean(one) > 0.8
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_fields_are_kept_where_there_is_no_pattern(seed: int) -> None:
+    assert stitched_fields([stitched(seed)], [np.zeros((0, *SHAPE))]).any()
+
+
+def test_masked_pixels_have_the_offset_of_their_field() -> None:
+    terms, values = legendre(SHAPE, 3)[1:], stitched(6)
+    masked = values.copy()
+    masked[3:9, 40:60] = np.nan
+    fit, whole = (FieldFit.of(one, terms, numbers()) for one in (masked, values))
+    np.testing.assert_allclose(fit.steps, whole.steps, atol=5 * NOISE / 20)
+    assert whole.variance == pytest.approx(NOISE**2, rel=0.05)

@@ -115,7 +115,7 @@ def test_bad_pixels_do_not_matter() -> None:
     holes[::7, ::5] = np.nan
     found = true_offsets(holes, np.zeros(SHAPE), plane())
     assert np.isfinite(found.kept).all()
-    assert not found.kept[::7, ::5].any()
+    assert np.abs(found.kept[::7, ::5]).max() < 1e-15
     # In a simulation they are pixels like all others.
     drawn = found.drawn(np.random.default_rng(8))[::7, ::5]
     assert drawn.std() == pytest.approx(np.nanstd(holes), rel=4 / np.sqrt(2 * drawn.size))

@@ -33,6 +33,7 @@ from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import set_recordings
 
 CLIP = 8.0  # medians of the differences of pixels side by side, beyond which they do not count
+SAME = 0.98  # cosine of the angle below which two sets measure along one axis
 KINDS = ("the mean light", "the visibility", "the phase")
 PHASE = KINDS.index("the phase")
 MIN_PIXELS, MIN_SIDE = 200, 9
@@ -185,20 +186,30 @@ def _bent(turn: C128) -> F64:
 
 def _lit(evidence: Evidence) -> list[_Lit]:
     recordings = set_recordings(evidence)
-    lit = [
-        _Lit.of(found, recordings[name])
+    large = {
+        name: found
         for name, found in evidence.fringes.items()
         if np.count_nonzero(found.good) > MIN_PIXELS and min(found.good.shape) >= MIN_SIDE
-    ]
-    # All sets of an evidence look at the same pixels.
-    stitched = _stitched(lit) if lit else None
+    }
+    lit = [_Lit.of(found, recordings[name]) for name, found in large.items()]
+    stitched = _stitched(lit, [found.k for found in large.values()]) if lit else None
     return [replace(one, stitched=stitched) for one in lit]
 
 
-def _stitched(lit: Sequence[_Lit]) -> Indices | None:
+def _stitched(lit: Sequence[_Lit], vectors: Sequence[tuple[float, float]]) -> Indices | None:
     """Fields (y, x) of the foundry's stitching in the phases of all sets; None without any."""
-    maps = [without_outliers(np.where(one.good, one.data[PHASE], np.nan)) for one in lit]
-    field = stitched_fields(maps, [one.gauge for one in lit])
+    # Sets along one axis see the same offsets, whose scatter is most of the noise: their mean.
+    axes: dict[tuple[float, ...], list[tuple[float, _Lit]]] = {}
+    for one, vector in zip(lit, np.array(vectors), strict=True):
+        unit = vector / np.linalg.norm(vector)
+        own = next((a for a in axes if abs(float(unit @ a)) > SAME), tuple(unit))
+        axes.setdefault(own, []).append((float(vector @ own), one))
+    maps, gauges = [], []
+    for sets in axes.values():
+        offsets = [np.where(one.good, one.data[PHASE], np.nan) / k for k, one in sets]
+        maps.append(without_outliers(np.mean(offsets, axis=0)))
+        gauges.append(np.concatenate([one.gauge for _, one in sets]))
+    field = stitched_fields(maps, gauges)
     return field if field.any() else None
 
 

@@ -257,8 +257,8 @@ class CodeWidths:
 
         What a local fit takes of the widths is given back as far as codes explain it that are wide
         or narrow, each by itself, or thresholds that are displaced, which leave the response where
-        it is: such as those beside codes that are left out. Where few codes are uneven, the
-        likelier of both is taken: a reference that is off widens one code, and displaces all
+        it is: such as those beside codes that are left out. Where few codes are uneven, both are
+        tried and the likelier is taken: a reference that is off widens one code, and displaces all
         thresholds up to the next one.
         """
         square = self.width**2
@@ -307,9 +307,13 @@ class CodeWidths:
             if few:
                 own = solved**2 + chance
             raised = self._raised(np.where(self.gap[:top], 0.0, found))
-            data = self.width * np.where(self.gap[:top], 1.0, raised)[self.number]
+            raised = np.where(self.gap[:top], 1.0, raised)[self.number]
+            data = self.width * raised
+        # Of the counts, which were raised to make the data.
         own = solved**2 + _FLOOR * chance
-        factors = splu(csc_array(normal + diags_array(1 / own)))
+        weight = diags_array(1 / (self.variance * raised**2))
+        evidence = design.T @ weight
+        factors = splu(csc_array(evidence @ design + diags_array(1 / own)))
         likeliest = factors.solve(evidence @ data)
         determinant = np.log(own).sum() + np.log(np.abs(factors.U.diagonal())).sum()
         misfit = data @ (weight @ data) - likeliest @ (evidence @ data)

@@ -41,8 +41,8 @@ class PixelNoise:
     ) -> "PixelNoise | None":
         """From frames (t, y, x) without light, ADU; None of fewer than `FEWEST` frames.
 
-        Pixels that are masked for their ``noisy`` frames alone are drawn as well: others of their
-        true noise were not masked, by chance.
+        Of masked pixels those are drawn that are ``noisy``, and clearly so: others of their true
+        noise were not masked, by chance.
         """
         stacks = [s for s in stacks if len(s) >= 2]
         freedom = sum(len(s) - 1 for s in stacks)
@@ -53,14 +53,17 @@ class PixelNoise:
             rest = frames - frames.mean(axis=0)
             rest -= np.median(rest[:, good], axis=1)[:, None, None]
             squares += np.einsum("tyx,tyx->yx", rest, rest, dtype=float)
-        told = good if noisy is None else good | (noisy & (squares >= np.median(squares[good])))
+        told = good
+        if noisy is not None:
+            loud = 1 + OUTLIER * np.sqrt(2 / freedom)
+            told = good | (noisy & (squares > loud * np.median(squares[good])))
         seen = np.log(np.maximum(squares / freedom, 1e-12)[told])
         half = freedom / 2
         # A variance of normal samples, about its true value, in logarithms.
         bias, error = float(digamma(half) - np.log(half)), float(polygamma(1, half))
-        middle = float(np.median(seen))
-        seen -= middle
-        spread = (1.4826 * float(np.median(np.abs(seen)))) ** 2
+        own = good[told]
+        seen -= float(np.median(seen[own]))
+        spread = (1.4826 * float(np.median(np.abs(seen[own])))) ** 2
         step = max(np.sqrt(error) / FINENESS, float(np.ptp(seen)) / (MOST - 3))
         log = np.arange(np.floor(seen.min() / step) - 1, np.ceil(seen.max() / step) + 2) * step
         # The bins of measured variances lie about the points of the grid.
@@ -72,7 +75,7 @@ class PixelNoise:
         start = (1 - BROAD) * start / start.sum() + BROAD / len(log)
         posterior = chance * _likeliest(chance, np.bincount(bins, minlength=len(log)), start)
         posterior /= posterior.sum(axis=1, keepdims=True)
-        ordinary = np.abs(seen) <= OUTLIER * np.sqrt(max(spread, error))
+        ordinary = own & (np.abs(seen) <= OUTLIER * np.sqrt(max(spread, error)))
         mean = float(np.mean((posterior @ np.exp(log))[bins[ordinary]]))
         binned = np.full(good.shape, -1)
         binned[told] = bins

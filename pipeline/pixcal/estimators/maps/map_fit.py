@@ -30,7 +30,7 @@ class MapPart:
     signals: F64  # (pixel, n) what one unit of each parameter does to the map
     data: F64  # (pixel,)
     blocks: Indices  # (size, pixel) number of the block that a pixel lies in
-    dof: int  # pixels less the terms that were taken off
+    dof: int  # pixels less the terms and the fields that were taken off
 
     @classmethod
     def of(
@@ -44,7 +44,7 @@ class MapPart:
         terms, values = _taken(free, at), data.ravel()[at]
         for _ in range(2):
             left = _left(values[:, None], terms.T, at, field)[:, 0]
-            centre = median(left)
+            centre = median(left.copy())
             kept = np.abs(left - centre) <= _CLIP * 1.4826 * median(np.abs(left - centre))
             if kept.all():
                 break
@@ -54,9 +54,9 @@ class MapPart:
         y, x = np.divmod(at, good.shape[1])
         sides = [*CELLS, max(min(good.shape) // 4, 1)]
         blocks = np.stack([(y // n) * (good.shape[1] // n + 1) + x // n for n in sides])
-        return cls(
-            np.ascontiguousarray(rest[:, :-1]), rest[:, -1].copy(), blocks, len(at) - len(free)
-        )
+        steps = 0 if field is None else len(np.unique(field.ravel()[at])) - 1
+        dof = len(at) - len(free) - steps
+        return cls(np.ascontiguousarray(rest[:, :-1]), rest[:, -1].copy(), blocks, dof)
 
 
 def _left(columns: F64, free: F64, at: Indices, field: Indices | None) -> F64:

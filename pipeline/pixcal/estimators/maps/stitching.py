@@ -9,7 +9,7 @@ that a line would cut, smooth terms and the fields so far left free.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -18,11 +18,13 @@ from scipy.stats import chi2
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64, Indices, Mask
 
-MIN_SIDE = 4  # pixels along a side of a field, at least
-CHANCE = 1e-3  # of a line at any place of a map without steps
-_MAX_LINES = 64
+MIN_SIDE = 4  # pixels along a side of a field, at least,
+USUAL_SIDE = 12  # and on average: what has more lines is a pattern, not the foundry's stitching
+CHANCE = 1e-3  # of a line at any place of a map of white noise without steps
 _ROUNDS = 3  # in which lines are looked for again, each beside all others
-_STEADY = 1e-6  # share of a step's information by which its normal matrix is kept regular
+# share of a step's information, and pixels, by which its normal matrix is kept regular where smooth
+# terms take the step up, or no pixel is good
+_STEADY, _PIXELS = 1e-6, 1e-9
 
 Lines = tuple[tuple[int, ...], tuple[int, ...]]  # first row, and first column, of later fields
 
@@ -33,17 +35,17 @@ def fields(maps: Sequence[F64], free: Sequence[F64]) -> Indices:
     Parameters
     ----------
     maps : sequence of ndarray (y, x)
-        Maps of the same pixels, each with steps of its own along the same lines; NaN where there
-        is none.
+        Maps of the same pixels, each with steps of its own along the same lines, and independent
+        white noise; NaN where there is none.
     free : sequence of ndarray (term, y, x)
         What smooth patterns each map may have, the constant left out.
     """
+    shape = maps[0].shape
     lines: Lines = ((), ())
-    for _ in range(_MAX_LINES):
-        more = _with_line(maps, free, lines, (0, 1))
-        if more == lines:
-            break
+    while (more := _with_line(maps, free, lines, (0, 1))) != lines:
         lines = more
+        if any(len(own) * USUAL_SIDE > n for own, n in zip(lines, shape, strict=True)):
+            return _numbers(shape, ((), ()))
     for _ in range(_ROUNDS):
         before = lines
         # A line that was found first may be needless, or off, once all are there.
@@ -53,7 +55,7 @@ def fields(maps: Sequence[F64], free: Sequence[F64]) -> Indices:
                 lines = _with_line(maps, free, others, (axis,))
         if lines == before:
             break
-    return _numbers(maps[0].shape, lines)
+    return _numbers(shape, lines)
 
 
 def _replaced(lines: Lines, axis: int, own: Iterable[int]) -> Lines:
@@ -68,8 +70,8 @@ def _with_line(
     field = _numbers(maps[0].shape, lines)
     fits = [FieldFit.of(values, terms, field) for values, terms in zip(maps, free, strict=True)]
     found = {axis: _best_line(fits, lines, axis) for axis in axes}
-    axis = min(found, key=lambda one: found[one][0])
-    log_chance, place = found[axis]
+    axis = min(found, key=lambda one: found[one])
+    log_chance, _, place = found[axis]
     if log_chance > np.log(CHANCE):
         return lines
     return _replaced(lines, axis, {*lines[axis], place})
@@ -99,19 +101,31 @@ class FieldFit:
     # (1 + term, y, x) what is left of the map, and the terms within the fields; zero where masked
     columns: F64
     good: Mask
+    steps: F64  # (y, x) offset of the field of each pixel; zero where all are masked
+    dof: int  # good pixels less all that was fitted
 
     @classmethod
     def of(cls, values: F64, terms: F64, field: Indices) -> "FieldFit":
         """Terms (term, y, x) in a map (y, x) with NaN; fields (y, x)."""
         good = np.isfinite(values)
-        own = within(np.stack([values, *terms])[:, good].T, field[good])
+        all_of_it = np.stack([values, *terms])[:, good].T
+        own = within(all_of_it, field[good])
         inside, rest = own[:, 1:], own[:, 0]
         covariance = inverse_normal(inside.T @ inside)
         size = covariance @ (inside.T @ rest)
         own[:, 0] = rest - inside @ size
         columns = np.zeros((own.shape[1], *values.shape))
         columns[:, good] = own.T
-        return cls(size, covariance, columns, good)
+        count = np.bincount(field[good], minlength=int(field.max()) + 1)
+        level = all_of_it[:, 0] - all_of_it[:, 1:] @ size
+        steps = np.bincount(field[good], level, minlength=len(count)) / np.maximum(count, 1)
+        dof = int(good.sum()) - len(size) - int(np.count_nonzero(count))
+        return cls(size, covariance, columns, good, steps[field], dof)
+
+    @property
+    def variance(self) -> float:
+        """Of a pixel beside all that was fitted."""
+        return float((self.columns[0] ** 2).sum()) / max(self.dof, 1)
 
     @property
     def rest(self) -> F64:
@@ -120,7 +134,9 @@ class FieldFit:
 
     def turned(self) -> "FieldFit":
         """Rows for columns."""
-        return FieldFit(self.values, self.covariance, self.columns.swapaxes(1, 2), self.good.T)
+        return replace(
+            self, columns=self.columns.swapaxes(1, 2), good=self.good.T, steps=self.steps.T
+        )
 
     def gains(self, begin: Indices, first: int, places: Indices, last: int) -> F64:
         """Chi-square (place,) of a line before each of some columns between two lines.
@@ -133,16 +149,15 @@ class FieldFit:
         left, whole = count[:, places - first - 1], count[:, -1:]
         size = left * (whole - left) / np.maximum(whole, 1)
         step, shared = np.split(np.moveaxis(sums[:, :, places - first - 1], 2, 0), [1], axis=1)
-        normal = np.eye(len(begin)) * ((1 + _STEADY) * size.T + 1e-9)[:, None, :]
-        normal -= np.einsum("pti,tu,puj->pij", shared, self.covariance, shared)
+        normal = np.eye(len(begin)) * ((1 + _STEADY) * size.T + _PIXELS)[:, None, :]
+        normal -= shared.swapaxes(1, 2) @ (self.covariance @ shared)
         right = step[:, 0, :, None]
-        variance = float(np.mean(self.columns[0][self.good] ** 2))
         found = (right * np.linalg.solve(normal, right)).sum(axis=(1, 2))
-        return np.asarray(found / max(variance, 1e-300))
+        return np.asarray(found / max(self.variance, 1e-300))
 
 
-def _best_line(fits: Sequence[FieldFit], lines: Lines, axis: int) -> tuple[float, int]:
-    """Logarithm of the chance of the best new line along an axis, and its place."""
+def _best_line(fits: Sequence[FieldFit], lines: Lines, axis: int) -> tuple[float, float, int]:
+    """Logarithm of the chance of the best new line along an axis, less its gain, and its place."""
     begin = np.array([0, *lines[1 - axis]])
     turned = [one.turned() if axis == 0 else one for one in fits]
     end = turned[0].good.shape[1]
@@ -154,6 +169,7 @@ def _best_line(fits: Sequence[FieldFit], lines: Lines, axis: int) -> tuple[float
             gains[places] = sum(one.gains(begin, first, places, last) for one in turned)
     place = int(np.argmax(gains))
     if not np.isfinite(gains[place]):
-        return 0.0, 0
+        return 0.0, 0.0, 0
     log_chance = float(chi2.logsf(gains[place], len(begin) * len(fits)))
-    return log_chance + float(np.log(end)), place
+    # Where the chance is too small for a number, the gain tells.
+    return log_chance + float(np.log(sum(turned[0].good.shape))), -float(gains[place]), place

@@ -17,6 +17,9 @@ _BEYOND = 7  # degree up to which polynomials tell how red true offsets are
 PERIODS = (2, 3, 4, 5, 6, 8)  # of rows and columns: those of readout circuits
 AROUND = 5  # pixels along the side of a pixel's surroundings
 _CLIP = 6.0
+# redness from which a map is no white noise, and the same of the means of its rows or columns,
+# which cells average; within the fields of stitched white noise 1.0 to 1.3, and 0.6 to 1.1
+_RED, _RED_LINES = 2.0, 1.4
 
 
 def clipped(values: F64) -> F64:
@@ -139,6 +142,16 @@ class OffsetModel:
         return np.asarray(drawn)
 
 
+def _red_lines(values: F64) -> list[float]:
+    """Variance of the means of rows, and of columns, over that of white noise; NaN are masked."""
+    good = np.isfinite(values)
+    variance = max(float(np.nanvar(values)), 1e-300)
+    return [
+        float(np.mean(profile(values, axis) ** 2 * good.sum(axis=1 - axis))) / variance
+        for axis in (0, 1)
+    ]
+
+
 @lru_cache(maxsize=4)
 def bench_patterns(shape: tuple[int, ...]) -> F64:
     """What the bench or the readout may do to any map (term, y, x): bending, repeating lines.
@@ -159,7 +172,8 @@ def bench_patterns(shape: tuple[int, ...]) -> F64:
 def stitched_fields(maps: Sequence[F64], fringes: Sequence[F64]) -> Indices:
     """Fields (y, x) of the foundry's stitching in offsets or phases (y, x), NaN where masked.
 
-    Beside what the bench or the readout may do, and fringes (term, y, x) of each map.
+    Beside what the bench or the readout may do, and fringes (term, y, x) of each map. Zeros where
+    what is left within the fields is no white noise, for then the lines may be part of a pattern.
     """
     patterns = bench_patterns(maps[0].shape)
     bends = len(legendre(maps[0].shape, DEGREE)) - 1
@@ -168,7 +182,12 @@ def stitched_fields(maps: Sequence[F64], fringes: Sequence[F64]) -> Indices:
         terms = np.concatenate([patterns, own])
         sizes = fit_terms(values - np.nanmean(values), terms)
         rests.append(values - np.tensordot(sizes[bends:], terms[bends:], 1))
-    return fields(rests, [patterns[:bends]] * len(rests))
+    field = fields(rests, [patterns[:bends]] * len(rests))
+    if not field.any():
+        return field
+    left = [FieldFit.of(rest, patterns[:bends], field).rest for rest in rests]
+    red = any(redness(rest) > _RED or max(_red_lines(rest)) > _RED_LINES for rest in left)
+    return np.zeros_like(field) if red else field
 
 
 def true_offsets(delta: F64, sigma: F64, psi: F64) -> OffsetModel:
@@ -182,18 +201,16 @@ def true_offsets(delta: F64, sigma: F64, psi: F64) -> OffsetModel:
     terms = np.concatenate([patterns, fringes])
     values = clipped(delta)
     fit = FieldFit.of(values, terms, stitched_fields([values], [fringes]))
-    variance = float(np.nanvar(fit.rest))
-    noise = float(np.nanmedian(sigma[np.isfinite(delta)] ** 2))
+    variance = fit.variance
+    noise = float(np.nanmedian(sigma[np.isfinite(delta)] ** 2)) if fit.good.any() else 0.0
     true = variance * max(0.0, 1 - noise / max(variance, 1e-300))
     squares = np.zeros(len(terms))
     if true:
         at_large = _steps_at_large(fit.rest)
         squares[: len(at_large)] = variance * at_large
     scatter = true * fit.covariance + np.diag(squares / (terms**2).sum(axis=(1, 2)))
-    steps = values - np.tensordot(fit.values, terms, 1) - fit.rest
-    kept = steps + fit.rest * np.sqrt(true / max(variance, 1e-300))
-    kept = np.nan_to_num(kept - np.nanmean(kept))
-    return OffsetModel(kept, terms, _root(scatter), ~np.isfinite(values), true**0.5)
+    kept = fit.steps + np.nan_to_num(fit.rest) * np.sqrt(true / max(variance, 1e-300))
+    return OffsetModel(kept - kept.mean(), terms, _root(scatter), ~fit.good, true**0.5)
 
 
 def _root(covariance: F64) -> F64:

@@ -50,8 +50,8 @@ class Candidate:
         ``share``: fraction of its significance that the causes before it do not produce.
         """
         assert self.estimate is not None
-        whole, sure = self.estimate.effect, self.estimate.sure
-        ways = [whole, *([sure] if sure != whole else []), *([self.law] if self.law else [])]
+        laws = [self.law] if self.law else []
+        ways = list(dict.fromkeys([self.estimate.effect, self.estimate.sure, *laws]))
         if share < NEARLY_ALL:
             ways += [way.scaled(share) for way in ways]
         if self.replay is not None:

@@ -106,8 +106,8 @@ def _pixel_noise(
     parts = evidence if parted("bias", halves) else evidence[:1]
     bias = [s.adu for e in parts for s in e.of_kind("bias")]
     # Noise that jumps between levels is an effect; white noise is the detector's own.
-    white = ~np.logical_or.reduce([jumping(frames) for frames in bias])
-    return PixelNoise.of(bias, good, 1 - (one.amplifier_noise / one.read_noise) ** 2, white)
+    noisy = ~np.logical_or.reduce([jumping(frames) for frames in bias])
+    return PixelNoise.of(bias, good, 1 - (one.amplifier_noise / one.read_noise) ** 2, noisy)
 
 
 def parted(name: str, halves: Sequence[Half]) -> bool:

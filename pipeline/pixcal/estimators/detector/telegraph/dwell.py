@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 from pixcal.estimators.detector.telegraph.classes import PLACES, Stays, states
 from pixcal.estimators.detector.telegraph.moments import NOISY, Moments
 from pixcal.kernels.frame_order import follows
+from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64, Indices
 
 LAGS = np.array([1, 2, 4, 8, 16, 32])  # frames apart
@@ -110,7 +111,7 @@ def _products(series: LitSeries) -> tuple[F64, F64]:
     # covariance, times the weights, this is missing.
     fitted = (root[:, None] * series.fitted[:, :, None]).astype(float)
     normal = np.einsum("tkn,tln->nkl", fitted, fitted)
-    taken = np.einsum("nkl,tln->tkn", np.linalg.pinv(normal, hermitian=True), fitted)
+    taken = np.einsum("nkl,tln->tkn", inverse_normal(normal), fitted)
     for n, lag in enumerate(LAGS):
         later = np.flatnonzero(follows(series.frame, int(lag)))
         if len(later) >= _FEWEST_PAIRS:

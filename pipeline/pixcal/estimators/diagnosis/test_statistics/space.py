@@ -126,8 +126,7 @@ def low_orders(name: str, look: Look) -> Curve:
     terms = legendre(values.shape, 4 if name == "contrast" else 3)
     field = look.stitched if name == "offset" else np.zeros(values.shape, np.intp)
     fit = FieldFit.of(values, terms[1:], field)
-    variance = float(np.nanvar(fit.rest)) * redness(fit.rest)
-    error = np.sqrt(variance * np.diag(fit.covariance))
+    error = np.sqrt(fit.variance * redness(fit.rest) * np.diag(fit.covariance))
     # Two Gaussian beams make a contrast that bends in any direction, but no more than that.
     first = 3 if name != "contrast" else 6
     pulls = fit.values / np.maximum(error, 1e-300)
