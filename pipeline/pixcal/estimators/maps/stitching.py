@@ -8,12 +8,13 @@ Lines are looked for one after the other: the score test of a step of its own si
 that a line would cut, smooth terms and the fields so far left free.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64, Indices, Mask
@@ -170,6 +171,7 @@ def _best_line(fits: Sequence[FieldFit], lines: Lines, axis: int) -> tuple[float
     place = int(np.argmax(gains))
     if not np.isfinite(gains[place]):
         return 0.0, 0.0, 0
-    log_chance = float(chi2.logsf(gains[place], len(begin) * len(fits)))
+    chance = float(chdtrc(len(begin) * len(fits), gains[place]))
+    log_chance = math.log(chance) if chance > 0 else -math.inf
     # Where the chance is too small for a number, the gain tells.
     return log_chance + float(np.log(sum(turned[0].good.shape))), -float(gains[place]), place
