@@ -1,7 +1,7 @@
 """Frames in memory: reduced and fitted without a file, with what the stages find in files."""
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +70,18 @@ def test_frames_in_memory_are_reduced_and_fitted_as_those_in_files(
                     np.testing.assert_allclose(one, other, rtol=0, atol=ROUNDING_RAD / scale)
             else:
                 np.testing.assert_array_equal(one, other, err_msg=field)
+
+
+def test_halves_that_come_with_an_evidence_are_those_of_its_samples(raw: Raw) -> None:
+    run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction)
+    for one in evidence_of(run, within=((7, 5), (150, 80))).fringes.values():
+        assert (one.origin, one.window) == ((7, 5), (150, 80))
+        # Samples that are cut are no longer those the halves came from.
+        anew = replace(one).halves
+        assert anew is not one.halves
+        for own, other in zip(one.halves, anew, strict=True):
+            for value, expected in zip(own, other, strict=True):
+                np.testing.assert_allclose(value, expected, rtol=1e-4, atol=1e-7)
 
 
 def test_nothing_is_written(raw: Raw, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

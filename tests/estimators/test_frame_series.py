@@ -81,7 +81,7 @@ def fringes(seed: int, frames: int = 80) -> FringeEvidence:
     electrons = (mean + np.sqrt(mean + 100) * rng.standard_normal(mean.shape)).astype(np.float32)
     good, dk = rng.random(shape) > 0.02, np.zeros((frames, 2))
     coding = Coding(1.0, 0.0, NO_SAMPLE)
-    free, covariance = free_frames(electrons, coding, g, dk, theta, read, shot, good)
+    (free, covariance), *_ = free_frames(electrons, coding, g, dk, theta, read, shot, good)
     return FringeEvidence(
         name="a", baseline_mm=(6.0, 0.0), k=(1.21, 0.02), origin=(0, 0), window=shape,
         frame=np.arange(frames), time_s=0.14 * np.arange(frames), exptime_s=0.02,

@@ -23,7 +23,6 @@ from pixcal.estimators.maps.map_fit import (
 from pixcal.estimators.maps.structure import stitched_fields, without_outliers
 from pixcal.kernels.beams import Light
 from pixcal.kernels.crosstalk import filled
-from pixcal.kernels.robust import median
 from pixcal.kernels.scene import DetectorMaps
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import C128, F64, Indices, Mask
@@ -178,7 +177,7 @@ def _bent(turn: C128) -> F64:
     """Phase (y, x) less its mean and slopes, rad: a fit has them free, and they may be large."""
     for axis in (0, 1):
         one, other = turn.swapaxes(0, axis)[:-1], turn.swapaxes(0, axis)[1:]
-        step = median(np.angle(other * one.conj()).ravel())
+        step = np.angle(np.vdot(one, other))
         place = np.expand_dims(np.arange(turn.shape[axis]), 1 - axis)
         turn = turn * np.exp(-1j * step * place)
     return np.asarray(np.angle(turn * np.exp(-1j * np.angle(turn.mean()))))

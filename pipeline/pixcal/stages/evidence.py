@@ -33,12 +33,23 @@ def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice
     return evidence_of(run_dir, part, frames)
 
 
-def evidence_of(run_dir: Local, part: Part | None = None, frames: slice = slice(None)) -> Evidence:
-    """The same of a run that is known to be whole, or is in memory."""
+def evidence_of(
+    run_dir: Local,
+    part: Part | None = None,
+    frames: slice = slice(None),
+    *,
+    within: tuple[tuple[int, int], tuple[int, int]] | None = None,
+) -> Evidence:
+    """The same of a run that is known to be whole, or is in memory.
+
+    ``within``: first row and column of the run in a larger window, and the shape of that.
+    """
     acquisition = read_acquisition(run_dir)
     ingested = Ingested(run_dir / "ingest")
     ny, nx = ingested.shape
     y, x = part or ((0, ny), (0, nx))
+    (y0, x0), window = within or ((0, 0), (ny, nx))
+    origin = (y0 + y[0], x0 + x[0])
     maps = {
         name: ArrayReader(run_dir / "reduce" / "calibration.zarr" / name).read(y, x)
         for name in ("bias", "dark_rate", "flat", "mask")
@@ -46,7 +57,7 @@ def evidence_of(run_dir: Local, part: Part | None = None, frames: slice = slice(
     fringes = {}
     for listed in acquisition.frames.fringes:
         fringes[listed.name] = _fringes(
-            run_dir, ingested, listed.name, listed.baseline_mm, (y, x), frames
+            run_dir, ingested, listed.name, listed.baseline_mm, (y, x), frames, origin, window
         )
     used = read_json(run_dir / "reduce" / "reduce.json")
     return Evidence(
@@ -63,7 +74,7 @@ def evidence_of(run_dir: Local, part: Part | None = None, frames: slice = slice(
         pitch_um=acquisition.detector.pitch_um,
         wavelength_nm=acquisition.fibres.wavelength_nm,
         distance_mm=acquisition.fibres.distance_mm,
-        origin=(y[0], x[0]),
+        origin=origin,
         photon_transfer=_photon_transfer(used["gain_e_per_adu"]),
         step_adu=max(int(ingested.quantum), 1),
         neighbours=tuple((y, x) for y, x in used["gain_e_per_adu"]["neighbours"]),
@@ -84,6 +95,8 @@ def _fringes(
     baseline: tuple[float, float],
     part: Part,
     frames: slice,
+    origin: tuple[int, int],
+    window: tuple[int, int],
 ) -> FringeEvidence:
     source = ReducedSet(run_dir / "reduce" / "reduced.zarr" / name)
     swept = run_dir / "sweep" / "sweep.zarr" / name
@@ -109,16 +122,16 @@ def _fringes(
     good = (mask == 0) & np.isfinite(theta).all(axis=0)
     read = ArrayReader(source.folder / "read_variance").read(y, x).astype(float)
     shot = ArrayReader(source.folder / "shot_factor").read(y, x).astype(float)
-    free, covariance = free_frames(codes, coding, g, dk, theta, read, shot, good)
+    (free, covariance), *halves = free_frames(codes, coding, g, dk, theta, read, shot, good)
     table = ingested.tables[f"fringes/{name}"]
     numbers = frame_numbers(table)[frames]
     exposure = table["exptime_s"][0]
-    return FringeEvidence(
+    made = FringeEvidence(
         name=name,
         baseline_mm=baseline,
         k=(float(facts["kx"]), float(facts["ky"])),
-        origin=(y[0], x[0]),
-        window=source.shape,
+        origin=origin,
+        window=window,
         frame=numbers,
         time_s=times,
         exptime_s=np.nan if exposure is None else float(exposure),
@@ -136,6 +149,8 @@ def _fringes(
         shot_factor=shot,
         start_s=_start(ingested, f"fringes/{name}"),
     )
+    vars(made)["halves"] = tuple(halves)  # as the property would keep them
+    return made
 
 
 def fitted_theta(swept: Local, part: Part, reference: tuple[float, float]) -> F64:

@@ -187,7 +187,7 @@ class SetDeviations(_Deviations):
             # What is left once the pixels have taken their part.
             beside = found.model.copy()
             beside[:, good] += changed - found.g.astype(np.float32) @ share
-            free, _ = free_frames(
+            (free, _), *_ = free_frames(
                 beside, Coding(1.0, 0.0, NO_SAMPLE), found.g, found.dk, found.theta,
                 found.read_variance, found.shot_factor, good,
             )  # fmt: skip

@@ -15,6 +15,7 @@ from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 T = TypeVar("T")
+FreeFrames = tuple[F64, F64]  # parameters (t, 5) of frames, each by itself, and covariance
 
 STRIPE = 4  # rows of a stripe of `FringeEvidence.halves`: few neighbours lie in different halves
 SATURATED = 1e-3  # share of saturated samples from which flats tell nothing of levels and noise
@@ -88,19 +89,17 @@ class FringeEvidence:
         return np.arctan2(self.g[:, 2], self.g[:, 1])
 
     @cached_property
-    def halves(self) -> tuple[tuple[F64, F64], tuple[F64, F64]]:
-        """``free`` and ``free_covariance`` of each half of the pixels, taken by stripes of rows."""
-        # The bench is common to both, the noise of the samples is not, that of whole rows included.
-        own = stripes(self.good.shape)
+    def halves(self) -> tuple[FreeFrames, FreeFrames]:
+        """``free`` and ``free_covariance`` of each half of the pixels, as `free_frames` has them.
+
+        Of a new evidence they are known; they are found anew for some of its frames or pixels.
+        """
         codes = np.where(np.isnan(self.electrons), np.float32(NO_SAMPLE), self.electrons)
-        one, other = (
-            free_frames(
-                codes, Coding(1.0, 0.0, NO_SAMPLE), self.g, self.dk, self.theta,
-                self.read_variance, self.shot_factor, self.good & half,
-            )
-            for half in (own, ~own)
+        _, *halves = free_frames(
+            codes, Coding(1.0, 0.0, NO_SAMPLE), self.g, self.dk, self.theta, self.read_variance,
+            self.shot_factor, self.good,
         )  # fmt: skip
-        return one, other
+        return halves[0], halves[1]
 
 
 @dataclass(frozen=True)
@@ -215,8 +214,11 @@ def free_frames(
     read_variance: F64,
     shot_factor: F64,
     good: Mask,
-) -> tuple[F64, F64]:
+) -> tuple[FreeFrames, FreeFrames, FreeFrames]:
     """Parameters (t, 5) of every frame by itself, the pixels being known, and their covariance.
+
+    From all good pixels, and from each half of them, taken by stripes of rows: the bench is common
+    to both halves, the noise of the samples is not, that of whole rows included.
 
     Parameters
     ----------
@@ -224,17 +226,27 @@ def free_frames(
     g, dk : (t, 3), (t, 2) start, at the middle of the part
     theta, read_variance, shot_factor, good : as in `FringeEvidence`
     """
-    n, used = len(g), np.flatnonzero(good)
     y, x = np.broadcast_arrays(*grid((good.shape[0], good.shape[1])))
-    packed, right = np.zeros((n, 15)), np.zeros((n, 5))
     start, turned = g.astype(np.float32), dk.astype(np.float32)
-    samples = np.take(codes.reshape(n, -1), used, axis=1).astype(np.float32, copy=False)
-    frame_sums(
-        samples, coding.scale, coding.offset, coding.fill,
-        start, turned, y[good].astype(np.float32), x[good].astype(np.float32),
-        np.ascontiguousarray(theta[:, good], np.float32), read_variance[good].astype(np.float32),
-        shot_factor[good].astype(np.float32), packed, right,
-    )  # fmt: skip
-    covariance = inverse_normal(symmetric(packed), 1e-10)
-    step = np.einsum("tij,tj->ti", covariance, right)
-    return np.hstack([start, turned]) + step, covariance
+
+    def sums(good: Mask) -> tuple[F64, F64]:
+        used, n = np.flatnonzero(good), len(g)
+        packed, right = np.zeros((n, 15)), np.zeros((n, 5))
+        samples = np.take(codes.reshape(n, -1), used, axis=1).astype(np.float32, copy=False)
+        frame_sums(
+            samples, coding.scale, coding.offset, coding.fill,
+            start, turned, y[good].astype(np.float32), x[good].astype(np.float32),
+            np.ascontiguousarray(theta[:, good], np.float32),
+            read_variance[good].astype(np.float32), shot_factor[good].astype(np.float32),
+            packed, right,
+        )  # fmt: skip
+        return packed, right
+
+    def solved(packed: F64, right: F64) -> FreeFrames:
+        covariance = inverse_normal(symmetric(packed), 1e-10)
+        step = np.einsum("tij,tj->ti", covariance, right)
+        return np.hstack([start, turned]) + step, covariance
+
+    own = stripes(good.shape)
+    one, other = sums(good & own), sums(good & ~own)
+    return solved(one[0] + other[0], one[1] + other[1]), solved(*one), solved(*other)

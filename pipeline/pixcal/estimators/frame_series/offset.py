@@ -15,7 +15,7 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import STRIPE, FringeEvidence, Stack
 from pixcal.estimators.frame_series.variance_components import Modes
 from pixcal.estimators.frame_series.walk_modes import walk_modes
-from pixcal.kernels.normal_matrix import inverse_normal
+from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.model.arrays import F32, F64, Mask
 
 FEWEST = 8  # frames from which something is learnt; of fewer, chance is not what it is taken for
@@ -66,14 +66,7 @@ def fringe_offsets(found: FringeEvidence, flat: F64) -> OffsetSeries | None:
     masks = _quarters(found.good)
     if len(found.g) < FEWEST or masks is None:
         return None
-    good = found.good
-    pattern = np.where(good, np.concatenate([found.theta, 1 / flat[None]]), 0.0)
-    pattern = pattern.astype(np.float32).reshape(len(pattern), -1)
-    residual, variance = (a.reshape(len(a), -1) for a in (found.residual, found.variance))
-    used = np.isfinite(residual) & good.ravel()
-    weight = np.where(used, 1 / variance, np.float32(0))
-    pull = np.where(used, residual, np.float32(0)) * weight
-    quarters = [_sums(np.where(m.ravel(), pattern, 0), weight, pull) for m in masks]
+    quarters = _sums(found, flat, masks)
     whole = tuple(np.sum(part, axis=0) for part in zip(*quarters, strict=True))
     fits = [_constant(*sums) for sums in (whole, *quarters)]
     if not all(np.isfinite(f).all() for f in fits):
@@ -133,11 +126,24 @@ def _half(count: int) -> Mask:
     return np.asarray(np.bitwise_count(np.arange(count) // STRIPE) % 2 == 0)
 
 
-def _sums(pattern: F32, weight: F32, pull: F32) -> tuple[F64, F64]:
-    """Normal matrices (t, n, n) and right sides (t, n) of a fit of patterns (n, pixels)."""
-    n = len(pattern)
-    normal = (weight @ (pattern[:, None] * pattern).reshape(n * n, -1).T).reshape(-1, n, n)
-    return normal.astype(float), (pull @ pattern.T).astype(float)
+def _sums(found: FringeEvidence, flat: F64, masks: Sequence[Mask]) -> list[tuple[F64, F64]]:
+    """Normal matrices (t, 4, 4) and right sides (t, 4) of light, fringes and offset; by mask."""
+    maps = np.concatenate([found.theta, 1 / flat[None]]).reshape(4, -1)
+    rows, columns = np.triu_indices(len(maps))
+    pull, weight = (own.reshape(len(own), -1) for own in (found.residual, 1 / found.variance))
+    missing = np.isnan(pull)
+    if missing.any():
+        pull, weight = np.where(missing, 0, pull), np.where(missing, 0, weight)
+    pull = pull * weight
+
+    def summed(weights: F32, patterns: F64) -> F64:
+        # All masks at once: the weights are read once.
+        every = np.stack([np.where(mask.ravel(), patterns, 0) for mask in masks])
+        sums = weights @ every.astype(np.float32).reshape(-1, patterns.shape[1]).T
+        return np.asarray(sums.astype(float).reshape(len(weights), len(masks), -1).swapaxes(0, 1))
+
+    normals, rights = summed(weight, maps[rows] * maps[columns]), summed(pull, maps)
+    return list(zip(symmetric(normals), rights, strict=True))
 
 
 def _constant(normal: F64, right: F64) -> tuple[F64, F64]:

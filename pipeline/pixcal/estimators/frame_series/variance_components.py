@@ -67,12 +67,20 @@ class Components:
     """Sizes found, and how well."""
 
     size: F64  # (m,)
-    covariance: F64  # (m, m) of `size`; zero for those that were held
+    free: Mask  # (m,) sizes that were not held
     beta: F64  # beta, beta_covariance: (p,), (p, p) coefficients of the known shapes
     beta_covariance: F64
     likelihood: float  # logarithm, restricted; comparable where the known shapes are the same
     profile: float  # logarithm, not restricted; comparable whatever the known shapes
     modes: Modes  # that it is of
+
+    @cached_property
+    def covariance(self) -> F64:
+        """Covariance (m, m) of ``size``; zero for those that were held."""
+        found = np.zeros((len(self.size),) * 2)
+        inside = np.ix_(self.free, self.free)
+        found[inside] = inverse_normal(_State(self.modes, self.size).information()[inside])
+        return found
 
     def above(self, part: int) -> float:
         """1-sigma error of a size, upwards: where the likelihood has fallen by exp(-1/2)."""
@@ -131,12 +139,8 @@ def estimate_components(
     if gained > FAR:
         state, _ = _climbed(state, signals, steps)
     state, _ = _climbed(state, free, steps)
-    size = state.size
-    covariance = np.zeros((len(size), len(size)))
-    inside = np.ix_(free, free)
-    covariance[inside] = inverse_normal(state.information()[inside])
     return Components(
-        size, covariance, state.beta, state.spread, state.likelihood, state.profile, modes
+        state.size, free, state.beta, state.spread, state.likelihood, state.profile, modes
     )
 
 

@@ -109,19 +109,23 @@ class FieldFit:
     def of(cls, values: F64, terms: F64, field: Indices) -> "FieldFit":
         """Terms (term, y, x) in a map (y, x) with NaN; fields (y, x)."""
         good = np.isfinite(values)
-        all_of_it = np.stack([values, *terms])[:, good].T
-        own = within(all_of_it, field[good])
-        inside, rest = own[:, 1:], own[:, 0]
-        covariance = inverse_normal(inside.T @ inside)
-        size = covariance @ (inside.T @ rest)
-        own[:, 0] = rest - inside @ size
-        columns = np.zeros((own.shape[1], *values.shape))
-        columns[:, good] = own.T
-        count = np.bincount(field[good], minlength=int(field.max()) + 1)
-        level = all_of_it[:, 0] - all_of_it[:, 1:] @ size
-        steps = np.bincount(field[good], level, minlength=len(count)) / np.maximum(count, 1)
+        # Over all pixels, zero where masked: picking the good ones takes longer than the rest.
+        used, number = good.ravel().astype(float), field.ravel()
+        columns = np.concatenate([np.where(good, values, 0.0)[None], terms]).reshape(-1, good.size)
+        columns[1:] *= used
+        count = np.bincount(number, used)
+        sums = np.stack([np.bincount(number, own) for own in columns])
+        means = sums / np.maximum(count, 1)
+        columns -= means[:, number] if len(count) > 1 else means
+        columns *= used
+        inside = columns[1:]
+        covariance = inverse_normal(inside @ inside.T)
+        size = covariance @ (inside @ columns[0])
+        columns[0] -= size @ inside
+        steps = means[0] - size @ means[1:]
         dof = int(good.sum()) - len(size) - int(np.count_nonzero(count))
-        return cls(size, covariance, columns, good, steps[field], dof)
+        shaped = columns.reshape(-1, *good.shape)
+        return cls(size, covariance, shaped, good, steps[field], dof)
 
     @property
     def variance(self) -> float:

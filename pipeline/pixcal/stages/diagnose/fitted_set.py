@@ -43,7 +43,7 @@ class FittedSet:
             by_maps = effect.undo(by_maps) or by_maps
             maps = self.undone(effect, maps) or maps
         if maps is before:
-            return replace(self, flat=None)
+            return self._untouched
         size = float(np.hypot(*self.k))
         delta = corrected_offsets(
             self.delta,
@@ -62,6 +62,11 @@ class FittedSet:
             light=light.astype(np.float32),
             contrast=contrast.astype(np.float32),
         )
+
+    @cached_property
+    def _untouched(self) -> "FittedSet":
+        # One for all benches whose effects leave the maps alone: its model of offsets is kept.
+        return replace(self, flat=None)
 
     @cached_property
     def maps(self) -> FringeMaps:

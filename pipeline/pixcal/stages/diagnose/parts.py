@@ -5,7 +5,7 @@ them is not in how they were looked at.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 from zlib import crc32
 
@@ -81,12 +81,4 @@ def select(tables: Mapping[str, Table], half: Half) -> dict[str, Table]:
 def evidence_of(raw: Raw, part: Part, window: tuple[int, int]) -> Evidence:
     """Reduce and fit a part of a window, with straight fringes: what it tells."""
     run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction)
-    found = evidence.evidence_of(run)
-    origin = (part[0][0], part[1][0])
-    return replace(
-        found,
-        origin=origin,
-        fringes={
-            name: replace(f, origin=origin, window=window) for name, f in found.fringes.items()
-        },
-    )
+    return evidence.evidence_of(run, within=((part[0][0], part[1][0]), window))
