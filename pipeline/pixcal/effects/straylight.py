@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.polynomial.legendre import leggrid2d
+from numpy.polynomial.legendre import legvander
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.beams import Light
@@ -42,7 +42,10 @@ class StrayPattern:
         for at, value in zip(orders, self.coefficients, strict=False):
             products[at] = value
         grid = np.linspace(-1, 1, 33)
-        inside, terms = (leggrid2d(*at, products) for at in ((grid, grid), (y, x)))
+        inside, terms = (
+            legvander(down, DEGREE) @ products @ legvander(along, DEGREE).T
+            for down, along in ((grid, grid), (y, x))
+        )
         return np.asarray(np.expm1(np.maximum(terms - inside.min(), 0.0)))
 
 

@@ -81,7 +81,7 @@ class Light:
         coherence = np.divide(size, iota, out=np.zeros_like(size), where=iota > 0)
         return cls((Beam(each, np.angle(phasor), MODULATED), Beam(each, 0.0)), coherence)
 
-    @property
+    @cached_property
     def power(self) -> F64:
         """Light (y, x) of the beams, each by itself, e-."""
         return np.asarray(sum(beam.amplitude**2 for beam in self.beams))

@@ -7,7 +7,7 @@ all sets by Gauss-Newton steps, beside smooth surfaces and the fringe modes that
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -154,9 +154,11 @@ class _Lit:
         own, light = model.light(self.light, self.recording, self.rows, self.maps), self.light
         found = np.zeros((3, *light.mean.shape))
         lit = np.where(light.mean > 0, light.mean, np.inf)
-        found[0] = np.log(np.maximum(own.mean / lit, 1e-9))
+        same = own.beams is light.beams
+        mean = light.mean + (own.incoherent - light.incoherent) if same else own.mean
+        found[0] = np.log(np.maximum(mean / lit, 1e-9))
         found[1] = -found[0]
-        if own.beams is not light.beams:
+        if not same:
             ratio = own.phasor / np.where(light.phasor == 0, 1e-9, light.phasor)
             found[1] += np.log(np.maximum(np.abs(ratio), 1e-9))
             found[2] = _bent(ratio)
@@ -215,10 +217,10 @@ def _stitched(lit: Sequence[_Lit], vectors: Sequence[tuple[float, float]]) -> In
 def _fitted(start: LightStart, lit: Sequence[_Lit], degree: int) -> LightFit:
     model, here = start.model, [one.change(start.model) for one in lit]
     errors: dict[str, float] = {}
-    lengths: dict[str, float] = {}
+    steps: dict[str, _Step] = {}
     for _ in range(ROUNDS):
         values = {k: v for k, v in numbers(model).items() if field_of(k) in start.free}
-        slopes = _slopes(model, values, lit, here, lengths)
+        slopes = _slopes(model, values, lit, here, steps)
         rest = [one.data - at for one, at in zip(lit, here, strict=True)]
         found = _least_squares(lit, rest, slopes, degree)
         step = dict(zip(values, found.values, strict=True))
@@ -236,33 +238,40 @@ def _fitted(start: LightStart, lit: Sequence[_Lit], degree: int) -> LightFit:
     return LightFit(start, model, errors, *_gain(lit, here, degree), len(errors))
 
 
+class _Step(NamedTuple):
+    """Of a number, for its derivative."""
+
+    length: float
+    sets: Sequence[int]  # that it changes
+
+
 def _slopes(
     model: Any,
     values: Mapping[str, float],
     lit: Sequence[_Lit],
     here: Sequence[F64],
-    lengths: dict[str, float],
+    steps: dict[str, _Step],
 ) -> list[F64]:
     """Derivatives (n, 3, y, x) of the maps of each set by some numbers.
 
-    By steps of lengths that are kept for the next time.
+    By steps that are kept for the next time.
     """
     found = [np.zeros((len(values), *at.shape)) for at in here]
     for n, (key, value) in enumerate(values.items()):
-        step = lengths.get(key, STEP * max(abs(value), 1.0))
+        step, sets = steps.get(key, (STEP * max(abs(value), 1.0), range(len(lit))))
         for _ in range(LONGER):
             moved = with_numbers(model, {key: value + step})
             if numbers(moved)[key] <= value:
                 moved = with_numbers(model, {key: value - step})
             size = numbers(moved)[key] - value
-            changes = [one.change(moved) - at for one, at in zip(lit, here, strict=True)]
-            largest = max(float(np.abs(c).max()) for c in changes)
+            changes = {i: lit[i].change(moved) - here[i] for i in sets}
+            largest = max((float(np.abs(c).max()) for c in changes.values()), default=0.0)
             if largest > SEEN or not size:
                 break
             step *= 1.5 * SEEN / max(largest, SEEN / MOST)
-        lengths[key] = step
-        for own, change in zip(found, changes, strict=True):
-            own[n] = change / (size or 1.0)
+        steps[key] = _Step(step, [i for i, change in changes.items() if change.any()])
+        for i, change in changes.items():
+            found[i][n] = change / (size or 1.0)
     return found
 
 
@@ -285,12 +294,18 @@ def _least_squares(
     parts = []
     whole, left = np.zeros((2, len(signals[0])))
     for one, data, own in zip(lit, rest, signals, strict=True):
-        for kind in (k for k in kinds if _shows(own, k)):
+        largest = np.abs(own).max(axis=(2, 3))
+        for kind in (k for k in kinds if _shows(largest, k)):
             free = np.concatenate([polynomial(one.good.shape, degree), one.gauge])
             stitched = one.stitched if kind == PHASE else None
-            parts.append(MapPart.of(own[:, kind], data[kind], free, one.good, stitched))
-            whole += (own[:, kind][:, one.good] ** 2).sum(axis=1)
-            left += (parts[-1].signals ** 2).sum(axis=0)
+            # Many a number changes one set alone.
+            some = largest[:, kind] > 0
+            part = MapPart.of(own[some, kind], data[kind], free, one.good, stitched)
+            shown = np.zeros((len(part.data), len(own)))
+            shown[:, some] = part.signals
+            parts.append(replace(part, signals=shown))
+            whole[some] += (own[some, kind][:, one.good] ** 2).sum(axis=1)
+            left += (shown**2).sum(axis=0)
     told = np.flatnonzero(left > UNTOLD * whole)
     found = MapFit(np.zeros(len(whole)), np.zeros((len(whole),) * 2), 0.0)
     if not len(told):
@@ -302,9 +317,8 @@ def _least_squares(
     return replace(found, gain=fit.gain)
 
 
-def _shows(signals: F64, kind: int) -> bool:
-    """Whether signals (n, 3, y, x) show in a kind of map at all."""
-    largest = np.abs(signals).max(axis=(2, 3))
+def _shows(largest: F64, kind: int) -> bool:
+    """Whether signals show in a kind of map at all, by the largest value (n, 3) of each."""
     return bool((largest[:, kind] > LEAST * largest.max(axis=1)).any())
 
 

@@ -136,7 +136,7 @@ def _sums(found: FringeEvidence, flat: F64, masks: Sequence[Mask]) -> list[tuple
         pull, weight = np.where(missing, 0, pull), np.where(missing, 0, weight)
     pull = pull * weight
 
-    def summed(weights: F32, patterns: F64) -> F64:
+    def summed(weights: F32 | F64, patterns: F64) -> F64:
         # All masks at once: the weights are read once.
         every = np.stack([np.where(mask.ravel(), patterns, 0) for mask in masks])
         sums = weights @ every.astype(np.float32).reshape(-1, patterns.shape[1]).T

@@ -87,9 +87,11 @@ def fit_maps(parts: Sequence[MapPart]) -> MapFit:
     meat = np.zeros((len(parts[0].blocks), *normal.shape))
     for part, variance in zip(parts, variances, strict=True):
         rest = part.data - part.signals @ values
-        pulls = part.signals * (rest / variance)[:, None]
+        some = np.flatnonzero(part.signals.any(axis=0))
+        pulls = (part.signals[:, some] * (rest / variance)[:, None]).T
         for own, block in zip(meat, part.blocks, strict=True):
-            scores = np.stack([np.bincount(block, pull) for pull in pulls.T])
+            scores = np.zeros((len(values), int(block.max()) + 1))
+            scores[some] = [np.bincount(block, pull) for pull in pulls]
             own += scores @ scores.T
     inside = np.einsum("ij,sjk,ki->si", covariance, meat, covariance)
     more = max(1.0, *map(float, np.mean(inside / np.diag(covariance), axis=1)))
