@@ -1,6 +1,7 @@
 """Light that does not interfere: laser light scattered in the bench, of a smooth pattern."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -15,6 +16,12 @@ from pixcal.simulation.effect import Effect, FringeMaps, LightStart, Stage
 from pixcal.simulation.recording import Recording
 
 DEGREE = 8  # of the polynomials that a measured pattern is made of
+
+
+@lru_cache(maxsize=8)
+def _polynomials(places: bytes) -> F64:
+    """Legendre polynomials (place, order) at places (float64) from -1 to 1."""
+    return np.asarray(legvander(np.frombuffer(places), DEGREE))
 
 
 @dataclass(frozen=True)
@@ -43,7 +50,7 @@ class StrayPattern:
             products[at] = value
         grid = np.linspace(-1, 1, 33)
         inside, terms = (
-            legvander(down, DEGREE) @ products @ legvander(along, DEGREE).T
+            _polynomials(down.tobytes()) @ products @ _polynomials(along.tobytes()).T
             for down, along in ((grid, grid), (y, x))
         )
         return np.asarray(np.expm1(np.maximum(terms - inside.min(), 0.0)))

@@ -260,10 +260,7 @@ def _slopes(
     for n, (key, value) in enumerate(values.items()):
         step, sets = steps.get(key, (STEP * max(abs(value), 1.0), range(len(lit))))
         for _ in range(LONGER):
-            moved = with_numbers(model, {key: value + step})
-            if numbers(moved)[key] <= value:
-                moved = with_numbers(model, {key: value - step})
-            size = numbers(moved)[key] - value
+            moved, size = _moved(model, key, value, step)
             changes = {i: lit[i].change(moved) - here[i] for i in sets}
             largest = max((float(np.abs(c).max()) for c in changes.values()), default=0.0)
             if largest > SEEN or not size:
@@ -273,6 +270,16 @@ def _slopes(
         for i, change in changes.items():
             found[i][n] = change / (size or 1.0)
     return found
+
+
+def _moved(model: Any, key: str, value: float, step: float) -> tuple[Any, float]:
+    """The model with a number moved by a step, or back at the end of its range; by how much."""
+    for own in (step, -step):
+        moved = with_numbers(model, {key: value + own})
+        size = numbers(moved)[key] - value
+        if size > 0:
+            break
+    return moved, size
 
 
 def _is_straight(change: F64, expected: F64) -> bool:
