@@ -17,7 +17,7 @@ from blind_examination.oracle import Oracle, ask_oracle
 from blind_examination.running import DIAGNOSIS, DONE, FAILED, PRODUCTS, share
 from blind_examination.seal import Sealed, read_seal
 from blind_examination.summary import PLACE, median, summary
-from blind_examination.table import as_markdown, write_between
+from blind_examination.table import around_table, as_markdown, write_between
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.errors import DamagedError, InputError, PixcalError, PlanError
 from pixcal.storage.manifest import read_json, write_json
@@ -53,6 +53,9 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
     """
     exams = [(folder, sealed), *config.also]
     _require_alike([own for own, _ in exams])
+    if config.write is not None:
+        # Before the minutes that scoring takes.
+        around_table(config.write, read_manifest(folder).size)
     marked = [_marked(own, truth, config, runtime) for own, truth in exams]
     first = marked[0]
     named = [one.named(apart=len(marked) > 1) for one in marked]

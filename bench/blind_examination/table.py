@@ -190,6 +190,18 @@ def write_between(page: Path, size: str, text: str) -> None:
     InputError
         If the page or its marks are not there.
     """
+    before, after = around_table(page, size)
+    page.write_text(f"{before}\n\n{text}\n{after}", encoding="utf-8")
+
+
+def around_table(page: Path, size: str) -> tuple[str, str]:
+    """What stands on a page before and after a table, the marks included.
+
+    Raises
+    ------
+    InputError
+        If the page or its marks are not there.
+    """
     begin, end = f"<!-- blind:{size} -->", "<!-- end -->"
     if not page.is_file():
         raise InputError(f"--write {page}: not found")
@@ -197,4 +209,4 @@ def write_between(page: Path, size: str, text: str) -> None:
     _, closed, after = rest.partition(end)
     if not mark or not closed:
         raise InputError(f"--write {page}: has no lines {begin} and {end}; add them")
-    page.write_text(f"{before}{begin}\n\n{text}\n{end}{after}", encoding="utf-8")
+    return before + begin, end + after

@@ -338,6 +338,10 @@ def test_cases_are_diagnosed_once_and_without_what_is_left_out(
         blind.score(folder, sealed, blind.ScoreConfig(), SYNC)
     assert blind.run(folder, blind.RunConfig(limit=1), SYNC) == (1, 0)
     assert not (folder / "runs" / "case-0001" / "ingest").exists()
+    nowhere = tmp_path / "nowhere.md"
+    with pytest.raises(InputError, match=r"nowhere\.md: not found"):
+        blind.score(folder, sealed, blind.ScoreConfig(write=nowhere), SYNC)
+    assert not (folder / "score.json").exists()
     found = blind.score(folder, sealed, blind.ScoreConfig(), SYNC)
     assert [c["case"] for c in found["cases"]] == ["case-0001"]
     assert found["missing"] == ["case-0002", "case-0003"]

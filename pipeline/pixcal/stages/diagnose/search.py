@@ -163,14 +163,18 @@ class Search:
         if not options or len(options) + 1 > left or not self.comparison.differs(causes.current):
             return False
         benches = [tuple(one.effects.values()) for one in options]
-        tried = self._simulate([causes.bench, *benches], 1, "exchanged", ())
-        likely = [
-            -np.inf if isinstance(c, str) else self.comparison.trial(b, c).log_likelihood
-            for b, c in zip([causes.bench, *benches], tried, strict=True)
-        ]
-        best = options[int(np.argmax(likely[1:]))]
-        if max(likely[1:]) < likely[0]:
-            return False
+        # One simulation of each to choose by; some more, before all that confirm the choice.
+        for seeds, needed in ((1, 0.0), (SCREEN, MIN_LOGLIK_GAIN_WEAK)):
+            tried = self._simulate([causes.bench, *benches], seeds, "exchanged", ())
+            likely = [
+                -np.inf if isinstance(c, str) else self.comparison.trial(b, c).log_likelihood
+                for b, c in zip([causes.bench, *benches], tried, strict=True)
+            ]
+            place = int(np.argmax(likely[1:]))
+            if likely[1 + place] < likely[0] + needed:
+                return False
+            options, benches = (options[place],), [benches[place]]
+        (best,) = options
         trial = self._confirmed(tuple(best.effects.values()))
         if isinstance(trial, str) or trial.log_likelihood < (
             causes.current.log_likelihood + MIN_LOGLIK_GAIN_WEAK
