@@ -248,7 +248,7 @@ class NominalBench:
         sets = []
         for own, fit in zip(self.measured.sets, fits, strict=True):
             light, contrast = undone.fringes(
-                float(np.median(own.light)), float(np.median(own.contrast))
+                float(np.median(own.light)), float(np.median(own.contrast)), own.k
             )
             times = np.float32(contrast) * fit.contrast
             sets.append(

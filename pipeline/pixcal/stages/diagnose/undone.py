@@ -20,7 +20,6 @@ MAP_PHASES = 12  # spread over a fringe, at which an effect on samples is undone
 _PHASES = 2 * np.pi * np.arange(MAP_PHASES) / MAP_PHASES
 _EVEN = np.stack([np.ones(MAP_PHASES), np.cos(_PHASES), np.sin(_PHASES)], axis=1)
 TURNS = 5  # of the fits of pixels and frames: each gains a factor of three or more
-ACROSS = 9  # pixels along the side of a frame whose level is undone
 
 
 @dataclass(frozen=True)
@@ -30,16 +29,19 @@ class IntensityBeforeEffects:
     effects: Sequence[Effect]
     detector: SimulatedDetector
 
-    def fringes(self, light: float, contrast: float) -> tuple[float, float]:
-        """Of the mean (e-) of fringes, and of their contrast.
+    def fringes(self, light: float, contrast: float, k: tuple[float, float]) -> tuple[float, float]:
+        """Of the mean (e-) of fringes with the vector k (kx, ky), rad/px, and of their contrast.
 
         As the fit finds them, whose weights let harmonics of the phase have a part in both.
         """
-        cosine = np.cos(2 * np.pi * np.arange(PHASES) / PHASES)
-        measured = light * (1 + contrast * cosine)
-        samples = self.levels(measured)
-        if samples is measured or not contrast > 0:
+        side = np.arange(self._across) - self._across // 2
+        phase = 2 * np.pi * np.arange(PHASES)[:, None, None] / PHASES
+        cosine = np.cos(phase - k[0] * side - k[1] * side[:, None])
+        frames = light * (1 + contrast * cosine)
+        undone = self._undone(frames)
+        if undone is None or not contrast > 0:
             return 1.0, 1.0
+        measured, cosine, samples = (self._middle(own) for own in (frames, cosine, undone))
         weight = (np.maximum(measured, 0) + self.detector.read_noise_e**2 + 1) ** -0.5
         design = np.stack([np.ones(PHASES), cosine], axis=1) * weight[:, None]
         mean, amplitude = np.linalg.lstsq(design, samples * weight, rcond=None)[0]
@@ -47,14 +49,25 @@ class IntensityBeforeEffects:
 
     def levels(self, levels: F64) -> F64:
         """Even frames of these levels (e-) without the effects."""
-        frames = np.broadcast_to(levels[:, None, None], (len(levels), ACROSS, ACROSS))
-        found = start = np.asarray(frames, np.float32)
+        across = self._across
+        undone = self._undone(np.broadcast_to(levels[:, None, None], (len(levels), across, across)))
+        return levels if undone is None else self._middle(undone)
+
+    @property
+    def _across(self) -> int:
+        """Pixels along the side of a frame whose middle no effect's halo leaves."""
+        return 1 + 2 * sum(effect.undo_halo for effect in self.effects)
+
+    def _middle(self, frames: F64) -> F64:
+        return np.asarray(frames[:, self._across // 2, self._across // 2], float)
+
+    def _undone(self, frames: F64) -> F64 | None:
+        """Frames (t, y, x) without the effects, e-; None where none acts on samples."""
+        found = start = frames.astype(np.float32)
         for effect in sorted(self.effects, key=lambda e: e.turn, reverse=True):
             undone = effect.undo_samples(found)
             found = found if undone is None else undone
-        if found is start:
-            return levels
-        return np.asarray(found[:, ACROSS // 2, ACROSS // 2], float)
+        return None if found is start else found.astype(float)
 
 
 def undone_on_samples(
