@@ -131,8 +131,8 @@ def invoke(args: Sequence[str]) -> int:
         sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as raised:
         # Libraries that are interrupted while they load raise various errors.
-        lost = isinstance(raised, ImportError) and _interrupted.is_set()
-        error = KeyboardInterrupt() if lost else raised
+        by_it = isinstance(raised, ImportError) or isinstance(raised.__cause__, KeyboardInterrupt)
+        error = KeyboardInterrupt() if by_it and _interrupted.is_set() else raised
         if os.environ.get("PIXCAL_DEBUG"):
             traceback.print_exc()
         code, message = explain(error)

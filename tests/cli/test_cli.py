@@ -26,7 +26,7 @@ from pixcal.engine.run import Runtime
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.report import page as report_page
 from pixcal.stages import fit, reduce
-from pixcal_cli import results
+from pixcal_cli import main, results
 from pixcal_cli.click_options import memory_size, region
 from pixcal_cli.main import cli, explain, invoke
 
@@ -210,6 +210,23 @@ def test_an_error_inside_a_stage_is_one_line(
     assert len(err.strip().splitlines()) == 1
     for name in names:
         assert name in err
+
+
+def test_an_interruption_is_one_whatever_a_library_makes_of_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As Python 3.11 does with one that comes while a class is made."""
+    error = RuntimeError("Error calling __set_name__")
+    error.__cause__ = KeyboardInterrupt()
+    replace_body(monkeypatch, "reduce", error)
+    for asked, said in ((False, "internal error"), (True, "interrupted; ")):
+        if asked:
+            main._interrupted.set()
+        try:
+            assert invoke(["reduce", "RUN"]) == 1
+        finally:
+            main._interrupted.clear()
+        assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("out", ["file", "file/run"])

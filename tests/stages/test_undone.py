@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from joint_fit import fit_jointly
 
+from pixcal.effects.brighter_fatter import BrighterFatter
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.estimators.maps.corrected import phase_change
+from pixcal.kernels.boundaries import REACH, moved_charge
 from pixcal.simulation.effect import FringeMaps
 from pixcal.stages.diagnose.undone import FitOfFrames, undone_on_samples
 
@@ -59,3 +61,32 @@ def test_of_a_change_of_the_light_the_maps_take_all():
     taken = fit.taken_up(one)
     np.testing.assert_allclose(taken[:, 5, 7], [3, 0.5, -0.2], atol=0.03)
     assert np.abs(np.delete(taken[:, 5], 7, axis=1)).max() < 0.03
+
+
+def test_what_charge_moves_is_undone_up_to_the_edges_and_in_the_contrast():
+    """Beyond them the fringes go on, where the effect acts and where it is undone."""
+    effect, margin = BrighterFatter(6e-7, 0.7, 1.2), REACH + 2
+    y, x = np.indices([n + 2 * margin for n in SHAPE], float)
+    psi = 0.03 * y + 2 * np.pi / 9.3 * x
+    theta = np.stack([np.full(psi.shape, 2e4), 1.8e4 * np.sin(psi), 1.8e4 * np.cos(psi)])
+    phi = np.random.default_rng(8).uniform(0, 2 * np.pi, 80)
+    g = np.stack([np.ones_like(phi), np.cos(phi), np.sin(phi)], axis=1)
+    charge = np.einsum("ti,iyx->tyx", g, theta).astype(np.float32)
+    moved = charge.astype(float) + moved_charge(charge, effect._shifts, effect.along_y)
+    inside = (..., slice(margin, -margin), slice(margin, -margin))
+    truth = theta[inside]
+    found, g = fit_jointly(moved[inside], truth, g)
+    maps = FringeMaps(found, (2 * np.pi / 9.3, 0.03))
+    undone = undone_on_samples(effect, maps, FitOfFrames.of(maps, g)).theta
+    harmonic, left = third_harmonic(truth, found, psi[inside]), phase_change(truth, undone)
+    assert abs(harmonic) > 3e-5
+    assert abs(third_harmonic(truth, undone, psi[inside])) < 0.1 * abs(harmonic)
+    edges = np.concatenate([left[:, :2], left[:, -2:]], axis=1)
+    assert (edges - left.mean()).std() < 3 * left[:, 3:-3].std()
+
+    def contrast(maps):
+        return float(np.mean(np.hypot(*maps[1:]) / maps[0]))
+
+    loss = contrast(found) - contrast(truth)
+    assert loss < -2e-3
+    assert abs(contrast(undone) - contrast(truth)) < 0.1 * abs(loss)

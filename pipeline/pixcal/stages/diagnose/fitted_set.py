@@ -37,10 +37,8 @@ class FittedSet:
 
     def without(self, effects: Sequence[Effect]) -> "FittedSet":
         """The same with effects undone that act on maps: offsets as fitted with them known."""
-        maps = by_maps = before = self.maps
+        maps = before = self.maps
         for effect in sorted(effects, key=lambda e: e.turn, reverse=True):
-            # Their levels are those of `IntensityBeforeEffects`, without the noise of maps.
-            by_maps = effect.undo(by_maps) or by_maps
             maps = self.undone(effect, maps) or maps
         if maps is before:
             return self._untouched
@@ -53,8 +51,8 @@ class FittedSet:
             size,
         )
         good = np.asarray(np.isfinite(self.theta).all(axis=0))
-        light = light_surface(by_maps.theta, good) / light_surface(before.theta, good)
-        contrast = contrast_surface(by_maps.theta, good) / contrast_surface(before.theta, good)
+        light = light_surface(maps.theta, good) / light_surface(before.theta, good)
+        contrast = contrast_surface(maps.theta, good) / contrast_surface(before.theta, good)
         return replace(
             self,
             delta=delta,

@@ -157,7 +157,7 @@ class NominalBench:
         for effect in effects:
             effect.check(bench)
         rows = (0, bench.detector.shape[0])
-        measured = self._drawn(effects if fitted else (), own_seed, undone)
+        measured = self._drawn(effects if fitted else (), own_seed)
         if fitted and effects:
             measured = self._of_measured_k(measured, bench, effects)
         change = photon_transfer_change(
@@ -227,9 +227,7 @@ class NominalBench:
         )
         return replace(measured, maps=maps)
 
-    def _drawn(
-        self, effects: Sequence[Effect], seed: int, undone: IntensityBeforeEffects
-    ) -> Measured:
+    def _drawn(self, effects: Sequence[Effect], seed: int) -> Measured:
         """As measured, with offsets that can be true where the effects are what they are."""
         if not self.fits:
             return self.measured
@@ -245,17 +243,12 @@ class NominalBench:
         if fits[0].flat is not None:
             maps = replace(maps, response=np.maximum(fits[0].flat, 0).astype(np.float32))
         # As the bench was without what the effects take from the fringes, and do anew.
-        sets = []
-        for own, fit in zip(self.measured.sets, fits, strict=True):
-            light, contrast = undone.fringes(
-                float(np.median(own.light)), float(np.median(own.contrast)), own.k
+        sets = tuple(
+            replace(
+                own,
+                light=own.light * fit.light,
+                contrast=np.minimum(own.contrast * fit.contrast, np.float32(1)),
             )
-            times = np.float32(contrast) * fit.contrast
-            sets.append(
-                replace(
-                    own,
-                    light=own.light * np.float32(light) * fit.light,
-                    contrast=np.minimum(own.contrast * times, np.float32(1)),
-                )
-            )
-        return replace(self.measured, maps=maps, sets=tuple(sets))
+            for own, fit in zip(self.measured.sets, fits, strict=True)
+        )
+        return replace(self.measured, maps=maps, sets=sets)

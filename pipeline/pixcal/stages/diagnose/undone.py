@@ -11,11 +11,12 @@ from typing import Self
 import numpy as np
 
 from pixcal.estimators.maps.imprint import MIN_SIGNAL, usual_fringe
+from pixcal.kernels.beams import LightMaps, with_margin
 from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import SimulatedDetector
 from pixcal.simulation.effect import Effect, FringeMaps
 
-PHASES = 16  # of a fringe that is undone sample by sample
+ACROSS = 9  # pixels along the side of a frame whose level is undone
 MAP_PHASES = 12  # spread over a fringe, at which an effect on samples is undone
 _PHASES = 2 * np.pi * np.arange(MAP_PHASES) / MAP_PHASES
 _EVEN = np.stack([np.ones(MAP_PHASES), np.cos(_PHASES), np.sin(_PHASES)], axis=1)
@@ -24,50 +25,21 @@ TURNS = 5  # of the fits of pixels and frames: each gains a factor of three or m
 
 @dataclass(frozen=True)
 class IntensityBeforeEffects:
-    """Levels of light as they were before effects that are undone on samples, over those after."""
+    """Levels of even light as they were before effects that are undone on samples."""
 
     effects: Sequence[Effect]
     detector: SimulatedDetector
 
-    def fringes(self, light: float, contrast: float, k: tuple[float, float]) -> tuple[float, float]:
-        """Of the mean (e-) of fringes with the vector k (kx, ky), rad/px, and of their contrast.
-
-        As the fit finds them, whose weights let harmonics of the phase have a part in both.
-        """
-        side = np.arange(self._across) - self._across // 2
-        phase = 2 * np.pi * np.arange(PHASES)[:, None, None] / PHASES
-        cosine = np.cos(phase - k[0] * side - k[1] * side[:, None])
-        frames = light * (1 + contrast * cosine)
-        undone = self._undone(frames)
-        if undone is None or not contrast > 0:
-            return 1.0, 1.0
-        measured, cosine, samples = (self._middle(own) for own in (frames, cosine, undone))
-        weight = (np.maximum(measured, 0) + self.detector.read_noise_e**2 + 1) ** -0.5
-        design = np.stack([np.ones(PHASES), cosine], axis=1) * weight[:, None]
-        mean, amplitude = np.linalg.lstsq(design, samples * weight, rcond=None)[0]
-        return mean / light, amplitude / mean / contrast
-
     def levels(self, levels: F64) -> F64:
         """Even frames of these levels (e-) without the effects."""
-        across = self._across
-        undone = self._undone(np.broadcast_to(levels[:, None, None], (len(levels), across, across)))
-        return levels if undone is None else self._middle(undone)
-
-    @property
-    def _across(self) -> int:
-        """Pixels along the side of a frame whose middle no effect's halo leaves."""
-        return 1 + 2 * sum(effect.undo_halo for effect in self.effects)
-
-    def _middle(self, frames: F64) -> F64:
-        return np.asarray(frames[:, self._across // 2, self._across // 2], float)
-
-    def _undone(self, frames: F64) -> F64 | None:
-        """Frames (t, y, x) without the effects, e-; None where none acts on samples."""
-        found = start = frames.astype(np.float32)
+        frames = np.broadcast_to(levels[:, None, None], (len(levels), ACROSS, ACROSS))
+        found = start = np.asarray(frames, np.float32)
         for effect in sorted(self.effects, key=lambda e: e.turn, reverse=True):
             undone = effect.undo_samples(found)
             found = found if undone is None else undone
-        return None if found is start else found.astype(float)
+        if found is start:
+            return levels
+        return np.asarray(found[:, ACROSS // 2, ACROSS // 2], float)
 
 
 def undone_on_samples(
@@ -79,12 +51,17 @@ def undone_on_samples(
     to; by default their phases are spread evenly.
     """
     flat = np.ones(maps.theta.shape[1:]) if maps.flat is None else maps.flat
-    charge = np.einsum("tm,myx->tyx", _EVEN, maps.theta * flat)
-    undone = effect.undo_samples(charge.astype(np.float32))
+    # Beyond the edges the fringes go on, as they do where the effect acts.
+    light = with_margin(LightMaps(*(maps.theta * flat).astype(np.float32)), effect.undo_halo)
+    wide = np.stack([light.iota, light.alpha_sin, light.alpha_cos])
+    charge = np.einsum("tm,myx->tyx", _EVEN, wide).astype(np.float32)
+    undone = effect.undo_samples(charge)
     if undone is None:
         return None
+    rows, columns = (slice(effect.undo_halo, effect.undo_halo + n) for n in flat.shape)
+    change = (undone.astype(float) - charge)[:, rows, columns]
     fit = FitOfFrames.of(maps, _EVEN) if fit is None else fit
-    return replace(maps, theta=maps.theta + fit.taken_up(undone - charge) / flat)
+    return replace(maps, theta=maps.theta + fit.taken_up(change) / flat)
 
 
 @dataclass(frozen=True)
