@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from pixcal.effects.hyperbolic_fringes import HyperbolicFringes
-from pixcal.effects.straylight import Straylight
+from pixcal.effects.straylight import Straylight, StrayPattern
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.beams import Light
 from pixcal.kernels.scene import DetectorMaps
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.light_fit import LightStart
-from pixcal.simulation.numbers import field_of, numbers, with_numbers
+from pixcal.simulation.numbers import field_of, numbers, set_of, with_numbers
 from pixcal.simulation.replica import set_recordings
 
 DRAWS = 24
@@ -107,3 +107,17 @@ def test_a_loss_of_contrast_that_the_mean_light_does_not_have_is_no_straylight(
     found = Straylight.estimate(replace(evidence, fringes=fringes))
     assert found is not None
     assert found.significance == 0
+
+
+def test_a_number_of_one_set_changes_the_maps_of_no_other() -> None:
+    parts = tuple(StrayPattern(name, (0, 9), (0, 9), (0.1, 0.2)) for name in ("a", "b"))
+    model = Straylight(0.0, (0.0, 0.0), patterns=parts)
+    keys = [key for key in numbers(model) if "coefficients" in key]
+    assert [set_of(model, key) for key in keys] == ["a", "a", "b", "b"]
+    assert set_of(model, "share") == set_of(model, "slope_per_px[1]") == ""
+    before = [model.pattern((0, 9), (0, 9), part.set) for part in parts]
+    for key in keys:
+        moved = with_numbers(model, {key: 0.5})
+        for part, was in zip(parts, before, strict=True):
+            if part.set != set_of(model, key):
+                np.testing.assert_array_equal(moved.pattern((0, 9), (0, 9), part.set), was)

@@ -7,7 +7,7 @@ all sets by Gauss-Newton steps, beside smooth surfaces and the fringe modes that
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from pixcal.kernels.scene import DetectorMaps
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import C128, F64, Indices, Mask
 from pixcal.simulation.forward import ForwardModel
-from pixcal.simulation.numbers import field_of, numbers, with_numbers
+from pixcal.simulation.numbers import field_of, numbers, set_of, with_numbers
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import set_recordings
 
@@ -117,6 +117,11 @@ class _Lit:
     light: Light = field(repr=False)  # of all columns up to the part's last
     maps: DetectorMaps = field(repr=False)
     stitched: Indices | None = field(default=None, repr=False)  # (y, x) fields of offsets
+
+    @property
+    def name(self) -> str:
+        """Of the set."""
+        return self.recording.bench.frames.fringes[self.recording.number].name
 
     @classmethod
     def of(cls, found: FringeEvidence, recording: Recording) -> "_Lit":
@@ -217,10 +222,10 @@ def _stitched(lit: Sequence[_Lit], vectors: Sequence[tuple[float, float]]) -> In
 def _fitted(start: LightStart, lit: Sequence[_Lit], degree: int) -> LightFit:
     model, here = start.model, [one.change(start.model) for one in lit]
     errors: dict[str, float] = {}
-    steps: dict[str, _Step] = {}
+    lengths: dict[str, float] = {}
     for _ in range(ROUNDS):
         values = {k: v for k, v in numbers(model).items() if field_of(k) in start.free}
-        slopes = _slopes(model, values, lit, here, steps)
+        slopes = _slopes(model, values, lit, here, lengths)
         rest = [one.data - at for one, at in zip(lit, here, strict=True)]
         found = _least_squares(lit, rest, slopes, degree)
         step = dict(zip(values, found.values, strict=True))
@@ -238,27 +243,21 @@ def _fitted(start: LightStart, lit: Sequence[_Lit], degree: int) -> LightFit:
     return LightFit(start, model, errors, *_gain(lit, here, degree), len(errors))
 
 
-class _Step(NamedTuple):
-    """Of a number, for its derivative."""
-
-    length: float
-    sets: Sequence[int]  # that it changes
-
-
 def _slopes(
     model: Any,
     values: Mapping[str, float],
     lit: Sequence[_Lit],
     here: Sequence[F64],
-    steps: dict[str, _Step],
+    lengths: dict[str, float],
 ) -> list[F64]:
     """Derivatives (n, 3, y, x) of the maps of each set by some numbers.
 
-    By steps that are kept for the next time.
+    By steps of lengths that are kept for the next time.
     """
     found = [np.zeros((len(values), *at.shape)) for at in here]
     for n, (key, value) in enumerate(values.items()):
-        step, sets = steps.get(key, (STEP * max(abs(value), 1.0), range(len(lit))))
+        step, of = lengths.get(key, STEP * max(abs(value), 1.0)), set_of(model, key)
+        sets = [i for i, one in enumerate(lit) if of in ("", one.name)]
         for _ in range(LONGER):
             moved, size = _moved(model, key, value, step)
             changes = {i: lit[i].change(moved) - here[i] for i in sets}
@@ -266,7 +265,7 @@ def _slopes(
             if largest > SEEN or not size:
                 break
             step *= 1.5 * SEEN / max(largest, SEEN / MOST)
-        steps[key] = _Step(step, [i for i, change in changes.items() if change.any()])
+        lengths[key] = step
         for i, change in changes.items():
             found[i][n] = change / (size or 1.0)
     return found

@@ -28,6 +28,15 @@ def field_of(key: str) -> str:
     return re.split(r"\W", key)[0]
 
 
+def set_of(model: Any, key: str) -> str:
+    """Name of the fringe set that the part of a number is of; empty where it is of all sets."""
+    for name, place in re.findall(r"([a-z]\w*)|\[(\d+)\]", key):
+        model = getattr(model, name) if name else model[int(place)]
+        if of := getattr(model, "set", ""):
+            return str(of)
+    return ""
+
+
 def with_numbers(model: T, values: Mapping[str, float]) -> T:
     """The model with other numbers, held within their ranges."""
     changed: T = _changed(model, "", values, {})

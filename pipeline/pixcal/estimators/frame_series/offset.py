@@ -28,6 +28,7 @@ NOISES = np.array([[1, 1, 1, 1], [1, 1, 0, 0], [1, 0, 1, 0]])
 # `BELOW` of it
 MIN_NOISE = 0.05
 BELOW = 0.3
+_MIN_VARIANCE = 1e-6  # e-², of samples in pixels that are not good
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,8 @@ def _sums(found: FringeEvidence, flat: F64, masks: Sequence[Mask]) -> list[tuple
     """Normal matrices (t, 4, 4) and right sides (t, 4) of light, fringes and offset; by mask."""
     maps = np.concatenate([found.theta, 1 / flat[None]]).reshape(4, -1)
     rows, columns = np.triu_indices(len(maps))
-    pull, weight = (own.reshape(len(own), -1) for own in (found.residual, 1 / found.variance))
+    variance = np.maximum(found.variance, np.float32(_MIN_VARIANCE))
+    pull, weight = (own.reshape(len(own), -1) for own in (found.residual, 1 / variance))
     missing = np.isnan(pull)
     if missing.any():
         pull, weight = np.where(missing, 0, pull), np.where(missing, 0, weight)
