@@ -74,7 +74,7 @@ class FittedSet:
 
     def undone(self, effect: Effect, maps: FringeMaps) -> FringeMaps | None:
         """Maps without an effect, as a fit of the same frames gives them; None where none tell."""
-        return effect.undo(maps) or undone_on_samples(effect, maps, self._fit)
+        return effect.undo(maps) or undone_on_samples(effect, maps, self._fit, beyond=True)
 
     @cached_property
     def _fit(self) -> FitOfFrames | None:

@@ -43,22 +43,27 @@ class IntensityBeforeEffects:
 
 
 def undone_on_samples(
-    effect: Effect, maps: FringeMaps, fit: "FitOfFrames | None" = None
+    effect: Effect, maps: FringeMaps, fit: "FitOfFrames | None" = None, *, beyond: bool = False
 ) -> FringeMaps | None:
     """Maps that a fit finds in frames without noise that an effect was undone on.
 
-    None where the effect is not one of samples. ``fit``: of the frames that the maps were fitted
-    to; by default their phases are spread evenly.
+    None where the effect is not one of samples.
+
+    Parameters
+    ----------
+    fit : of the frames that the maps were fitted to; by default their phases are spread evenly
+    beyond : the fringes go on beyond the edges of the maps, as where an effect is simulated; by
+        default the effect is undone on frames that end there
     """
     flat = np.ones(maps.theta.shape[1:]) if maps.flat is None else maps.flat
-    # Beyond the edges the fringes go on, as they do where the effect acts.
-    light = with_margin(LightMaps(*(maps.theta * flat).astype(np.float32)), effect.undo_halo)
+    margin = effect.undo_halo if beyond else 0
+    light = with_margin(LightMaps(*(maps.theta * flat).astype(np.float32)), margin)
     wide = np.stack([light.iota, light.alpha_sin, light.alpha_cos])
     charge = np.einsum("tm,myx->tyx", _EVEN, wide).astype(np.float32)
     undone = effect.undo_samples(charge)
     if undone is None:
         return None
-    rows, columns = (slice(effect.undo_halo, effect.undo_halo + n) for n in flat.shape)
+    rows, columns = (slice(margin, margin + n) for n in flat.shape)
     change = (undone.astype(float) - charge)[:, rows, columns]
     fit = FitOfFrames.of(maps, _EVEN) if fit is None else fit
     return replace(maps, theta=maps.theta + fit.taken_up(change) / flat)
