@@ -95,3 +95,7 @@ def test_what_charge_moves_is_undone_up_to_the_edges_and_in_the_contrast():
     closed = undone_on_samples(effect, maps, fit).theta
     apart = phase_change(closed, undone)
     assert np.abs(apart[:, :3]).max() > 10 * np.abs(apart - np.median(apart))[:, 14:-14].max()
+    samples = effect.undo_samples(moved[inside].astype(np.float32)).astype(float)
+    as_corrected, _ = fit_jointly(samples, truth, g)
+    same = phase_change(as_corrected, closed)
+    assert np.abs(same - np.median(same)).max() < 0.1 * np.abs(apart).max()
