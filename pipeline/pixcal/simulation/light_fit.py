@@ -304,7 +304,7 @@ def _least_squares(
         for kind in (k for k in kinds if _shows(largest, k)):
             free = np.concatenate([polynomial(one.good.shape, degree), one.gauge])
             stitched = one.stitched if kind == PHASE else None
-            # Many a number changes one set alone.
+            # A number of one set leaves the maps of the others as they are.
             some = largest[:, kind] > 0
             part = MapPart.of(own[some, kind], data[kind], free, one.good, stitched)
             shown = np.zeros((len(part.data), len(own)))
