@@ -18,8 +18,9 @@ DECLARED_ERROR = 0.01  # least relative error of a declared gain
 # until the relative change of their noise is known to this error or all flats are used.
 FRAMES = 8
 CHANGE_ERROR = 0.003
-# shot noise over read noise, as variances, of a flat that tells what effects do to the former
-LIT = 4.0
+# shot noise over read noise, as variances, of a flat that tells what effects do to the former: with
+# the same random numbers the read noise cancels, and a response bends little down there
+LIT = 0.5
 # steps whose effects change the noise of flats otherwise than a gain does
 OF_NOISE = (Stage.CHARGE, Stage.SIGNAL, Stage.CONVERTER)
 
@@ -71,7 +72,7 @@ def photon_transfer_change(
     if len(flats) < LADDER:
         flat = max(flats, key=lambda r: r.electrons)
     else:
-        # Of a ladder the gain is that at level zero: the dimmest flat with little read noise.
+        # Of a ladder the gain is that at level zero: the dimmest flat with light enough.
         lit = [r for r in flats if r.electrons > LIT * detector.read_noise_e**2] or flats
         flat = min(lit, key=lambda r: r.electrons)
     flat = replace(flat, bench=bench)
