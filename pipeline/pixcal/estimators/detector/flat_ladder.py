@@ -6,7 +6,7 @@ noise of the flats bends with it, as far as that is precise enough to tell; else
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ MIN_RUNGS = 3  # fewest levels of flats that tell a curve from a line
 LAMP = 1e-3  # relative error of the light of a flat at least, its exposure time included
 STEADY = 0.1  # rms of the levels about a curve beyond which the lamp was changed between them
 RATES = 1.3  # largest over least light a second of few levels of one lamp
+OFF = 8.0  # usual distances of the levels from the curve beyond which one of them is of another lamp
 DISAGREE = 4.0  # errors between the curve of the levels and that of their noise
 
 # least degrees of freedom of the flicker with which first frames tell more than it: six pairs
@@ -42,6 +43,7 @@ class Ladder:
     sizes: F64  # (2,) response S (1 + sizes[0] u + sizes[1] u²), u the level over the highest
     covariance: F64  # (2, 2); the scatter of the levels about the curve is in it
     wander: float  # relative rms of the levels about the curve
+    off: F64  # exposure times (s) of flats far off the curve, for which the lamp was changed
 
     @property
     def top(self) -> float:
@@ -162,11 +164,32 @@ def _ladder(evidence: Evidence) -> Ladder | None:
     # Where the flat varies, bright pixels bend more than the mean does.
     flat = evidence.flat[evidence.good] / evidence.flat[evidence.good].mean()
     moments = float((flat**2).mean()), float((flat**3).mean())
-    found = _bent(times, levels, error, moments)
+    found = _of_one_lamp(times, levels, error, moments)
     if found is None or found.wander > STEADY:
         return None
     curve = transfer_curve(evidence)
     return found if curve is None or _agree(found, curve) else None
+
+
+def _of_one_lamp(
+    times: F64, levels: F64, error: F64, moments: tuple[float, float]
+) -> Ladder | None:
+    """The ladder without a level far off the curve of the others: no response has such a step.
+
+    The ends are always of the ladder: there a response may have a knee.
+    """
+    whole = _bent(times, levels, error, moments)
+    if whole is None or len(times) <= _WITH_CUBIC:
+        return whole
+    best, off = whole, None
+    for n in np.argsort(levels)[1:-1]:
+        rest = np.arange(len(times)) != n
+        found = _bent(times[rest], levels[rest], error[rest], moments)
+        if found is not None and found.wander < best.wander:
+            best, off = found, n
+    if off is None or best.wander * OFF > whole.wander * np.sqrt(len(times)):
+        return whole
+    return replace(best, off=times[[off]])
 
 
 def _bent(times: F64, levels: F64, error: F64, moments: tuple[float, float]) -> Ladder | None:
@@ -198,7 +221,7 @@ def _bent(times: F64, levels: F64, error: F64, moments: tuple[float, float]) -> 
     whole = _NOT_TOLD**2 * np.eye(4)
     whole[np.ix_(terms, terms)] = covariance * max(chi2, 1.0)
     wander = float(np.sqrt(max(chi2, 1.0)) * error.mean())
-    return Ladder(times, levels, sizes, whole[2:, 2:], wander)
+    return Ladder(times, levels, sizes, whole[2:, 2:], wander, times[:0])
 
 
 def _agree(found: Ladder, curve: TransferCurve) -> bool:

@@ -29,6 +29,7 @@ class FlatLight:
     rise: tuple[float, float] = (0.0, 0.0)
     # whether the levels are those of one lamp; else they are taken as measured
     one_lamp: bool = False
+    off: frozenset[float] = frozenset()  # exposure times (s) of levels that are of another lamp
     freedom: float = math.inf  # degrees of freedom that ``flicker`` is known by
     # by the number of a recording, the light (t,) of each frame over the mean; NaN for frames that
     # are drawn: the first, which may lack what stayed behind, and those not looked at
@@ -50,6 +51,7 @@ class FlatLight:
             # Of all frames of a level: a part may have two of them.
             rise_of(list(light.values())),
             all(one is not None for one in found),
+            frozenset(float(t) for one in found if one is not None for t in one.off),
             min(freedoms),
             frames,
         )
@@ -64,7 +66,7 @@ class FlatLight:
             + self._flicker(recording.bench.seed) * recording.rng("lamp", frame).standard_normal()
             + self._rise(recording.bench.seed) * (frame - (recording.count - 1) / 2)
         )
-        if known is not None or not self.one_lamp:
+        if known is not None or not self.one_lamp or recording.exptime_s in self.off:
             return float(of_frame)
         return float(of_frame * (1 + self.wander * recording.rng("lamp").standard_normal()))
 
@@ -85,7 +87,7 @@ class FlatLight:
     ) -> dict[int, float]:
         """Electrons of the flats, by number, before some effects acted.
 
-        Of one lamp they lie on a line over exposure time.
+        Of one lamp they lie on a line over exposure time; a level of another is as measured.
         """
         flats = [r for r in recordings if r.kind == "flat" and r.electrons > 0]
         if not flats:
@@ -95,6 +97,7 @@ class FlatLight:
         if self.one_lamp:
             d = before.detector
             below = levels < (d.top_adu - d.bias_adu) * d.gain_e_per_adu
-            below = below if below.any() else np.ones(len(levels), np.bool_)
-            levels = straight_line(times[below], levels[below], times)
+            own = np.isin(times, list(self.off), invert=True)
+            below = below & own if (below & own).any() else own
+            levels = np.where(own, straight_line(times[below], levels[below], times), levels)
         return {r.number: float(level) for r, level in zip(flats, levels, strict=True)}

@@ -101,12 +101,12 @@ class Summary:
 def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     """Put the statistics of all columns together; InputError if the flats hold no light."""
     tables = ArrayReader(folder / "levels").read()
-    levels, usable = _rungs(tables, job)
+    levels, usable, nearly = _rungs(tables, job)
     sums = pair_sums(folder, job)
     # Pixels that are full saturate the flats though no sample of the converter does.
     points = transfer_points(add_neighbours(sums[1], sums[0]).sums)
     well = saturation(points)
-    full = usable & (levels > (sum(well) if well else math.inf))
+    full = usable & (nearly | (levels > sum(well)) if well else np.False_)
     usable &= ~full
     light = _light(tables, levels, usable, job)
     medians = usual(job, folder, light)
@@ -210,18 +210,22 @@ def _steps(job: Measuring) -> tuple[float, float]:
     return rounding + variance * job.quantum**2, density * job.quantum**3
 
 
-def _rungs(tables: F64, job: Measuring) -> tuple[F64, Mask]:
-    """Level of each rung (ADU) over the columns that have one on all rungs, and which to use."""
+def _rungs(tables: F64, job: Measuring) -> tuple[F64, Mask, Mask]:
+    """Level of each rung (ADU) over the columns that have one on all rungs, and which to use.
+
+    Also those of which some pixels are full, or nearly.
+    """
     if not job.flat:
-        return np.zeros(0), np.zeros(0, np.bool_)
-    level, pixels, lost = (tables.reshape(-1, len(job.flat), 3)[..., n] for n in range(3))
+        return np.zeros(0), np.zeros(0, np.bool_), np.zeros(0, np.bool_)
+    level, pixels, lost, nearly = (tables.reshape(-1, len(job.flat), 4)[..., n] for n in range(4))
     frames = np.array([len(group.frames) for group in job.flat])
     usable = np.less_equal(lost.sum(axis=0), _SATURATED_RUNG * frames * pixels.sum(axis=0))
     common = np.isfinite(level[:, usable]).all(axis=1, keepdims=True)
     weight = np.where(common & np.isfinite(level), pixels, 0.0)
     total = (weight * np.nan_to_num(level)).sum(axis=0)
     seen = weight.sum(axis=0)
-    return np.divide(total, seen, out=np.zeros_like(total), where=seen > 0), usable
+    ended = nearly.sum(axis=0) > _SATURATED_RUNG * pixels.sum(axis=0)
+    return np.divide(total, seen, out=np.zeros_like(total), where=seen > 0), usable, ended
 
 
 def _light(tables: F64, levels: F64, usable: Mask, job: Measuring) -> F64:

@@ -19,8 +19,12 @@ from pixcal.storage.frame_reader import Reader
 ROWS = 64  # rows that are looked at, in the middle of the frames
 TOGETHER = 64  # frames that are read at once: those of a chunk of a cube
 APART = 0.05  # relative distance of two levels that are not one lamp's flicker
+# The same where the lamp is steady: least distance, and that over the usual one of two frames that
+# follow one another.
+FINE, STEADY = 0.005, 6.0
 MIN_SHARE = 1e-3  # of the samples of a frame that lie at the highest code at least
 MIN_SAMPLES = 50
+MIN_CHANGES = 3  # fewest, from frame to frame, that tell a lamp's flicker
 NEIGHBOURS = 16  # codes below the highest that are held against it
 MIN_DARKS = 5  # fewest steps between levels of darks that tell groups apart
 # least step between two groups: over the median step, and over the noise of a sample
@@ -64,8 +68,36 @@ class FlatSurvey:
             own = np.flatnonzero((times == time) | (np.isnan(times) & np.isnan(time)))
             order = own[np.argsort(self.levels[own], kind="stable")]
             levels = self.levels[order]
-            found[order[1:]] = np.cumsum(np.diff(levels) > APART * np.maximum(levels[1:], 1.0))
+            bounds = np.flatnonzero(np.diff(levels) > APART * np.maximum(levels[1:], 1.0)) + 1
+            parts = (fine for part in np.split(order, bounds) for fine in self._parted(part))
+            for step, part in enumerate(parts):
+                found[part] = step
         return [int(step) for step in found]
+
+    def _parted(self, frames: I64) -> list[I64]:
+        """Frames of similar levels, parted where a steady lamp was changed a little between them.
+
+        Frames of a level follow one another, two at least: how much those differ tells the lamp's
+        flicker.
+        """
+        frames = np.sort(frames)
+        change = np.abs(np.diff(self.levels[frames])) / max(float(self.levels[frames].max()), 1.0)
+        if len(change) < MIN_CHANGES:
+            return [frames]
+        limit = max(FINE, STEADY * float(np.quantile(change, 0.25)))
+        parts = np.split(frames, np.flatnonzero(change > limit) + 1)
+        if min(len(part) for part in parts) < 2:
+            return [frames]
+        levels: list[I64] = []
+        for part in sorted(parts, key=self._mean):
+            if levels and self._mean(part) - self._mean(levels[-1]) < limit * self._mean(part):
+                levels[-1] = np.concatenate([levels[-1], part])
+            else:
+                levels.append(part)
+        return levels
+
+    def _mean(self, frames: I64) -> float:
+        return float(self.levels[frames].mean())
 
 
 def of_several_levels(frames: Reader) -> bool:

@@ -98,7 +98,7 @@ def statistics_writers(folder: Place, shape: tuple[int, int], flats: int) -> dic
     for name, whole, chunks, dtype in (
         ("maps", (n, *shape), (n, *map_chunk(shape)), np.float32),
         ("pairs", (*tiles, 2, N_BINS, COLUMNS), (1, wide, 2, N_BINS, COLUMNS), np.float64),
-        ("levels", (*tiles, rungs, 3), (1, wide, rungs, 3), np.float64),
+        ("levels", (*tiles, rungs, 4), (1, wide, rungs, 4), np.float64),
     ):
         dims = [f"axis{axis}" for axis in range(len(whole))]
         made[name] = create_array(folder / name, whole, dtype, chunks=chunks, dims=dims)
@@ -219,7 +219,7 @@ def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined)
     exptime = group.exptime if job.flats_timed else 0.0
     frames = len(group.frames)
     signal = np.where(found.seen == frames, found.mean, np.nan)
-    column.levels[number, 1:] = signal.size, (frames - found.seen).sum()
+    column.levels[number, 1:3] = signal.size, (frames - found.seen).sum()
     # Few frames say little of one pixel's noise, and most pixels are like the others.
     seen = lit(signal)
     level = finite_median(signal[seen])
@@ -239,6 +239,10 @@ def _measure_response(job: Measuring, column: _Column) -> None:
     maps, levels = column.maps, step_levels(column.rungs)
     column.levels[:, 0] = levels
     rungs, levels = unsaturated(column.rungs, levels, float(np.median(column.noise)))
+    column.levels[:, 3] = [
+        np.isfinite(before.signal).sum() - np.isfinite(after.signal).sum()
+        for before, after in zip(column.rungs, rungs, strict=True)
+    ]
     maps["response"], maps["response_error"] = relative_response(rungs, levels)
     maps["flags"][nonlinear(rungs, levels, job.options.nonlinear_share)] += int(PixelFlag.NONLINEAR)
 
