@@ -10,6 +10,7 @@ from pixcal.effects.cosmic_hits import CosmicHits
 from pixcal.effects.gain_error import GainError
 from pixcal.effects.ipc import Coupling, Ipc
 from pixcal.effects.lag import Lag
+from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.effects.quantisation import Quantisation
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
@@ -51,6 +52,24 @@ def test_brighter_fatter_takes_noise_in_proportion_to_the_level(
     weak, strong = (1 - change(bench, BrighterFatter(s)) for s in (2e-7, 4e-7))
     assert weak > 0.005
     assert strong == pytest.approx(2 * weak, rel=0.15)
+
+
+def test_a_bent_response_leaves_the_gain_at_level_zero(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    """With so much read noise that it outweighs the photon noise of half of the flats."""
+    times = np.linspace(0.002, 0.02, 10)
+    bench = make_effect_bench(
+        {
+            "detector.shape": [121, 127],
+            "detector.read_noise_e": 70.0,
+            "frames.flats": [{"exptime_s": float(t), "count": 2} for t in times],
+        }
+    )
+    top = bench.frames.flat_rate_e_s
+    assert top is not None
+    bent = Nonlinearity(quadratic=-0.1, cubic=0.0, level_e=top * times[-1])
+    assert change(bench, bent) == pytest.approx(1.0, abs=0.05)
 
 
 def test_narrow_codes_scale_noise_and_mean_alike(

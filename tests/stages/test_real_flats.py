@@ -15,9 +15,11 @@ from pixcal.estimators.detector.flat_ladder import ladder as ladder_of
 from pixcal.estimators.detector.flat_ladder import level_before
 from pixcal.estimators.diagnosis.test_statistics import DETECTOR, measure
 from pixcal.estimators.diagnosis.test_statistics.look import STEPS
+from pixcal.model.arrays import F64
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.parts import Raw, evidence_of
 from pixcal.stages.diagnose.windows import split, whole_of
+from pixcal.stages.reduce.flat_survey import FlatSurvey
 
 LEVELS = tuple(np.linspace(0.05, 1.0, 12))
 CAMERA = {"gain": 2.3, "noise": 8.0, "bias": 200.4, "scatter": 2.0, "top": 4095, "rate": 8000.0}
@@ -84,6 +86,28 @@ def test_levels_that_bend_without_their_noise_are_the_lamp(
     assert found is not None
     assert (ladder_of(evidence) is not None) == told
     assert (found.significance > 5) == (quadratic != 0)
+
+
+def test_a_level_of_another_lamp_is_not_of_the_ladder(tmp_path: Path) -> None:
+    flats = ladder([(t, 1) for t in LEVELS]) + ladder([(0.55, 1.03)], 20)
+    evidence, _ = reduced(Detector(**CAMERA, flats=flats), 16, tmp_path)
+    levels, found = ladder_of(evidence), Nonlinearity.estimate(evidence)
+    assert levels is not None
+    assert found is not None
+    assert levels.off.tolist() == [0.55]
+    assert levels.wander < 0.002
+    assert found.significance < 3
+
+
+def test_a_knee_at_the_highest_level_is_of_the_ladder(tmp_path: Path) -> None:
+    camera = Detector(
+        **CAMERA, flats=ladder([(t, 1) for t in LEVELS]), response=lambda e: e - 0.5 * (
+            np.maximum(e - 0.93 * 8000, 0)
+        ),
+    )  # fmt: skip
+    evidence, _ = reduced(camera, 17, tmp_path)
+    levels = ladder_of(evidence)
+    assert levels is None or not len(levels.off)
 
 
 def test_a_lamp_that_scatters_from_level_to_level_is_no_response(tmp_path: Path) -> None:
@@ -165,6 +189,34 @@ def test_saturation_is_found_and_what_is_below_it_used(tmp_path: Path) -> None:
         Detector(**CAMERA, flats=ladder([(t, 1) for t in LEVELS])), 3, tmp_path / "b"
     )
     assert plain["saturation_adu"]["found"] is None
+
+
+def test_levels_that_some_pixels_fill_are_left_out(tmp_path: Path) -> None:
+    """The brightest pixels are full, and have no photon noise, where the mean is well below."""
+    camera = Detector(
+        **CAMERA, flats=ladder([(1.1 * t, 1) for t in LEVELS], 4), prnu=0.03,
+        response=lambda e: np.minimum(e, 8000 * 1.02),
+    )  # fmt: skip
+    _, report = reduced(camera, 6, tmp_path)
+    # At the last but one level the usual pixel is at 0.99 of its full well, at the one before 0.89.
+    assert report["saturation_adu"]["full_frames"] == list(range(4 * 10, 4 * 12))
+
+
+def test_levels_of_a_steady_lamp_a_little_apart_are_levels() -> None:
+    pairs = np.repeat(np.linspace(0.02, 1, 50), 2) * 3000
+    pairs *= 1 + 2e-4 * np.random.default_rng(3).standard_normal(len(pairs))
+    survey = FlatSurvey(pairs, None)
+    assert survey.steps([0.1] * len(pairs)) == np.repeat(np.arange(50), 2).tolist()
+    # Back at a level that was there before.
+    again = FlatSurvey(np.array([1000, 1001, 1030, 1031, 1060, 1060.5, 1000.5, 1000.0]), None)
+    assert again.steps([0.1] * 8) == [0, 0, 1, 1, 2, 2, 0, 0]
+
+
+@pytest.mark.parametrize("levels", [np.linspace(2000, 1000, 41), np.full(41, 1000.0)])
+def test_a_lamp_that_flickers_or_fades_is_at_one_level(levels: F64) -> None:
+    flickers = levels * (1 + 1e-3 * np.random.default_rng(4).standard_normal(len(levels)))
+    for seen in (levels, flickers):
+        assert set(FlatSurvey(seen, None).steps([0.1] * len(levels))) == {0}
 
 
 def test_full_wells_below_the_highest_code_are_no_response(tmp_path: Path) -> None:
