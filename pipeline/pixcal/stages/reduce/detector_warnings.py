@@ -28,8 +28,8 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
         assert summary.well is not None
         found.append(
             f"the wells are full at {summary.well[0]:.0f} ADU above bias: {summary.full.sum()} of "
-            f"{len(summary.levels)} levels of flats are that bright, or nearly, and left out of gain "
-            "and linearity"
+            f"{len(summary.levels)} levels of flats are that bright, or nearly, and left out of "
+            "gain and linearity"
         )
     if summary.linearity is not None and summary.linearity.max_deviation > _LINEARITY:
         found.append(
