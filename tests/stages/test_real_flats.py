@@ -13,6 +13,7 @@ from pixcal.effects.lag import Lag
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.estimators.detector.flat_ladder import ladder as ladder_of
 from pixcal.estimators.detector.flat_ladder import level_before
+from pixcal.estimators.detector.transfer_curve import transfer_curve
 from pixcal.estimators.diagnosis.test_statistics import DETECTOR, measure
 from pixcal.estimators.diagnosis.test_statistics.look import STEPS
 from pixcal.model.arrays import F64
@@ -86,6 +87,15 @@ def test_levels_that_bend_without_their_noise_are_the_lamp(
     assert found is not None
     assert (ladder_of(evidence) is not None) == told
     assert (found.significance > 5) == (quadratic != 0)
+
+
+def test_noise_says_nothing_where_the_level_is_not_known(tmp_path: Path) -> None:
+    """Neither bias nor dark frames: the signal includes the bias."""
+    evidence, _ = reduced(Detector(**CAMERA, flats=ladder([(t, 1) for t in LEVELS])), 1, tmp_path)
+    without = replace(evidence, bias=np.zeros_like(evidence.bias))
+    for one, known in ((evidence, True), (without, False)):
+        assert (("photon_transfer", DETECTOR) in measure(one)) == known
+        assert (transfer_curve(one) is not None) == known
 
 
 def test_a_level_of_another_lamp_is_not_of_the_ladder(tmp_path: Path) -> None:

@@ -41,7 +41,9 @@ class TransferCurve:
 
 
 def transfer_curve(evidence: Evidence, *, whole: bool = False) -> TransferCurve | None:
-    """Photon transfer of each level of flats; None with fewer than three levels.
+    """Photon transfer of each level of flats.
+
+    None with fewer than three levels, or where that without light is not known.
 
     Where flats told the gain, of `STEPS` only those count that were found to share noise, unless
     the ``whole`` noise is asked for. The slope is better known so; but what several share together
@@ -51,6 +53,8 @@ def transfer_curve(evidence: Evidence, *, whole: bool = False) -> TransferCurve 
 
 
 def _transfer_curve(evidence: Evidence, whole: bool) -> TransferCurve | None:
+    if not evidence.has_level:
+        return None
     counted = None if whole else _shared_steps(evidence)
     without = (s for s in evidence.stacks if s.kind != "flat" and _is_enough(s))
     darks = [_read_alone(sums) for s in without if (sums := _of_stack(s, evidence)) is not None]

@@ -173,6 +173,11 @@ class Evidence:
         """Whether the read noise spans so much of a code that means of dark samples are right."""
         return self.amplifier_noise > DITHER * self.gain * self.step_adu
 
+    @property
+    def has_level(self) -> bool:
+        """Whether the level without light is known, so that noise can be held against light."""
+        return bool(self.bias.any())
+
     @cached_property
     def ladder(self) -> tuple[Stack, ...]:
         """Flats by exposure time, without those that are saturated in part."""

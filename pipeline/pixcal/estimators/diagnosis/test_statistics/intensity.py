@@ -48,7 +48,7 @@ def residual_by_level(look: Look) -> Curve:
 def photon_transfer(evidence: Evidence) -> Curve | None:
     """Variance of differences of flats over what shot and read noise give, for each level."""
     values = []
-    for stack in evidence.ladder:
+    for stack in evidence.ladder if evidence.has_level else ():
         if len(stack.adu) < 2:
             continue
         light = (stack.adu - evidence.bias.astype(np.float32))[:, evidence.good] * np.float32(
