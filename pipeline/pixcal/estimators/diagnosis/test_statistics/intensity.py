@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from pixcal.estimators.detector.flat_ladder import ladder, straight_line
+from pixcal.estimators.detector.flat_ladder import MIN_RUNGS, ladder, straight_line
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.test_statistics import Curve, statistic
 from pixcal.estimators.diagnosis.test_statistics.look import CODES, LEVELS, Look
+from pixcal.model.arrays import F64
 
 CLASSES = (4, 16, 64)
 
@@ -47,6 +48,11 @@ def residual_by_level(look: Look) -> Curve:
 )
 def photon_transfer(evidence: Evidence) -> Curve | None:
     """Variance of differences of flats over what shot and read noise give, for each level."""
+    values = _noise_of_flats(evidence)
+    return Curve(np.arange(len(values), dtype=float), values) if len(values) else None
+
+
+def _noise_of_flats(evidence: Evidence) -> F64:
     values = []
     for stack in evidence.ladder if evidence.has_level else ():
         if len(stack.adu) < 2:
@@ -58,7 +64,23 @@ def photon_transfer(evidence: Evidence) -> Curve | None:
         steps = np.diff(light, axis=0)
         expected = np.maximum(light.mean(axis=0), 0) + evidence.read_noise**2
         values.append(float(np.mean(np.minimum(steps**2 / 2 / expected, 50))))
-    return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None
+    return np.array(values)
+
+
+@statistic(
+    "intensity",
+    "photon transfer: shape of variance against signal",
+    "noise / expected noise, over its mean",
+    x="flat",
+    power=True,
+    sets=False,
+)
+def photon_transfer_shape(evidence: Evidence) -> Curve | None:
+    """The same over its mean: how the noise bends is known better than the gain is."""
+    values = _noise_of_flats(evidence)
+    if len(values) < MIN_RUNGS:
+        return None
+    return Curve(np.arange(len(values), dtype=float), values / values.mean())
 
 
 @statistic(
