@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from pixcal.estimators.frame_series.walk_modes import walk_modes
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best, sigmas_of_chi2
@@ -16,6 +17,8 @@ from pixcal.model.arrays import F32, F64, Indices, Mask
 MIN_FRAMES = 8
 MAX_EDGES = 15  # along each axis
 NARROWEST = 8  # rows or columns of an output at least; even: two that alternate cancel
+# lines on either side whose means are compared: levels differ little beside the noise of few lines
+WIDTHS = (NARROWEST, 3 * NARROWEST, 9 * NARROWEST)
 _FAR = 24  # lines on either side by which an edge is placed
 _WILD = 5.0  # standard deviations from which a sample, _CLIP from which a step of a frame is cut
 _CLIP = 3.0
@@ -77,43 +80,56 @@ def _calm(rest: F32, good: Mask) -> F32:
 def _edges(rests: Sequence[F32], good: Mask, axis: int) -> tuple[list[tuple[int, float]], float]:
     """Edges along an axis with their significance, clearest first, and that of the clearest."""
     size = good.shape[axis]
-    places = np.arange(NARROWEST, size - NARROWEST + 1)
-    count = np.maximum(good.sum(axis=1 - axis), 1)
-    if len(places) < 4 * NARROWEST:
+    if size < 6 * NARROWEST - 1:
         return [], -np.inf
+    count = np.maximum(good.sum(axis=1 - axis), 1)
     lines = [rest.sum(axis=2 - axis, dtype=float) / count for rest in rests]
-    square, frames = np.zeros(len(places)), 0
-    for own in lines:
-        steps = _means(own, places, NARROWEST) - _means(own, places - NARROWEST, NARROWEST)
-        usual = 1.4826 * np.median(np.abs(steps)) or 1.0
-        square += np.square(np.clip(steps / usual, -_CLIP, _CLIP)).sum(axis=0)
-        frames += len(own)
-    dof = frames - len(rests)
-    square *= dof / np.maximum(_usual(square), 1e-9)
+    dof = sum(len(own) - 1 for own in lines)
+    free = {width: _steps(lines, width, dof) for width in WIDTHS if 4 * width < size}
+    looks = 2 * sum(np.count_nonzero(square) for square in free.values())
     found: list[tuple[int, float]] = []
-    free = square.copy()
-    while len(found) < MAX_EDGES and free.max() > 0:
-        at = int(free.argmax())
-        chance = sigmas_of_chi2(float(free[at]), dof)
-        sigmas = sigmas_of_best(*[chance] * (2 * len(places)))
-        edge = _placed(lines, int(places[at]))
+    while len(found) < MAX_EDGES and max(square.max() for square in free.values()) > 0:
+        best = max(free.values(), key=np.max)
+        at = int(best.argmax())
+        chance = sigmas_of_chi2(float(best[at]), dof)
+        sigmas = sigmas_of_best(*[chance] * looks)
+        edge = _placed(lines, at)
         found.append((edge, sigmas))
         if sigmas < SIGNIFICANT:
             break
         # Steps that are cut are alike at several places, of which the first need not be the edge.
-        for middle in (at, edge - NARROWEST):
-            free[max(middle - NARROWEST, 0) : middle + NARROWEST + 1] = 0
+        for width, square in free.items():
+            for middle in (at, edge):
+                square[max(middle - width, 0) : middle + width + 1] = 0
     return found, found[0][1] if found else -np.inf
 
 
-def _usual(square: F64) -> F64:
-    """Median (n,) of all places or, where it is larger, of those on a side: noise may differ."""
-    away, near = 4 * NARROWEST, NARROWEST
-    found = np.full(len(square), np.median(square))
-    for n in range(len(square)):
-        sides = (square[max(n - away, 0) : max(n - near, 0)], square[n + near : n + away])
-        found[n] = max(found[n], *(float(np.median(side)) for side in sides if len(side) >= near))
+def _steps(lines: Sequence[F64], width: int, dof: int) -> F64:
+    """Sum over frames of the squared step at each place over the usual one: chi-square by chance.
+
+    Between the means of ``width`` lines on either side; zero where there are fewer.
+    """
+    size = lines[0].shape[1]
+    places = np.arange(width, size - width + 1)
+    square = np.zeros(len(places))
+    for own in lines:
+        # Noise may differ from place to place.
+        noise = _line_noise(own)[None]
+        expected = _means(noise, places, width)[0] + _means(noise, places - width, width)[0]
+        steps = _means(own, places, width) - _means(own, places - width, width)
+        steps /= np.sqrt(np.maximum(expected, 1e-12))
+        usual = 1.4826 * np.median(np.abs(steps)) or 1.0
+        square += np.square(np.clip(steps / usual, -_CLIP, _CLIP)).sum(axis=0)
+    found = np.zeros(size + 1)
+    found[places] = square * dof / max(float(np.median(square)), 1e-9)
     return found
+
+
+def _line_noise(lines: F64) -> F64:
+    """Variance (n,) of means (t, n) of lines, by how they differ from the next; no step counts."""
+    change = np.square(np.diff(lines, axis=1)).mean(axis=0) / 2
+    near = np.pad(change, (NARROWEST, NARROWEST + 1), mode="reflect")
+    return np.asarray(np.median(sliding_window_view(near, 2 * NARROWEST + 1), axis=1))
 
 
 def _means(lines: F64, first: Indices, count: int) -> F64:
@@ -126,9 +142,7 @@ def _placed(lines: Sequence[F64], about: int) -> int:
     """Place about an edge that parts the lines best."""
     size = lines[0].shape[1]
     first, last = max(about - _FAR, 0), min(about + _FAR, size)
-    places = range(
-        max(about - NARROWEST // 2, first + 1), min(about + NARROWEST // 2, last - 1) + 1
-    )
+    places = range(max(about - NARROWEST, first + 1), min(about + NARROWEST, last - 1) + 1)
     gains = []
     for place in places:
         before, after = place - first, last - place
