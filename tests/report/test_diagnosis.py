@@ -187,6 +187,18 @@ def table(shown: Shown, title: str) -> Table:
     return found
 
 
+@pytest.mark.usefixtures("without_figures")
+@pytest.mark.parametrize("verdict", ["no gap", "explained", "partly explained"])
+def test_frames_that_were_not_split_are_not_called_held_out(verdict: str) -> None:
+    found = a_diagnosis(verdict, curves=(a_curve("a", sigma=9.0, after=0.5),))
+    used = found.facts["looked_at"]
+    for shared in ([], ["flat"]):
+        of = dataclasses.replace(found, facts=found.facts | {"looked_at": used | {"shared": shared}})
+        shown = diagnosis(contents(of))
+        assert ("held-out" in shown.answer) != bool(shared)
+        assert ("tested on the other, except flat frames" in shown.text) == bool(shared)
+
+
 def test_a_run_that_was_not_diagnosed_says_what_to_run() -> None:
     shown = diagnosis(contents(None))
     assert shown.text.startswith("Not run: run 'pixcal diagnose RUN'")

@@ -49,6 +49,7 @@ _AXES = {
     "period, columns": _Axis("period, columns", "every {} columns"),
     "frames before": _Axis("other frame", "frame {}"),
     "harmonic (cosine, sine)": _Axis("harmonic", "{}"),
+    "exposure time of flats": _Axis("exposure time (s)", "flats of {} s"),
     "batches averaged": _Axis("batches averaged", "batches averaged: {}"),
 }
 

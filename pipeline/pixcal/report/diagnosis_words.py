@@ -57,8 +57,8 @@ def answer(diagnosis: DiagnosisContents) -> str:
     count = sum(bool(c["in_gap"]) for c in diagnosis.curves)
     if verdict == "no gap":
         return (
-            f"No gap: on held-out frames, none of {tested} statistics differs significantly from "
-            "the nominal simulation."
+            f"No gap: {'' if _shared(facts) else 'on held-out frames, '}none of {tested} "
+            "statistics differs significantly from the nominal simulation."
         )
     where = _main_domain(gap, residual=False)
     if verdict == "unexplained":
@@ -69,18 +69,23 @@ def answer(diagnosis: DiagnosisContents) -> str:
         )
     causes = listed(effect_title(diagnosis, c["effect"]) for c in facts["causes"])
     one = len(facts["causes"]) == 1
-    left = residual_gap(gap)
+    left, held_out = residual_gap(gap), "" if _shared(facts) else ", measured on held-out frames"
     if verdict == "explained":
         return (
             f"Explained: {causes} account{'s' if one else ''} for the differences between the "
             f"data and the nominal simulation, found in {count} of {tested} statistics. The "
-            f"{left}, measured on held-out frames."
+            f"{left}{held_out}."
         )
     return (
         f"{verdict[:1].upper()}{verdict[1:]}: {causes} close{'s' if one else ''} "
         f"{percent(1 - gap['after'])} of the gap between the data and the nominal simulation. The "
-        f"{left}{_main_domain(gap, residual=True)}, measured on held-out frames."
+        f"{left}{_main_domain(gap, residual=True)}{held_out}."
     )
+
+
+def _shared(facts: Mapping[str, Any]) -> bool:
+    """Whether some frames were too few to fit effects on one half and test them on the other."""
+    return bool(facts.get("looked_at", {}).get("shared"))
 
 
 def _main_domain(gap: Mapping[str, Any], *, residual: bool) -> str:

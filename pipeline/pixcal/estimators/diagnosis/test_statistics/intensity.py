@@ -87,7 +87,7 @@ def photon_transfer_shape(evidence: Evidence) -> Curve | None:
     "intensity",
     "linearity: deviation of the flats from a line over exposure time",
     "relative deviation",
-    x="flat",
+    x="exposure time of flats",
     sets=False,
 )
 def flat_ladder(evidence: Evidence) -> Curve | None:
