@@ -193,7 +193,9 @@ def test_frames_that_were_not_split_are_not_called_held_out(verdict: str) -> Non
     found = a_diagnosis(verdict, curves=(a_curve("a", sigma=9.0, after=0.5),))
     used = found.facts["looked_at"]
     for shared in ([], ["flat"]):
-        of = dataclasses.replace(found, facts=found.facts | {"looked_at": used | {"shared": shared}})
+        of = dataclasses.replace(
+            found, facts=found.facts | {"looked_at": used | {"shared": shared}}
+        )
         shown = diagnosis(contents(of))
         assert ("held-out" in shown.answer) != bool(shared)
         assert ("tested on the other, except flat frames" in shown.text) == bool(shared)
