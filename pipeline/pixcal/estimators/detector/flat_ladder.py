@@ -19,9 +19,7 @@ MIN_RUNGS = 3  # fewest levels of flats that tell a curve from a line
 LAMP = 1e-3  # relative error of the light of a flat at least, its exposure time included
 STEADY = 0.1  # rms of the levels about a curve beyond which the lamp was changed between them
 RATES = 1.3  # largest over least light a second of few levels of one lamp
-OFF = (
-    8.0  # usual distances of the levels from the curve beyond which one of them is of another lamp
-)
+OFF = 8.0  # usual distances from the curve beyond which a level is of another lamp
 DISAGREE = 4.0  # errors between the curve of the levels and that of their noise
 
 # least degrees of freedom of the flicker with which first frames tell more than it: six pairs

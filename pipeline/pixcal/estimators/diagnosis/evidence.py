@@ -176,7 +176,8 @@ class Evidence:
     @property
     def has_level(self) -> bool:
         """Whether the level without light is known, so that noise can be held against light."""
-        return bool(self.bias.any())
+        # A camera that cuts its noise off at zero may have a bias of zero everywhere.
+        return bool(self.bias.any()) or any(stack.kind != "flat" for stack in self.stacks)
 
     @cached_property
     def ladder(self) -> tuple[Stack, ...]:

@@ -106,7 +106,7 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     # Pixels that are full saturate the flats though no sample of the converter does.
     points = transfer_points(add_neighbours(sums[1], sums[0]).sums)
     well = saturation(points)
-    full = usable & (nearly | (levels > sum(well)) if well else np.False_)
+    full = usable & (nearly | (levels > sum(well))) if well else np.zeros_like(usable)
     usable &= ~full
     light = _light(tables, levels, usable, job)
     medians = usual(job, folder, light)
