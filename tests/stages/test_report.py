@@ -211,7 +211,7 @@ def write_diagnose(run: Path, verdict: str = "explained", effects: tuple[str, ..
         "gap_closed": 0.97, "gap_closed_interval": [0.95, 0.98],
         "gain_over_rest": 0.97, "p_value": 1e-30, "sigmas": 30.0, "why": NASTY,
         "given_away_by": [{"statistic": "contrast_by_step", "set": "one"}],
-        "not_told_apart_from": [], "would_decide": [],
+        "not_told_apart_from": [], "would_decide": [], "remedy": "flush the sensor",
         "on_map": {"rms_px": 0.0, "max_px": 0.0, "action": "not measured"},
     }  # fmt: skip
     facts = {
@@ -406,8 +406,10 @@ def test_without_a_fit_the_detector_is_shown(tmp_path: Path, sets: tuple[str, ..
 
 @pytest.mark.usefixtures("without_figures")
 def test_a_detector_without_fringes_is_no_bench(tmp_path: Path) -> None:
-    page = words(page_of(make_run(tmp_path / "run", (37, 29), (), stages=("ingest", "reduce"))))
+    stages = ("ingest", "reduce", "diagnose")
+    page = words(page_of(make_run(tmp_path / "run", (37, 29), (), stages=stages)))
     assert "CHIP: detector" in page
+    assert "0.2000 ± 0.0010 %  flush the sensor" in page
     assert "The detector: gain 1.0100 ± 0.0040 e⁻/ADU, read noise 16.00 e⁻ (declared)." in page
     for word in ("fibre", "fringe set", "632.8", "offsets from"):
         assert word not in page.split("Acquisition as understood")[0], word

@@ -46,6 +46,10 @@ class BrighterFatter(Effect):
     domains = ("intensity", "noise", "space")
     strengths = ("shift_px_per_e",)
     frames_needed = ("ladder", "baseline")
+    remedy = (
+        "the conversion gain allows for it; bright spots grow with their level: correct "
+        "widths for it"
+    )
     quick = False
     sources = (
         "Antilogus et al. 2014, JINST 9, C03048: spots grow by up to 2 % over the full range; "

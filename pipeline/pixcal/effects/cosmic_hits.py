@@ -71,6 +71,7 @@ class CosmicHits(Effect):
     strengths = ("rate_cm2_s", "readout_cm2")
     left_because = "few samples are hit, and most of them are masked"
     frames_needed = ("dark",)
+    remedy = "take several frames and reject outliers"
     sources = (
         "Particle Data Group, Review of Particle Physics, Cosmic Rays: about one muon per cm^2 and "
         "minute through a horizontal detector at sea level",

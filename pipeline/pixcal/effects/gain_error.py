@@ -50,6 +50,7 @@ class GainError(Effect):
         "reduce --gain measured', and fit again"
     )
     frames_needed = ("flat",)
+    remedy = "set gain_e_per_adu to the measured gain, or run 'pixcal reduce RUN --gain measured'"
     sources = (
         "Janesick 2007, Photon Transfer (SPIE PM170): gain by photon transfer, to about 1 % with "
         "some ten thousand pixels",

@@ -51,6 +51,9 @@ class Lag(Effect):
     )
     optional_parameters = ("decay_frames", "spread", "quiet", "carried")
     frames_needed = ("random",)
+    remedy = (
+        "fix on the bench: flush the sensor, or discard the first frame after a change of light"
+    )
     quick = False
     sources = (
         "Bonjour, Blanc and Kayal 2012, IEEE Electron Device Letters 33(12), 1735: lag of pinned "

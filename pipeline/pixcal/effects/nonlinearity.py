@@ -66,6 +66,7 @@ class Nonlinearity(Effect):
     domains = ("intensity",)
     strengths = ("quadratic", "cubic", "bends")
     frames_needed = ("ladder",)
+    remedy = "the signal can be linearised with this curve (parameters in diagnosis.json)"
     quick = False
     sources = (
         "Rousset et al., table 1: 2 % linearity error of the GIGAPYX-4600",

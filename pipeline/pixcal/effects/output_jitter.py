@@ -35,6 +35,7 @@ class OutputJitter(Effect):
     strengths = ("output_rms", "walk_e_h")
     left_because = "noise that is independent in each frame averages out"
     frames_needed = ("dark",)
+    remedy = "subtract the level of each output in each frame, from dark or overscan pixels"
     sources = (
         "Rauscher 2015, PASP 127, 1144: the outputs of an infrared array have noise of their own "
         "beside what they share",

@@ -57,6 +57,9 @@ class Quantisation(Effect):
     strengths = ("coarse_adu", "dnl_rms", "ripple", "bits", "widths")
     left_because = "rounding adds noise of some hundredths of the bound"
     frames_needed = ("ladder",)
+    remedy = (
+        "fix on the bench: raise the analogue gain until the noise exceeds a step between codes"
+    )
     sources = (
         "IEEE Std 1241-2010: code widths from histograms; round-off of step/sqrt(12) rms",
         "Widrow and Kollar 2008, Quantization Noise, Cambridge University Press: when round-off is "

@@ -45,6 +45,7 @@ class RowNoise(Effect):
     strengths = ("row_rms", "flicker_rms", "interlace_rms", "column_rms", "alternate_rms")
     left_because = "noise that is independent in each frame averages out"
     frames_needed = ("dark",)
+    remedy = "subtract the level of each line in each frame, from dark or overscan pixels"
     sources = (
         "Rauscher 2015, PASP 127, 1144: infrared arrays of 5 e- read noise have 3 e- of correlated "
         "flicker noise, and 0.5 e- of noise of alternate columns",

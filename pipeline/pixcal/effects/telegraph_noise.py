@@ -69,6 +69,7 @@ class TelegraphNoise(Effect):
     strengths = ("amplitude_e",)
     left_because = "such pixels have larger errors, and SIGMA shows them"
     frames_needed = ("dark",)
+    remedy = "exclude the pixels flagged noisy, and take medians over frames"
     quick = False
     sources = (
         "Ozdogru et al. 2025, Proc. SPIE 13527, 135270V (arXiv:2505.24540): telegraph noise in 1 "

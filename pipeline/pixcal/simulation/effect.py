@@ -169,6 +169,8 @@ class Effect(ForwardModel):
         How the fit absorbs it; empty where it does not.
     left_because : str
         Why maps need no correction for it all the same: it is noise, or small.
+    remedy : str
+        What to do about it on a detector without fringes.
     is_gain : bool
         Whether it scales all samples alike, as photon transfer measures.
     fit_model : str
@@ -179,6 +181,7 @@ class Effect(ForwardModel):
 
     absorbed_because: ClassVar[str] = ""
     left_because: ClassVar[str] = ""
+    remedy: ClassVar[str] = "find and fix it on the bench"
     is_gain: ClassVar[bool] = False
     fit_model: ClassVar[str] = ""
     smooth_degree: ClassVar[int] = 3

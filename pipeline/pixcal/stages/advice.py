@@ -11,7 +11,7 @@ from pixcal.effects import known_effects
 from pixcal.report.text import NO_OFFSETS, number, with_error
 from pixcal.stages.treatment import CORRECTED, SUFFIX, fitted_shapes, treatment_of_kind
 from pixcal.storage.manifest import MANIFEST, read_json
-from pixcal.storage.stage import require
+from pixcal.storage.stage import read_acquisition, require
 
 Json = Mapping[str, Any]
 
@@ -38,14 +38,21 @@ def advice(run_dir: Path) -> Advice:
     sigma = _sigma(fit, correction)
     causes = diagnosis["causes"] if diagnosis else ()
     shapes = fitted_shapes(run_dir)
+    fringes = bool(read_acquisition(run_dir).frames.fringes)
+
+    def action(cause: Json) -> str:
+        to_do = str(cause.get("remedy", ""))
+        if fringes:
+            to_do = _action(cause, correction, shapes, bool(sigma))
+        return f"{to_do}{_to_distinguish(cause)}"
+
     rows: tuple[tuple[str, ...], ...] = tuple(
-        (c["effect"], size_of(c), moved_by(c, sigma), _action(c, correction, shapes, bool(sigma)))
-        for c in causes
+        (c["effect"], size_of(c), moved_by(c, sigma), action(c)) for c in causes
     )
     rows = (("effect", "size", "effect on the offsets", "action"), *rows) if rows else ()
     if not sigma:
         rows = tuple((*row[:2], *row[3:]) for row in rows)
-    settled = all(_settled(c, correction, bool(sigma)) for c in causes)
+    settled = all(fringes and _settled(c, correction, bool(sigma)) for c in causes)
     if not fit["outputs"]:
         return Advice((), rows, settled)
     if not sigma:
@@ -175,10 +182,8 @@ def _action(
     why = treated["why"] if treated else treatment_of_kind(kind, *shapes)[1] if kind else ""
     because = f": {why}" if why else ""
     if action == "corrected":
-        if not with_maps and cause["on_map"]["rms_px"]:
+        if not with_maps:
             text = "'pixcal fit RUN --with-diagnosis' makes maps corrected for it"
-        elif not with_maps:
-            text = "pixcal corrects maps of pixel offsets for it, once there are fringe frames"
         elif _settled(cause, correction, with_maps):
             text = "maps corrected"
         else:
@@ -187,10 +192,15 @@ def _action(
         text = f"{'maps unaffected' if with_maps else 'no bias of pixel offsets'}{because}"
     else:
         text = action.replace("fix the", "fix on the") + because
-    if cause.get("would_decide"):
-        others = " or ".join(cause["not_told_apart_from"])
-        text += f"; to distinguish it from {others}, retake with {', '.join(cause['would_decide'])}"
     return text
+
+
+def _to_distinguish(cause: Json) -> str:
+    """Frames that would distinguish a cause from others, for the end of a sentence."""
+    if not cause.get("would_decide"):
+        return ""
+    others = " or ".join(cause["not_told_apart_from"])
+    return f"; to distinguish it from {others}, retake with {', '.join(cause['would_decide'])}"
 
 
 def size_of(cause: Json) -> str:

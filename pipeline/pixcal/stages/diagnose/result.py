@@ -181,6 +181,7 @@ class _Description:
             "p_value": float(np.clip(chance, MIN_P_VALUE, 1.0)),
             "sigmas": _rounded(estimate.significance),
             "why": estimate.why,
+            "remedy": effect.remedy,
             "given_away_by": self._telling(found.without[name]),
             "not_told_apart_from": list(alike),
             "would_decide": recommend_frames(self.facts.missing_frames, kinds) if alike else [],
