@@ -234,6 +234,9 @@ def test_flats_tell_where_there_are_no_fringes(acquired: Callable[..., Evidence]
     off = (found.effect.response(top) - Nonlinearity().response(top))[0] / top[0]
     assert abs(off) < 4 * found.errors["quadratic"] < 0.012
     assert found.significance > 6
+    at = float(found.size["of"].split()[-2])
+    true = float(Nonlinearity().response(np.float32([at]))[0]) / at - 1
+    assert abs(found.size["value"] - true) < 4 * found.size["error"] < -2 * true
     nominal = Nonlinearity.estimate(replace(acquired(), fringes={}))
     assert nominal is not None
     assert nominal.significance < 4

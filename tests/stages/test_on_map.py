@@ -71,6 +71,8 @@ def test_the_size_of_an_effect_is_told_in_its_units():
     points = [{"level_e": 0.0, "change_e": 0.0}, {"level_e": 5e3, "change_e": -100.0}]
     bent = {"strengths": ["bends"], "units": {"bends": ""}, "parameters": {"bends": points}}
     assert size_of(bent) == "2 bends, largest 2 %"
+    told = {"value": -0.02, "error": 0.001, "unit": "", "of": "off a line at 900 e-"}
+    assert size_of(bent | {"size": told}) == "−2.00 ± 0.10 % off a line at 900 e⁻"
     glow = {"parameters": {"rate": 118.0, "reach_px": 15.0}, "uncertainty": {"rate": 2.0}}
     own = glow | {"units": {"rate": "e-/s", "reach_px": "px"}, "strengths": ["rate"]}
     assert size_of(own) == "rate 118.0 ± 2.0 e⁻/s"

@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from pixcal.estimators.detector.flat_ladder import ladder_response
+from pixcal.estimators.detector.flat_ladder import ladder, ladder_response
 from pixcal.estimators.detector.ladder_curve import ladder_curve
 from pixcal.estimators.detector.neighbours import shared_charge
 from pixcal.estimators.detector.response import departure, fit_curve, fit_response
@@ -163,9 +163,11 @@ class Nonlinearity(Effect):
             points = np.pad(bent.charge, (1, 0)).tolist(), np.pad(bent.change, (1, 0)).tolist()
             named = {f"bends[{n}].change_e": float(e) for n, e in enumerate(bent.error, 1)}
             steps = tuple(dict(zip(named, own, strict=True)) for own in bent.steps.T.tolist())
+            # The last point lies beyond the flats.
+            size = _size(bent.charge[-2], bent.change[-2], bent.error[-2])
             return Estimate(
                 cls(0.0, 0.0, found.level_e, tuple(map(Bend, *points))), named, *told, steps,
-                law="response curve of second and third order", by_law=effect,
+                law="response curve of second and third order", by_law=effect, size=size,
             )  # fmt: skip
         if evidence.fringes and found.significance > SIGNIFICANT:
             part = central_crop(evidence)
@@ -174,12 +176,13 @@ class Nonlinearity(Effect):
         errors = np.sqrt(np.diag(found.covariance))
         named = {"quadratic": float(errors[0]), "cubic": float(errors[1])}
         if more is None:
-            return Estimate(effect, named, *told, refused=refused)
+            return Estimate(effect, named, *told, refused=refused, size=found.size)
         named |= {f"bends[{n}].change_e": error for n, error in enumerate(more[1])}
         curve = replace(effect, bends=more[0])
         return Estimate(
             replace(curve, bends=(*more[0], *_straight_on(curve, evidence))), named, *told,
             law="response curve of second and third order", by_law=effect, refused=refused,
+            size=found.size,
         )  # fmt: skip
 
     @classmethod
@@ -197,6 +200,14 @@ class _Polynomial:
     covariance: F64  # (2, 2)
     why: str
     details: Mapping[str, object]
+    top_e: float  # highest level measured
+
+    @property
+    def size(self) -> dict[str, object]:
+        # A power that the flats do not tell is taken as zero, its error as large.
+        terms = (self.top_e / self.level_e) ** np.array([1, 2]) * (self.sizes != 0)
+        error = float(np.sqrt(terms @ self.covariance @ terms))
+        return _size(self.top_e, self.top_e * float(terms @ self.sizes), self.top_e * error)
 
     @property
     def chi2(self) -> float:
@@ -210,9 +221,9 @@ class _Polynomial:
 def _polynomial(evidence: Evidence) -> _Polynomial | None:
     """From fringes or, without them, from what flats tell best."""
     level = _full_scale(evidence, Nonlinearity().level_e)
-    ladder, curve = ladder_response(evidence, level), _of_noise(evidence, level)
+    levels, curve = ladder_response(evidence, level), _of_noise(evidence, level)
     # Information on the bend alone: the ladder has a cubic term beside it.
-    told = [0.0 if one is None else np.linalg.inv(one[1])[0, 0] for one in (ladder, curve)]
+    told = [0.0 if one is None else np.linalg.inv(one[1])[0, 0] for one in (levels, curve)]
     by_levels = told[0] > told[1]
     if evidence.fringes:
         shifts = boundary_shifts(FALLOFF_PX)
@@ -221,8 +232,8 @@ def _polynomial(evidence: Evidence) -> _Polynomial | None:
         known = None if noise is None else (noise.size, noise.variance)
         sizes, covariance = fit_response(part, level, 2, shifts, known)
         why = "second and third harmonic of the fringes in the residuals"
-    elif ladder is not None and by_levels:
-        sizes, covariance = ladder
+    elif levels is not None and by_levels:
+        sizes, covariance = levels
         why = "flat levels that are not proportional to the exposure time"
     elif curve is not None:
         sizes, covariance = curve
@@ -232,11 +243,24 @@ def _polynomial(evidence: Evidence) -> _Polynomial | None:
     details: dict[str, object] = {}
     if curve is not None:
         details["of_noise"], details["of_noise_error"] = curve[0][0], curve[1][0, 0] ** 0.5
-    if ladder is not None:
-        errors = np.sqrt(np.diag(ladder[1]))
-        details["of_flats"] = [float(v) for v in ladder[0]]
+    if levels is not None:
+        errors = np.sqrt(np.diag(levels[1]))
+        details["of_flats"] = [float(v) for v in levels[0]]
         details["of_flats_errors"] = [float(v) for v in errors]
-    return _Polynomial(level, sizes[:2], covariance[:2, :2], why, details)
+    measured = ladder(evidence) if by_levels else transfer_curve(evidence)
+    top = level if evidence.fringes or measured is None else measured.top
+    return _Polynomial(level, sizes[:2], covariance[:2, :2], why, details, top)
+
+
+def _size(charge: float, change: float, error: float) -> dict[str, object]:
+    """`Estimate.size` of a response by its departure at a charge, all in e-."""
+    at = f"{float(f'{charge:.2g}'):.0f} e-"
+    return {
+        "value": float(change / charge),
+        "error": float(error / charge),
+        "unit": "",
+        "of": f"off a straight line through low signals, at {at}",
+    }
 
 
 def _bends(

@@ -108,6 +108,9 @@ class Estimate:
         the effect itself.
     refused : str
         Why it cannot be a cause, however significant.
+    size : mapping
+        The size where the strengths do not say it: ``value``, ``error``, ``unit`` (empty for a
+        ratio), and what it is ``of``, in words that follow the number.
     """
 
     effect: "Effect"
@@ -121,6 +124,7 @@ class Estimate:
     again: "Again | None" = None
     in_full: "Effect | None" = None
     refused: str = ""
+    size: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def sure(self) -> "Effect":

@@ -204,7 +204,10 @@ def _to_distinguish(cause: Json) -> str:
 
 
 def size_of(cause: Json) -> str:
-    """The strengths of an effect with errors and units."""
+    """The strengths of an effect with errors and units, or its size where these do not say it."""
+    if size := cause.get("size"):
+        measured = _measured(size["value"], size["error"], size["unit"])
+        return f"{measured} {size['of'].replace('e-', 'e⁻')}"
     sizes = (_strength(cause, name, cause["units"][name]) for name in cause["strengths"])
     return "; ".join(filter(None, sizes)) or "-"
 

@@ -171,6 +171,7 @@ class _Description:
             "units": {f.name: f.metadata.get("unit", "") for f in fields(effect)},
             "meanings": {f.name: f.metadata.get("doc", "") for f in fields(effect)},
             "strengths": list(effect.strengths),
+            "size": dict(estimate.size),
             "law": estimate.law,
             "gap_closed": _closed(alone.gap.total),
             "gap_closed_interval": [
