@@ -11,7 +11,7 @@ from astropy.table import Table
 from astropy.wcs import WCS
 
 import pixcal
-from pixcal.estimators.star_centroids.correction import gaussian_star
+from pixcal.estimators.star_centroids import gaussian_star
 from pixcal_cli.main import invoke
 
 SHAPE = (50, 60)

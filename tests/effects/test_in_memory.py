@@ -14,10 +14,9 @@ from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
 from pixcal.model.options import Sweep
 from pixcal.stages import ingest, reduce, simulate
-from pixcal.stages.diagnose.parts import Raw, take
+from pixcal.stages.diagnose.parts import NO_BATCHES, Raw, run_in_memory, take
 from pixcal.stages.diagnose.windows import whole_of
 from pixcal.stages.evidence import evidence_of
-from pixcal.stages.in_memory import NO_BATCHES, run_in_memory
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.stage import read_acquisition
 

@@ -192,7 +192,7 @@ def test_progress_goes_to_stderr(quiet: bool, capfd: pytest.CaptureFixture[str])
 
 ORPHANS = """
 import time
-from pixcal.engine.local import run_in_processes
+from pixcal.engine.run import run_in_processes
 run_in_processes(time.sleep, [60.0] * 4, 2, print)
 """
 

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.special import jv
 
-from pixcal.estimators.star_centroids.centroids import Star
+from pixcal.estimators.star_centroids import Star
 from pixcal.kernels.psf import diffraction_psf
 
 F64 = NDArray[np.float64]

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
+from pixcal.estimators.crosstalk.dense import ShareShrinkage
+from pixcal.estimators.crosstalk.information import _third_pixels
 from pixcal.estimators.crosstalk.links import PixelClasses, links
-from pixcal.estimators.crosstalk.maps import response_slopes
-from pixcal.estimators.crosstalk.second_order import _third_pixels
-from pixcal.estimators.crosstalk.shrinkage import ShareShrinkage
+from pixcal.estimators.crosstalk.pattern import response_slopes
 from pixcal.kernels.crosstalk import Coupling, couple_fringes
 
 STEPS = links((40, 40), 2)

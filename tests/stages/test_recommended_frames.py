@@ -8,7 +8,7 @@ from pixcal.effects import effects
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.simulation.effect import Effect
-from pixcal.stages.diagnose.recommended_frames import MORE, RANDOM, missing_frames, recommend_frames
+from pixcal.stages.diagnose.frames_used import MORE, RANDOM, missing_frames, recommend_frames
 
 LADDER = (0.01, 0.02, 0.03)
 FOUR = ((6.0, 0.0), (-9.0, 0.1), (0.0, 6.0), (0.0, 9.0))

@@ -17,7 +17,7 @@ import zarr
 from astropy.io import fits
 from distributed import LocalCluster
 
-from pixcal.engine import local as local_engine
+from pixcal.engine import run as local_engine
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import InputError, RemoteError
 from pixcal.stages import fit, ingest, reduce

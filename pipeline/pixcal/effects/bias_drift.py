@@ -12,11 +12,12 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.light import LIGHT_PARTS, FrameLight, light_of
 from pixcal.estimators.frame_series.offset import (
     OffsetSeries,
+    dark_courses,
     dark_offsets,
+    fringe_courses,
     fringe_offsets,
     offset_modes,
 )
-from pixcal.estimators.frame_series.offset_courses import dark_courses, fringe_courses
 from pixcal.estimators.frame_series.profiled import Profiled, ProfiledFit, best_shape
 from pixcal.estimators.frame_series.variance_components import (
     MAX_STEPS,

@@ -7,14 +7,13 @@ from functools import partial
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.row_ramp import RowRamp
 from pixcal.estimators.frame_series.row_settling import (
     find_settling,
     profile,
     settling_sigmas,
     steps_of,
 )
-from pixcal.estimators.frame_series.row_sums import RowSums, enough_frames
+from pixcal.estimators.frame_series.row_sums import RowRamp, RowSums, enough_frames
 from pixcal.estimators.maps.imprint import imprint, left_in_samples
 from pixcal.kernels.synthesis import illuminate
 from pixcal.model.arrays import F32, F64

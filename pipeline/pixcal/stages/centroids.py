@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from astropy.wcs import WCS
 
-from pixcal.estimators.star_centroids.centroids import Star
-from pixcal.estimators.star_centroids.correction import (
+from pixcal.estimators.star_centroids import (
     Corrected,
+    Star,
     correct_centroids,
     correction_map,
     gaussian_star,

@@ -1,19 +1,21 @@
-"""What a constant added to a whole frame does, told apart from noise of rows, columns and pixels.
+"""A constant added to a whole frame, told apart from noise of rows, columns and pixels.
 
 The pixels are halved by stripes of rows and by stripes of columns, which makes four quarters. The
 mean of a frame (W) holds its offset and all of the noise. The difference of the halves by rows (R)
 holds the noise of rows and pixels, that by columns (C) of columns and pixels, the one across (K)
 of the pixels alone; each as much of it as the mean does. So the variances of the four give that of
-the offset, and no model of the noise stands between.
+the offset, and no model of the noise stands between. By them the noise in each frame's own offset
+is taken out (Wiener).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import STRIPE, FringeEvidence, Stack
-from pixcal.estimators.frame_series.variance_components import Modes
+from pixcal.estimators.diagnosis.evidence import STRIPE, Evidence, FringeEvidence, Stack
+from pixcal.estimators.frame_series.light import LIGHT_PARTS, FrameLight
+from pixcal.estimators.frame_series.variance_components import Modes, estimate_components
 from pixcal.estimators.frame_series.walk_modes import walk_modes
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.model.arrays import F32, F64, Mask
@@ -29,6 +31,10 @@ NOISES = np.array([[1, 1, 1, 1], [1, 1, 0, 0], [1, 0, 1, 0]])
 MIN_NOISE = 0.05
 BELOW = 0.3
 _MIN_VARIANCE = 1e-6  # e-², of samples in pixels that are not good
+KNOTS = 32  # most points of a course of fringes
+
+Course = tuple[str, F64, F64]
+"""Fringe set or e.g. ``bias frames``; times (t,) from its first frame, s; offsets (t,), e-."""
 
 
 @dataclass(frozen=True)
@@ -171,3 +177,49 @@ def _series(
 
 def _diagonals(values: F64) -> F64:
     return np.asarray(values[:, :, None] * np.eye(values.shape[1]))
+
+
+def fringe_courses(light: FrameLight) -> tuple[list[Course], float]:
+    """Slow offsets of every set: the part of (B, log A/B) that moves the first and not A.
+
+    Then what is left of it from frame to frame, e- rms over all sets.
+    """
+    light = replace(light, dark=())
+    drifts, every = ("offset_walk", "offset_smooth"), (*LIGHT_PARTS, "offset_smooth")
+    found, jitter = [], []
+    for series in light.sets:
+        modes = replace(light, sets=(series,)).modes(every)
+        size = np.maximum(estimate_components(modes).size, 0.0)
+        n = len(series) - 1
+        parts = size[:, None, None, None] * modes.parts[:, :n]
+        # In e-, what (B, log A/B) share with the drift.
+        drift = light.level[series.name] * sum(parts[every.index(name)] for name in drifts)
+        offset = series.walk_modes.series(_wiener(parts, drift[:, :, 0], modes.values[:n]))
+        some = np.unique(np.linspace(0, n, min(KNOTS, n + 1)).astype(int))
+        found.append((series.name, series.time_s[some], offset[some]))
+        jitter.append(size[every.index("offset")])
+    return found, float(np.sqrt(np.mean(jitter)))
+
+
+def dark_courses(evidence: Evidence) -> list[Course]:
+    """All that moves the level of bias and of dark frames, where these are of one exposure time."""
+    found = []
+    for kind in ("bias", "dark"):
+        stacks = evidence.of_kind(kind)
+        if len(stacks) != 1:
+            continue
+        series = dark_offsets(stacks[0], evidence.good, evidence.gain, evidence.read_noise)
+        if series is None:
+            continue
+        modes = offset_modes([series], [np.zeros((len(series), 0))])
+        size = np.maximum(estimate_components(modes).size, 0.0)
+        parts = size[:, None, None, None] * modes.parts
+        smooth = _wiener(parts, parts[:2].sum(axis=0)[:, :, 0], modes.values)
+        found.append((f"{kind} frames", stacks[0].time_s, walk_modes(series.time_s).series(smooth)))
+    return found
+
+
+def _wiener(parts: F64, wanted: F64, values: F64) -> F64:
+    """Modes (n,) of a quantity whose covariance with the values (n, c) is ``wanted`` (n, c)."""
+    weight = np.linalg.solve(parts.sum(axis=0), wanted[..., None])[..., 0]
+    return np.asarray(np.einsum("nc,nc->n", weight, values))

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.fft import irfft2, next_fast_len, rfft2
 
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.star_centroids.centroids import Star
+from pixcal.estimators.star_centroids import Star
 from pixcal.model.arrays import C128, F64
 from pixcal.stages.astrometry.detector import PixelPositions
 from pixcal.stages.astrometry.stars import MAX_LOST

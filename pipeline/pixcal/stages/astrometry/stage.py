@@ -25,7 +25,7 @@ import numpy as np
 from pixcal import __version__
 from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime
-from pixcal.estimators.star_centroids.centroids import Star
+from pixcal.estimators.star_centroids import Star
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F64
 from pixcal.model.config import result_options

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.star_centroids.centroids import Star
+from pixcal.estimators.star_centroids import Star
 from pixcal.kernels.psf import Psf, diffraction_psf
 from pixcal.model.acquisition import Detector as Declared
 from pixcal.model.arrays import F64

@@ -1,12 +1,24 @@
-"""Frames and windows that a diagnosis used; the fields are keys of ``diagnosis.json``."""
+"""Frames and windows that a diagnosis used, and frames that would separate similar effects.
 
+The fields are keys of ``diagnosis.json``.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from pixcal.stages.diagnose.parts import Half
+from pixcal.model.acquisition import Acquisition
+from pixcal.simulation.effect import Effect
+from pixcal.stages.diagnose.parts import Half, Table
 from pixcal.stages.evidence import Part
 
 # of an array: first and last frame, and how many
 Frames = dict[str, tuple[int, int, int]]
+SAME_AXIS = 0.98  # cosine of the angle below which two sets measure along one axis
+LADDER = 3  # exposure times of flats for a linearity curve
+# equal phase steps do not show light of neighbouring frames
+RANDOM = "fringes with random phases"
+MORE = "more frames of the same kind"
 
 
 def frames_of(half: Half) -> Frames:
@@ -60,3 +72,70 @@ class FramesUsed:
             y0 < b1 and b0 < y1 and x0 < a1 and a0 < x1
             for (b0, b1), (a0, a1) in self.tried_on.windows
         )
+
+
+def missing_frames(
+    acquisition: Acquisition, tables: Mapping[str, Table], steps: Sequence[float]
+) -> dict[str, str]:
+    """Kinds of frames that are of use and that an acquisition does not have, each in words.
+
+    By kind, as in `Effect.frames_needed`. ``steps`` are those of each set's phase, rad; zero where
+    the phases are random.
+    """
+    axes = _axes([s.baseline_mm for s in acquisition.frames.fringes])
+    missing = {}
+    single = [name for name, lengths in axes if len(lengths) == 1]
+    if single:
+        missing["baseline"] = f"a second baseline along {' and '.join(single)}"
+    if len(axes) == 1:
+        missing["axis"] = "a fringe set along another axis"
+    for kind in ("dark", "flat"):
+        if kind not in tables:
+            missing[kind] = f"{kind} frames"
+    exposures = {t for t in tables.get("flat", {}).get("exptime_s", ()) if t is not None}
+    if len(exposures) < LADDER:
+        missing["ladder"] = f"flats at {LADDER} or more exposure times"
+    if steps and all(steps):
+        missing["random"] = RANDOM
+    return missing
+
+
+def recommend_frames(
+    missing: Mapping[str, str], kinds: Iterable[type[Effect]] = (Effect,)
+) -> list[str]:
+    """Those of the missing frames that tell effects apart, or all that tell on them (default: any).
+
+    What tells on one effect and not on another parts them; what tells on all of them only where
+    nothing else is missing, for each is known better then.
+    """
+    told = [set(kind.frames_needed) for kind in kinds]
+    some, every = told[0].union(*told), told[0].intersection(*told)
+    for wanted in (some - every, some):
+        if frames := [words for name, words in missing.items() if name in wanted]:
+            return frames
+    return [MORE]
+
+
+def _axes(baselines: Iterable[Sequence[float]]) -> list[tuple[str, set[float]]]:
+    """Axes of the fringe sets, and the different lengths (mm) of their baselines."""
+    found: list[tuple[tuple[float, float], set[float]]] = []
+    for bx, by in baselines:
+        size = math.hypot(bx, by)
+        if size == 0:
+            continue
+        one = bx / size, by / size
+        for axis, lengths in found:
+            if abs(axis[0] * one[0] + axis[1] * one[1]) > SAME_AXIS:
+                lengths.add(round(size, 1))
+                break
+        else:
+            found.append((one, {round(size, 1)}))
+    return [(_axis_name(axis), lengths) for axis, lengths in found]
+
+
+def _axis_name(axis: tuple[float, float]) -> str:
+    if abs(axis[0]) > SAME_AXIS:
+        return "x"
+    if abs(axis[1]) > SAME_AXIS:
+        return "y"
+    return f"{math.degrees(math.atan2(axis[1], axis[0])) % 180:.0f}°"

@@ -19,9 +19,8 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Again, Effect, Estimate
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
-from pixcal.stages.diagnose.frames_used import FramesUsed
+from pixcal.stages.diagnose.frames_used import MORE, FramesUsed
 from pixcal.stages.diagnose.look import DiagnosisInput, look_at
-from pixcal.stages.diagnose.recommended_frames import MORE
 from pixcal.stages.diagnose.result import by_domain
 from pixcal.stages.diagnose.search import CONFIRM, SCREEN, Search, affordable
 from pixcal.stages.diagnose.trial import (

@@ -11,10 +11,16 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.stages import reduce
-from pixcal.stages.diagnose.frames_used import FittedOn, FramesUsed, HeldOut, LeftOut, frames_of
+from pixcal.stages.diagnose.frames_used import (
+    FittedOn,
+    FramesUsed,
+    HeldOut,
+    LeftOut,
+    frames_of,
+    missing_frames,
+)
 from pixcal.stages.diagnose.measuring import nominal_bench
 from pixcal.stages.diagnose.parts import Half, Raw, evidence_of, take
-from pixcal.stages.diagnose.recommended_frames import missing_frames
 from pixcal.stages.diagnose.trial import Curves, Signature, Window, averaged, measured_curves
 from pixcal.stages.diagnose.windows import chosen_windows, frames_of_half, split
 from pixcal.stages.evidence import Part

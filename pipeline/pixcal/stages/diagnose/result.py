@@ -26,8 +26,7 @@ from pixcal.stages.diagnose.comparison import (
     gap_interval,
     shrinkage,
 )
-from pixcal.stages.diagnose.frames_used import FramesUsed
-from pixcal.stages.diagnose.recommended_frames import recommend_frames
+from pixcal.stages.diagnose.frames_used import FramesUsed, recommend_frames
 
 Json = dict[str, Any]
 

@@ -25,10 +25,10 @@ from pixcal.stages.diagnose.candidates import (
     likeliest,
 )
 from pixcal.stages.diagnose.comparison import MIN_LOGLIK_GAIN, Comparison, Trial
-from pixcal.stages.diagnose.exchange import exchanges
 from pixcal.stages.diagnose.rejection import (
     MIN_LOGLIK_GAIN_WEAK,
     doubtful,
+    exchanges,
     explained_by_other_law,
     needed_gain,
     redundant,

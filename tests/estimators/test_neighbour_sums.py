@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.kernels.pair_sums import pair_sums
+from pixcal.estimators.detector.neighbours import pair_sums
 
 T, Y, X, MARGIN = 3, 11, 14, 2
 

@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from pixcal.kernels.two_states import likely_states
+from pixcal.estimators.frame_series.hopping import likely_states
 
 
 @pytest.mark.parametrize("size", [0.7, 30.0, 800.0])

@@ -1,1 +1,0 @@
-"""Star centroids: the effect of the offsets, and their correction."""
