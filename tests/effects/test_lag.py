@@ -127,7 +127,9 @@ def test_frames_are_restored(make_effect_bench: Callable[..., Bench], lag: Lag) 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("truth", [Lag(), Lag(2e-4, 0.0, 0.1), Lag(0.005, 1.5, 0.1)])
+@pytest.mark.parametrize(
+    "truth", [Lag(), Lag(2e-4, 0.0, 0.1), Lag(0.005, 1.5, 0.1), Lag(0.03, 0.0, 0.1)]
+)
 def test_its_share_is_found(acquired: Callable[..., Evidence], truth: Lag) -> None:
     parameters = {"share": truth.share, "decay_frames": truth.decay_frames, "spread": truth.spread}
     found = Lag.estimate(acquired(None, {"lag": parameters}))

@@ -59,7 +59,7 @@ def make_run(
     write_reduce(run, shape, mask, sets, keys["ingest"], rng)
     if "fit" in stages:
         keys["reduce"] = read_manifest(run / "reduce").key
-        with build(run, "sweep", 4, {}, {"reduce": keys["reduce"]}) as made:
+        with build(run, "sweep", 5, {}, {"reduce": keys["reduce"]}) as made:
             keys["sweep"] = made.key
         write_fit(run, shape, mask, sets, keys["sweep"], moving, rng)
     if "allan" in stages and "fit" in stages:

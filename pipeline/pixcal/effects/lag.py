@@ -7,7 +7,7 @@ import numpy as np
 
 from pixcal.estimators.detector.frame_lag import CLEAR, MAX_DECAY, common_lag, lag_of_flats
 from pixcal.estimators.detector.noiseless_charge import missing_noise
-from pixcal.estimators.detector.pixel_lag import Uneven
+from pixcal.estimators.detector.pixel_lag import Uneven, seen_share
 from pixcal.estimators.detector.traps import BANDS, LossFit, in_bands
 from pixcal.estimators.diagnosis.central_crop import MAX_SAMPLES, central_crop
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
@@ -261,8 +261,12 @@ class Lag(Effect):
         part = central_crop(evidence)
         uneven = Uneven.of(part.fringes.values())
         sure, unalike = common.sigmas > CLEAR, uneven.sigmas > CLEAR
+        rms = uneven.rms(common.keep, common.share) if unalike else 0.0
+        missed = float(np.mean([common.share - seen_share(f, common.share, rms) for f in fringes]))
         # What the pixels have in common is no less than how much they differ by.
-        share = float(np.clip(common.share, uneven.rms(common.keep) if unalike else 0.0, 0.5))
+        share = float(np.clip(common.share + missed, rms, 0.5))
+        pixels = min(int(f.good.sum()) for f in fringes)
+        common = replace(common, share_error=float(np.hypot(common.share_error, rms / pixels**0.5)))
         spread, spread_error = uneven.spread(common.keep, share, common.share_error)
         level_e = max(float(np.nanquantile(f.electrons[::7], 0.99)) for f in fringes)
         whole = cls(share, common.decay_frames, 0.0, (), level_e, common.later)

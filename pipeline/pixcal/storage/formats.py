@@ -28,7 +28,7 @@ STAGES = {
     for stage in (
         ArtefactKind("ingest", 3, "ingest ACQ --out RUN", earlier=(1, 2), of_fringes=False),
         ArtefactKind("reduce", 2, "reduce RUN", earlier=(1,), of_fringes=False),
-        ArtefactKind("sweep", 4, "fit RUN"),
+        ArtefactKind("sweep", 5, "fit RUN"),
         ArtefactKind("fit", 1, "fit RUN"),
         ArtefactKind("allan", 1, "allan RUN", products="allan.json"),
         ArtefactKind("crests", 1, "crests RUN", products="crests*.*"),

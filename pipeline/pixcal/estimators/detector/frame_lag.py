@@ -12,13 +12,16 @@ from pixcal.estimators.detector.flat_ladder import (
     level_before,
     warming,
 )
-from pixcal.estimators.detector.pixel_lag import CLIP, MIN_FRAMES
+from pixcal.estimators.detector.pixel_lag import MIN_FRAMES
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.kernels.frame_order import follows
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
+CLIP = 5.0  # standard deviations of a frame's contrast
 LAGS = 6  # frames back that are looked at
-ROUNDS = 2  # of the fit, each about the lag of the one before
+ROUNDS = 2  # of the fit of flats
+CONTRAST_ROUNDS = 8  # of that of the contrast at most, each about the lag of the one before
+CONVERGED = 0.1  # step of the share, in its errors, after which there are no more
 MAX_DECAY = 3.0
 _SERIES = 8
 _MANY_FLATS = 5  # series that tell the flicker of the lamp beside the lag
@@ -108,7 +111,7 @@ def common_lag(
     undone : frames without a lag of a share and a decay, and the shares that come out later
     """
     found = CommonLag(0.0, 0.0, 0.0, 0.0, 0.0)
-    for _ in range(ROUNDS):
+    for _ in range(CONTRAST_ROUNDS):
         steps = []
         for own, which in zip(frames, numbers, strict=True):
             # Linear about a lag that is known in part, which is taken out of the frames first.
@@ -122,7 +125,9 @@ def common_lag(
             return None
         information = np.sum([n for _, n in steps], axis=0)
         right = np.sum([n @ w for w, n in steps], axis=0)
-        found = _exponential(information, right)
+        before, found = found, _exponential(information, right)
+        if abs(found.share - before.share) < CONVERGED * found.share_error:
+            break
     return _freely(found, information, right)
 
 

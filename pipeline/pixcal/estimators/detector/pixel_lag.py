@@ -13,7 +13,7 @@ from pixcal.model.arrays import F32, F64
 # of the phase that pixels are free to have, so that a bent response is not taken for lag
 HARMONICS = 5
 CONTROLS = 8  # frames after a frame that are compared with the one before it
-CLIP = 5.0
+CLIP = 7.0  # standard deviations of a share that particles go beyond
 MIN_FRAMES = 20
 
 
@@ -27,30 +27,65 @@ class Uneven:
     @classmethod
     def of(cls, sets: Iterable[FringeEvidence]) -> "Uneven":
         """Of all sets together; without any it says nothing."""
-        found = [one for f in sets if (one := uneven_pixels(f)) is not None]
+        found = [(*one, f.good.sum()) for f in sets if (one := uneven_pixels(f)) is not None]
         if not found:
             return cls(0.0, 1.0)
-        value, error = np.array(found).T
+        value, error, pixels = np.array(found).T
         weight = error**-2
-        return cls(float(weight @ value / weight.sum()), float(weight.sum() ** -0.5))
+        square = float(weight @ value / weight.sum())
+        # All sets have the same pixels.
+        drawn = (1 - 1 / len(found)) * 2 * square**2 / pixels.min()
+        return cls(square, float(np.sqrt(1 / weight.sum() + drawn)))
 
     @property
     def sigmas(self) -> float:
         """Significance."""
         return self.square / self.error
 
-    def rms(self, keep: float) -> float:
-        """Of the shares, where a part of what is held stays for another frame."""
-        return float(np.sqrt(max(self.square, 0.0))) / (1 - keep)
+    def rms(self, keep: float, share: float) -> float:
+        """Of shares about the mean ``share``, where a part of what is held stays another frame."""
+        return float(np.sqrt(max(self.square, 0.0))) * self._scale(keep, share)
 
     def spread(self, keep: float, share: float, share_error: float) -> tuple[float, float]:
         """Relative spread of the shares about the mean one, and its error."""
         if share <= 0:
             return 0.0, 1.0
-        spread = self.rms(keep) / share
-        size = max(self.rms(keep), np.sqrt(self.error) / (1 - keep))
-        error = self.error / (1 - keep) ** 2 / (2 * size)
+        rms, scale = self.rms(keep, share), self._scale(keep, share)
+        spread = rms / share
+        error = self.error * scale**2 / (2 * max(rms, np.sqrt(self.error) * scale))
         return spread, float(np.hypot(error, spread * share_error) / share)
+
+    @staticmethod
+    def _scale(keep: float, share: float) -> float:
+        """Of a pixel's share s less the mean one, over what is seen of it.
+
+        Beside maps and frames that were fitted with the lag, (s - share) / (1 - s) of the light
+        before is left. The frame before, as fitted, has 1 - share of it, and light from earlier on.
+        """
+        return ((1 - share) ** 2 + share**2 * (1 - keep) / (1 + keep)) / (1 - keep)
+
+
+def seen_share(fringes: FringeEvidence, share: float, rms: float) -> float:
+    """Share that the contrast of frames shows where the shares of pixels differ.
+
+    Pixels with a larger share have shallower troughs. Samples there have more noise, and a model
+    of weaker fringes, so these pixels count for less. From the normal equations of a frame, with
+    three shares of the same mean and rms, over all phases.
+    """
+    mean, cosine, sine = fringes.theta[:, fringes.good]
+    frames = fringes.free[:, 0].mean()
+    contrast = np.hypot(*fringes.free[:, 1:3].T).mean() / frames
+    visibility = contrast * np.median(np.hypot(cosine, sine) / mean) / (1 - share)
+    shares = (share + rms * np.sqrt(3) * np.array([-1, 0, 1]))[:, None]
+    wave = visibility * np.cos(np.linspace(0, 2 * np.pi, 64, endpoint=False))
+    model = np.stack([np.ones((3, 64)), (1 - shares) * wave])
+    noise = np.median(fringes.read_variance[fringes.good]) / (np.median(mean) * frames)
+    weight = np.array([[1], [4], [1]]) / (noise + model.sum(axis=0).clip(0))
+    normal = np.einsum("pa,ipa,jpa->ij", weight, model, model)
+    right = np.einsum("pa,ipa->i", weight * shares * wave, model)
+    of_mean, of_fringes = np.linalg.solve(normal, right)
+    seen = float(of_fringes - of_mean)
+    return seen / (1 + seen)
 
 
 def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
@@ -61,11 +96,10 @@ def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
     """
     if len(fringes.g) < MIN_FRAMES + CONTROLS:
         return None
-    freedom = Freedom(fringes, HARMONICS)
-    residual = freedom.left_over(freedom.of_good(fringes.residual))
-    weighted = freedom.weight * residual
-    steps = (1, *range(-1, -CONTROLS - 1, -1))
-    before, *after = _squares_of_shares(fringes, freedom, weighted, steps)
+    before = _squares_of_shares(fringes, Freedom(fringes, HARMONICS), (1,))[0]
+    # Frames are no more than nearly independent: without what the frame before explains.
+    free = Freedom(fringes, HARMONICS, before=True)
+    after = _squares_of_shares(fringes, free, range(-1, -CONTROLS - 1, -1))
     value, error = np.array(after).T
     noise = np.hypot(before[1], np.sqrt((error**2).mean() / CONTROLS))
     scatter = value.std(ddof=1) * np.sqrt(1 + 1 / CONTROLS)
@@ -73,9 +107,10 @@ def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
 
 
 def _squares_of_shares(
-    fringes: FringeEvidence, freedom: Freedom, weighted: F32, steps: Sequence[int]
+    fringes: FringeEvidence, freedom: Freedom, steps: Sequence[int]
 ) -> list[tuple[float, float]]:
     """Mean square, above noise, of pixels' shares of the frames some steps back, with errors."""
+    weighted = freedom.weight * freedom.left_over(freedom.of_good(fringes.residual))
     others = np.zeros((len(steps), *fringes.g.T.shape), np.float32)
     for other, step in zip(others, steps, strict=True):
         other[:] = np.roll(fringes.g, step, axis=0).T

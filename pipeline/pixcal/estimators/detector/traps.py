@@ -197,7 +197,8 @@ class _Set:
     """
 
     def __init__(self, evidence: Evidence, fringes: FringeEvidence, level_e: float) -> None:
-        self._freedom = freedom = Freedom(fringes)
+        # Pixels differ in the share that stays: what a level adds to it must not be told by that.
+        self._freedom = freedom = Freedom(fringes, before=True)
         self._flat = evidence.flat[freedom.good].astype(np.float32)
         self.level: F32 = freedom.of_good(evidence.level(fringes, np.nan_to_num(fringes.model)))
         b, c, s = fringes.free[:, :3].T

@@ -15,6 +15,7 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid
+from pixcal.kernels.frame_order import follows
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
 from pixcal.kernels.two_way import left_over
@@ -99,6 +100,7 @@ class Freedom(TwoWay):
     Parameters
     ----------
     harmonics : highest harmonic of the phase that a pixel is free to have
+    before : whether it is free to have a share of the frame before
     margin : pixels along the edges that are left out
 
     Attributes
@@ -111,7 +113,9 @@ class Freedom(TwoWay):
         The maps, and their slopes along x and y.
     """
 
-    def __init__(self, fringes: FringeEvidence, harmonics: int = 1, margin: int = 0) -> None:
+    def __init__(
+        self, fringes: FringeEvidence, harmonics: int = 1, margin: int = 0, before: bool = False
+    ) -> None:
         inside = np.zeros_like(fringes.good)
         ny, nx = inside.shape
         inside[margin : ny - margin, margin : nx - margin] = True
@@ -121,6 +125,8 @@ class Freedom(TwoWay):
         of_time = [fringes.g / np.abs(fringes.g).max(axis=0)]
         for n in range(2, harmonics + 1):
             of_time += [np.cos(n * fringes.phi)[:, None], np.sin(n * fringes.phi)[:, None]]
+        if before:
+            of_time.append(np.roll(of_time[0], 1, axis=0) * follows(fringes.frame)[:, None])
         # Where there are few different phases, harmonics are not independent.
         independent, size, _ = np.linalg.svd(np.hstack(of_time), full_matrices=False)
         independent = independent[:, size > _INDEPENDENT * size[0]]

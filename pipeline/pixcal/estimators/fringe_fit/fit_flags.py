@@ -2,6 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from pixcal.model.arrays import F32, U8
 from pixcal.model.flags import PixelFlag
@@ -23,6 +24,7 @@ def fit_flags(
     chi2: F32,
     count: F32,
     noise: float,
+    excess: float,
     chi2_limit: float,
 ) -> U8:
     """Flags of pixels: those of the reduction, and NO_DATA and BAD_FIT of the fit.
@@ -33,14 +35,16 @@ def fit_flags(
     iota, alpha, sigma, chi2, count : (y, x) float32 maps of the sweep: mean and amplitude (e-),
         error of the phase (rad), reduced chi-square, samples
     noise : usual reduced chi-square: where the noise model is off by a factor, all pixels are
+    excess : relative scatter of reduced chi-squares beyond chance, of an effect that all pixels
+        have to some degree and that makes none of them a defect
     chi2_limit : reduced chi-square, over ``noise``, above which a pixel does not fit
     """
     flags = mask.copy()
     flags[count == 0] |= np.uint8(PixelFlag.NO_DATA)
     # Chance alone gives a scatter of sqrt(2 / n) to a reduced chi-square.
-    chance = 8 * np.sqrt(2 / np.maximum(count - 3, 1))
+    scatter = 8 * np.sqrt(2 / np.maximum(count - 3, 1) + excess**2)
     with np.errstate(invalid="ignore"):
-        good = np.isfinite(sigma) & (chi2 / noise < np.maximum(chi2_limit, 1 + chance))
+        good = np.isfinite(sigma) & (chi2 / noise < np.maximum(chi2_limit, 1 + scatter))
         good &= (iota > 0) & (sigma < MAX_SIGMA_RAD)
         # Noise that makes an amplitude larger makes its error look smaller: the usual one tells.
         usual = np.nanmedian((alpha / iota)[good]) if good.any() else np.float32(1.0)
@@ -51,5 +55,23 @@ def fit_flags(
 
 
 def usual_chi2(values: NDArray[np.floating], freedom: int) -> float:
-    """Median of reduced chi-squares over that of pure noise (Wilson and Hilferty's cube)."""
-    return float(np.median(values) / (1 - 2 / (9 * max(freedom, 1))) ** 3)
+    """Median of reduced chi-squares over that of pure noise."""
+    return float(np.median(values) / _noise_chi2(0.0, freedom)) if len(values) else 1.0
+
+
+def excess_scatter(values: NDArray[np.floating], freedom: int) -> float:
+    """Relative scatter of reduced chi-squares beyond that of pure noise.
+
+    From their median to one standard deviation above it: defects are further up, and fewer.
+    """
+    if not len(values):
+        return 0.0
+    usual, high = np.quantile(values, ndtr([0.0, 1.0]))
+    chance = _noise_chi2(1.0, freedom) / _noise_chi2(0.0, freedom)
+    return float(np.sqrt(max((high / usual - 1) ** 2 - (chance - 1) ** 2, 0.0)))
+
+
+def _noise_chi2(sigmas: float, freedom: int) -> float:
+    """Reduced chi-square of pure noise, standard deviations above its median (Wilson, Hilferty)."""
+    part = 2 / (9 * max(freedom, 1))
+    return float((1 - part + sigmas * np.sqrt(part)) ** 3)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import eigh
 
+from pixcal.estimators.fringe_fit.fit_flags import excess_scatter, usual_chi2
 from pixcal.estimators.fringe_fit.fringes import (
     HONEST_FRINGES,
     FrameParameters,
@@ -82,6 +83,7 @@ class Scout:
     moving: bool = False
     moving_significance: float = 0.0
     noise: float = 1.0  # usual reduced chi-square of the pixels
+    excess_scatter: float = 0.0  # its relative scatter from pixel to pixel beyond chance
     theta: list[F64] = field(default_factory=list)  # (3, y, x) of each tile
 
     def prime(self, codes: Sequence[U16]) -> FrameParameters:
@@ -99,15 +101,16 @@ class Scout:
         frames = FrameParameters(g, np.zeros((n_frames, 2)), self.reference)
         frames = self._settled(codes, frames, TURNS)
         self._count_fringes()
-        noise = self._noise(codes, frames)
-        significance = self._motion_significance(codes, frames) / noise
+        chi2 = self._chi2(codes, frames)
+        significance = self._motion_significance(codes, frames) / np.median(chi2)
         self.moving_significance = significance
         # Six standard deviations of what frames without motion would show.
         self.moving = significance > 1 + 6 / np.sqrt(n_frames)
         if self.moving:
             frames = self._settled(codes, frames, TURNS_MOVING)
-            noise = self._noise(codes, frames)
-        self.noise = noise / (1 - 2 / (9 * (n_frames - 3))) ** 3
+            chi2 = self._chi2(codes, frames)
+        self.noise = usual_chi2(chi2, n_frames - 3)
+        self.excess_scatter = excess_scatter(chi2, n_frames - 3)
         return frames
 
     def solve(self, codes: Sequence[U16], start: FrameParameters | None = None) -> FrameParameters:
@@ -341,14 +344,13 @@ class Scout:
             np.einsum("ti,tij,tj->t", dk, inverse_normal(covariance, 1e-10), dk).mean() / 2
         )
 
-    def _noise(self, codes: Sequence[U16], frames: FrameParameters) -> float:
-        """Usual reduced chi-square of the pixels."""
+    def _chi2(self, codes: Sequence[U16], frames: FrameParameters) -> F64:
+        """Reduced chi-square of the good pixels of all tiles."""
 
-        def chi2(n: int) -> float:
+        def chi2(n: int) -> F64:
             return residual_chi2(self.tiles[n], codes[n], self.coding, frames, self.theta[n])
 
-        seen = [n for n, tile in enumerate(self.tiles) if tile.good.any()]
-        return float(np.median(self.each(chi2, seen)))
+        return np.concatenate(self.each(chi2, range(len(self.tiles))))
 
 
 def _like_most(theta: F64, good: Mask) -> Mask:

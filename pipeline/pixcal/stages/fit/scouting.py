@@ -111,6 +111,7 @@ def scout_set(
         "moving": bool(scout.moving),
         "moving_significance": scout.moving_significance,
         "noise": scout.noise,
+        "excess_scatter": scout.excess_scatter,
         "scout_tiles": len(places),
         "chunks_read": len(places) * source.n_blocks if keep else again,
     }

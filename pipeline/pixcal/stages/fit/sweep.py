@@ -105,6 +105,7 @@ class _Job:
     batches: FrameBatches
     prime: int
     noise: float
+    excess_scatter: float
     chi2_limit: float
 
 
@@ -140,7 +141,8 @@ def sweep_set(
     per_task = cy * cx * (held + 900 + 24 * n_batches + kept + source.more_bytes)
     runtime = within_memory(f"the fit of {name}", per_task, CACHE_BYTES, runtime)
     carrier = Carrier((float(facts["k"][0]), float(facts["k"][1])), frames.reference)
-    job = _Job(source, writers, frames, carrier, batches, prime, facts["noise"], config.chi2_limit)
+    usual = (facts["noise"], facts["excess_scatter"])
+    job = _Job(source, writers, frames, carrier, batches, prime, *usual, config.chi2_limit)
     steps = {f"{name}:{strip[0]}": strip for strip in source.strips()}
     run_steps(made, partial(_sweep_strip, job), steps, runtime, label=f"fit {name}")
     for writer in writers.values():
@@ -153,7 +155,7 @@ def sweep_set(
         "chunks": source.signal.n_chunks,
         "chunks_read": int(facts["chunks_read"] + table[..., 0].sum()),
         "bound_rad": float(np.nanmedian(bounds)) if np.isfinite(bounds).any() else None,
-        "chi2_reduced": usual_chi2(chi2, source.n_frames - 3) if len(chi2) else 1.0,
+        "chi2_reduced": usual_chi2(chi2, source.n_frames - 3),
         "batch_frames": batches.frames,
         "batch_period_s": batches.period_s,
         "batch_note": batches.note,
@@ -213,8 +215,9 @@ def _sweep_tile(job: _Job, at: tuple[int, int]) -> dict[str, NDArray[Any]]:
         number,
     )  # fmt: skip
     flags = fit_flags(
-        mask, maps.iota, maps.alpha, maps.sigma, maps.chi2, maps.count, job.noise, job.chi2_limit
-    )
+        mask, maps.iota, maps.alpha, maps.sigma, maps.chi2, maps.count, job.noise,
+        job.excess_scatter, job.chi2_limit,
+    )  # fmt: skip
     usable = (mask == 0) & np.isfinite(maps.chi2)
     chi2 = maps.chi2[usable]
     chi2 = chi2[:: -(-len(chi2) // _chi2_pixels(source)) or 1]
