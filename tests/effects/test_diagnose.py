@@ -18,7 +18,7 @@ from pixcal.effects.intra_pixel_response import IntraPixelResponse
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.effects.straylight import Straylight
 from pixcal.engine.run import Runtime
-from pixcal.estimators.diagnosis.test_statistics import DETECTOR, measure
+from pixcal.estimators.test_statistics import DETECTOR, measure
 from pixcal.kernels.frame_order import runs
 from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.test_statistics import DETECTOR, measure
-from pixcal.estimators.diagnosis.test_statistics.detector_frames import differences
+from pixcal.estimators.test_statistics import DETECTOR, measure
+from pixcal.estimators.test_statistics.detector_frames import differences
 
 
 def with_sky(evidence: Evidence, slope: float) -> Evidence:

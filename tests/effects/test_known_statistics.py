@@ -10,8 +10,8 @@ import pytest
 
 from pixcal.effects import effects
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.expectation import Reference
-from pixcal.estimators.diagnosis.test_statistics import DETECTOR, known_statistics, measure
+from pixcal.estimators.test_statistics import DETECTOR, known_statistics, measure
+from pixcal.estimators.test_statistics.expectation import Reference
 
 
 @pytest.fixture(scope="module")

@@ -12,11 +12,11 @@ import yaml
 from pixcal.effects import effect_of_file
 from pixcal.engine.run import Runtime
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.map_deviations import common_precision
-from pixcal.estimators.diagnosis.pair_sums import pair_sums, pair_variance
 from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
 from pixcal.simulation.effect import Estimate
+from pixcal.simulation.map_deviations import common_precision
+from pixcal.simulation.pair_sums import pair_sums, pair_variance
 from pixcal.simulation.replica import Replica
 from pixcal.stages import diagnose, fit, ingest, reduce, simulate
 from pixcal.stages.diagnose.trial import estimate

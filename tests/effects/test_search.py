@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from pixcal.estimators.diagnosis.expectation import Reference
-from pixcal.estimators.diagnosis.gap import compare, flagged
-from pixcal.estimators.diagnosis.test_statistics import Curve, Key
-from pixcal.estimators.diagnosis.test_statistics.signature import signature_key
+from pixcal.estimators.test_statistics import Curve, Key
+from pixcal.estimators.test_statistics.expectation import Reference
+from pixcal.estimators.test_statistics.gap import compare, flagged
+from pixcal.estimators.test_statistics.signature import signature_key
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult

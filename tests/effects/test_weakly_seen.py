@@ -5,7 +5,7 @@ import pytest
 
 from pixcal.effects.ipc import Ipc
 from pixcal.effects.row_noise import RowNoise
-from pixcal.estimators.diagnosis.gap import Difference
+from pixcal.estimators.test_statistics.gap import Difference
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.candidates import Candidate
 from pixcal.stages.diagnose.inquiry import needs_slow, weakly_seen

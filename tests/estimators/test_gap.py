@@ -4,9 +4,20 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, norm
 
-from pixcal.estimators.diagnosis.expectation import Reference, expect_nominal, expect_with, scaled
-from pixcal.estimators.diagnosis.gap import CHANCE, compare, flagged, log_likelihood, remaining
-from pixcal.estimators.diagnosis.test_statistics import Curve, Key, known_statistics
+from pixcal.estimators.test_statistics import Curve, Key, known_statistics
+from pixcal.estimators.test_statistics.expectation import (
+    Reference,
+    expect_nominal,
+    expect_with,
+    scaled,
+)
+from pixcal.estimators.test_statistics.gap import (
+    CHANCE,
+    compare,
+    flagged,
+    log_likelihood,
+    remaining,
+)
 from pixcal.stages.diagnose.comparison import MIN_LOGLIK_GAIN
 
 LINEAR: Key = ("harmonics", "a")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.test_statistics.noise import QUANTILES, ranges_about
+from pixcal.estimators.test_statistics.noise import QUANTILES, ranges_about
 
 
 def test_of_evenly_spread_values_they_are_the_quantiles() -> None:

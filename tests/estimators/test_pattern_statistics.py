@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import gamma
 
-from pixcal.estimators.diagnosis.test_statistics.look import Look, pattern_sizes
-from pixcal.estimators.diagnosis.test_statistics.patterns import (
+from pixcal.estimators.test_statistics.look import Look, pattern_sizes
+from pixcal.estimators.test_statistics.patterns import (
     highest_ordinate,
     smooth_patterns,
     smooth_patterns_by_phase,

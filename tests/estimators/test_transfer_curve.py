@@ -13,7 +13,7 @@ from pixcal.effects.quantisation import Quantisation
 from pixcal.estimators.detector.ladder_curve import ladder_curve
 from pixcal.estimators.detector.transfer_curve import transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
-from pixcal.estimators.diagnosis.test_statistics.noise import read_noise
+from pixcal.estimators.test_statistics.noise import read_noise
 
 SHAPE = (93, 101)
 READ, GAIN, BIAS, DARK = 1.0, 1.5, 200.3, 0.4

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pixcal.estimators.diagnosis.test_statistics import DETECTOR, known_statistics
-from pixcal.estimators.diagnosis.test_statistics.look import STEPS
-from pixcal.estimators.diagnosis.test_statistics.noise import OUTLIERS
+from pixcal.estimators.test_statistics import DETECTOR, known_statistics
+from pixcal.estimators.test_statistics.look import STEPS
+from pixcal.estimators.test_statistics.noise import OUTLIERS
 from pixcal.report import curve_places, diagnosis_words
 from pixcal.report import diagnosis_maps as maps
 from pixcal.report import page as page_module

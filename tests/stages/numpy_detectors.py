@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from on_disk import evidence_on_disk
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.expectation import Reference, expect_nominal
-from pixcal.estimators.diagnosis.gap import Difference, compare
-from pixcal.estimators.diagnosis.test_statistics import Key, measure
+from pixcal.estimators.test_statistics import Key, measure
+from pixcal.estimators.test_statistics.expectation import Reference, expect_nominal
+from pixcal.estimators.test_statistics.gap import Difference, compare
 from pixcal.model.acquisition import SCHEMA, Acquisition
 from pixcal.model.config import parse
 from pixcal.stages import reduce

@@ -5,7 +5,7 @@ import pytest
 from numpy_detectors import Detector, held_against_nominal
 
 from pixcal.effects.quantisation import Quantisation
-from pixcal.estimators.diagnosis.gap import flagged
+from pixcal.estimators.test_statistics.gap import flagged
 from pixcal.model.errors import InputError
 
 

@@ -14,8 +14,8 @@ from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.estimators.detector.flat_ladder import ladder as ladder_of
 from pixcal.estimators.detector.flat_ladder import level_before
 from pixcal.estimators.detector.transfer_curve import transfer_curve
-from pixcal.estimators.diagnosis.test_statistics import DETECTOR, measure
-from pixcal.estimators.diagnosis.test_statistics.look import STEPS
+from pixcal.estimators.test_statistics import DETECTOR, measure
+from pixcal.estimators.test_statistics.look import STEPS
 from pixcal.model.arrays import F64
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.parts import Raw, evidence_of

@@ -9,7 +9,7 @@ import pytest
 from pixcal.effects.lag import Lag
 from pixcal.effects.row_noise import RowNoise
 from pixcal.engine.run import Runtime
-from pixcal.estimators.diagnosis.test_statistics import Curve
+from pixcal.estimators.test_statistics import Curve
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose import trial
 from pixcal.stages.diagnose.search import LEAST_SIMULATIONS, SEARCH_S, SIMULATIONS, affordable

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.diagnosis.deviations import Change, SetDeviations, StackDeviations
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.map_deviations import Deviation, common_precision, is_smooth
 from pixcal.model.arrays import F32, F64, Mask
+from pixcal.simulation.deviations import Change, SetDeviations, StackDeviations
 from pixcal.simulation.forward import ForwardModel, Stage
+from pixcal.simulation.map_deviations import Deviation, common_precision, is_smooth
 from pixcal.simulation.replica import Replica
 
 Key = tuple[str | int, str]  # fringe set or number of a stack, and which of its deviations

@@ -12,7 +12,7 @@ from scipy.special import log_ndtr
 from pixcal.effects import effects
 from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.diagnosis.gap import CHANCE, sigmas_among, sigmas_of
+from pixcal.estimators.test_statistics.gap import CHANCE, sigmas_among, sigmas_of
 from pixcal.model.config import result_options
 from pixcal.model.options import Report as Config
 from pixcal.report.contents import (

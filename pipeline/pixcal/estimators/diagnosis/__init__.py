@@ -1,1 +1,1 @@
-"""What the diagnosis compares: evidence, test statistics, and the gap between them."""
+"""What an acquisition holds as evidence of an effect: frames, maps, and what their fit takes up."""

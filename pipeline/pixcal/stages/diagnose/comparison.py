@@ -5,13 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.expectation import (
+from pixcal.estimators.test_statistics import Key
+from pixcal.estimators.test_statistics.expectation import (
     Expectation,
     Reference,
     expect_nominal,
     expect_with,
 )
-from pixcal.estimators.diagnosis.gap import (
+from pixcal.estimators.test_statistics.gap import (
     CHANCE,
     Difference,
     Gap,
@@ -21,7 +22,6 @@ from pixcal.estimators.diagnosis.gap import (
     log_likelihood,
     remaining,
 )
-from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.model.arrays import F64
 from pixcal.stages.diagnose.trial import Curves, Effects
 

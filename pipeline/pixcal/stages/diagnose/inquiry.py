@@ -10,9 +10,9 @@ import numpy as np
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.expectation import Reference, expect_nominal, expect_with
-from pixcal.estimators.diagnosis.gap import Difference, compare, flagged
-from pixcal.estimators.diagnosis.test_statistics import Key
+from pixcal.estimators.test_statistics import Key
+from pixcal.estimators.test_statistics.expectation import Reference, expect_nominal, expect_with
+from pixcal.estimators.test_statistics.gap import Difference, compare, flagged
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 from pixcal.model.config import to_plain

@@ -9,9 +9,9 @@ import numpy as np
 from pixcal.estimators.detector.amplifiers import relative_gain
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
-from pixcal.estimators.diagnosis.test_statistics.look import Look
-from pixcal.estimators.diagnosis.test_statistics.noise import jumping
 from pixcal.estimators.maps.structure import flattened, smooth_surface
+from pixcal.estimators.test_statistics.look import Look
+from pixcal.estimators.test_statistics.noise import jumping
 from pixcal.kernels.processes import ramp_step
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.kernels.rounding import level_before_rounding

@@ -10,10 +10,16 @@ import numpy as np
 from scipy.special import log_ndtr, ndtr
 
 from pixcal import __version__
-from pixcal.estimators.diagnosis.expectation import Reference
-from pixcal.estimators.diagnosis.gap import Difference, flagged, likelier, sigmas_among, sigmas_of
-from pixcal.estimators.diagnosis.test_statistics import DETECTOR, Curve, Key
-from pixcal.estimators.diagnosis.test_statistics.signature import statistic_named
+from pixcal.estimators.test_statistics import DETECTOR, Curve, Key
+from pixcal.estimators.test_statistics.expectation import Reference
+from pixcal.estimators.test_statistics.gap import (
+    Difference,
+    flagged,
+    likelier,
+    sigmas_among,
+    sigmas_of,
+)
+from pixcal.estimators.test_statistics.signature import statistic_named
 from pixcal.model.arrays import F64
 from pixcal.model.config import to_plain
 from pixcal.report.curve_places import place

@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.expectation import Reference
-from pixcal.estimators.diagnosis.test_statistics import Key
-from pixcal.estimators.diagnosis.test_statistics.signature import signature_key
+from pixcal.estimators.test_statistics import Key
+from pixcal.estimators.test_statistics.expectation import Reference
+from pixcal.estimators.test_statistics.signature import signature_key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 from pixcal.simulation.effect import Effect

@@ -12,8 +12,8 @@ from pixcal.estimators.detector.flat_ladder import (
     light_of,
 )
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.test_statistics import Curve, family, statistic
-from pixcal.estimators.diagnosis.test_statistics.look import Look
+from pixcal.estimators.test_statistics import Curve, family, statistic
+from pixcal.estimators.test_statistics.look import Look
 from pixcal.kernels.frame_order import follows
 from pixcal.kernels.sample_sums import frame_means
 from pixcal.model.arrays import F64

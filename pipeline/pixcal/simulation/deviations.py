@@ -23,12 +23,12 @@ from pixcal.estimators.diagnosis.evidence import (
     Stack,
     free_frames,
 )
-from pixcal.estimators.diagnosis.map_deviations import MAPS, Deviation, change_of_maps, weighed
-from pixcal.estimators.diagnosis.pair_sums import pair_sums, pair_variance, taken_by_fit
-from pixcal.estimators.diagnosis.test_statistics.look import Look
 from pixcal.estimators.fringe_fit.tile_fit import Coding
 from pixcal.estimators.maps.structure import without_outliers
+from pixcal.estimators.test_statistics.look import Look
 from pixcal.model.arrays import F32, F64, Indices, Mask
+from pixcal.simulation.map_deviations import MAPS, Deviation, change_of_maps, weighed
+from pixcal.simulation.pair_sums import pair_sums, pair_variance, taken_by_fit
 
 WILD = 8.0  # standard deviations beyond which a residual is an outlier
 HARMONICS = 2  # of the phase, with which parameters of the frames may go for reasons of the fit

@@ -5,8 +5,6 @@ from itertools import combinations
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.test_statistics import Curve, family, statistic
-from pixcal.estimators.diagnosis.test_statistics.look import CELLS, Look, by_cell
 from pixcal.estimators.maps.stitching import FieldFit
 from pixcal.estimators.maps.structure import (
     PERIODS,
@@ -17,6 +15,8 @@ from pixcal.estimators.maps.structure import (
     redness,
     repeats,
 )
+from pixcal.estimators.test_statistics import Curve, family, statistic
+from pixcal.estimators.test_statistics.look import CELLS, Look, by_cell
 from pixcal.model.arrays import F64, Mask
 
 SAME = 0.98  # cosine of the angle below which two sets measure along the same axis

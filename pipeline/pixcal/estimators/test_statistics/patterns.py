@@ -8,10 +8,10 @@ import numpy as np
 from scipy.fft import rfft2
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.test_statistics import Curve, family, statistic
-from pixcal.estimators.diagnosis.test_statistics.detector_frames import differences, repeated
-from pixcal.estimators.diagnosis.test_statistics.look import Look, pattern_sizes
-from pixcal.estimators.diagnosis.test_statistics.time import DISTINCT
+from pixcal.estimators.test_statistics import Curve, family, statistic
+from pixcal.estimators.test_statistics.detector_frames import differences, repeated
+from pixcal.estimators.test_statistics.look import Look, pattern_sizes
+from pixcal.estimators.test_statistics.time import DISTINCT
 from pixcal.kernels.significance import sigmas_of_largest
 from pixcal.model.arrays import F32, F64, Mask
 

@@ -7,7 +7,7 @@ a statistic too.
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.test_statistics import (
+from pixcal.estimators.test_statistics import (
     DETECTOR,
     Curve,
     Key,

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
-from pixcal.estimators.diagnosis.test_statistics import Curve, family, statistic
-from pixcal.estimators.diagnosis.test_statistics.look import STEPS, neighbour_sums
+from pixcal.estimators.test_statistics import Curve, family, statistic
+from pixcal.estimators.test_statistics.look import STEPS, neighbour_sums
 from pixcal.kernels.line_means import without_line_means
 from pixcal.model.arrays import F32, F64, Mask
 

@@ -7,7 +7,7 @@ is that of lines; pairs a few pixels apart, and samples a few frames apart, hold
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.test_statistics.look import neighbour_sums
+from pixcal.estimators.test_statistics.look import neighbour_sums
 from pixcal.model.arrays import F32, F64, Mask
 
 # rows and columns to neighbours in other rows and other columns

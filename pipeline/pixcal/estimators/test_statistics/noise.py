@@ -6,8 +6,8 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.test_statistics import Curve, family, statistic
-from pixcal.estimators.diagnosis.test_statistics.look import (
+from pixcal.estimators.test_statistics import Curve, family, statistic
+from pixcal.estimators.test_statistics.look import (
     ADJACENT,
     CELLS,
     LEVELS,

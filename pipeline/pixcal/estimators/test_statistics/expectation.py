@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtr
 
-from pixcal.estimators.diagnosis.test_statistics import Curve, Key
-from pixcal.estimators.diagnosis.test_statistics.signature import statistic_named
+from pixcal.estimators.test_statistics import Curve, Key
+from pixcal.estimators.test_statistics.signature import statistic_named
 from pixcal.model.arrays import F64
 
 Curves = Mapping[Key, Curve]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.test_statistics.look import Look
+from pixcal.estimators.test_statistics.look import Look
 from pixcal.model.arrays import F64
 
 # stands for the name of a set where a curve is of the detector or of several sets

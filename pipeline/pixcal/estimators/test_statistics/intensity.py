@@ -4,8 +4,8 @@ import numpy as np
 
 from pixcal.estimators.detector.flat_ladder import MIN_RUNGS, ladder, straight_line
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.test_statistics import Curve, statistic
-from pixcal.estimators.diagnosis.test_statistics.look import CODES, LEVELS, Look
+from pixcal.estimators.test_statistics import Curve, statistic
+from pixcal.estimators.test_statistics.look import CODES, LEVELS, Look
 from pixcal.model.arrays import F64
 
 CLASSES = (4, 16, 64)
