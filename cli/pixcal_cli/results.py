@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from pixcal.report.text import chance, share_by_law
+from pixcal.report.text import chance, not_tested, share_by_law
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.manifest import MANIFEST, read_json
 from pixcal_cli.printing import Columns, number, show_notes, show_records, show_table, with_error
@@ -187,6 +187,13 @@ def show_diagnosis(run: Path) -> None:
         f"  {diagnosis['verdict']}; residual gap: {100 * gap['after']:.0f} % "
         f"(90 % interval {low:.0f} to {high:.0f} %)"
     )
+    if diagnosis["verdict"] == "no gap":
+        show_notes(list(filter(None, [not_tested(diagnosis)])))
+    else:
+        click.echo(
+            "  gap: sum of all significant differences between frames and simulation, each "
+            "weighted by its significance squared"
+        )
     columns: Columns = {
         "gap closed": lambda c: _closed(c["gap_closed"], c["gap_closed_interval"]),
         "unique share": lambda c: f"{100 * c['gain_over_rest']:.1f} %",
@@ -204,14 +211,15 @@ def show_diagnosis(run: Path) -> None:
         "with causes": lambda e: number(e["after"], 3),
         "significance σ": lambda e: f"{e['significance']:.1f}",
     }
+    told = [e for e in gap["where"] if e["significance"] > 0]
     rows = [
         (f"{e['domain']}: {e['title']}", *(cell(e) for cell in columns.values()))
-        for e in gap["where"][:MAX_ROWS]
+        for e in told[:MAX_ROWS]
     ]
     if rows:
         show_table(("statistic", *columns), rows)
-        if len(gap["where"]) > MAX_ROWS:
-            click.echo(f"  and {len(gap['where']) - MAX_ROWS} more in diagnosis.json")
+        if len(told) > MAX_ROWS:
+            click.echo(f"  and {len(told) - MAX_ROWS} more in diagnosis.json")
     if diagnosis["more_would_tell"]:
         click.echo(f"  recommended frames: {'; '.join(diagnosis['more_would_tell'])}")
 

@@ -459,8 +459,11 @@ def test_a_diagnosis_names_frames_that_would_decide(
     file = tmp_path / "diagnose/diagnosis.json"
     file.write_text(json.dumps(found))
     results.show_diagnosis(tmp_path)
-    verdict, _, lag, row_noise, *frames = (" ".join(row) for row in cells(capsys.readouterr().out))
+    verdict, gap, _, lag, row_noise, *frames = (
+        " ".join(row) for row in cells(capsys.readouterr().out)
+    )
     assert verdict == "partly explained; residual gap: 50 % (90 % interval 40 to 60 %)"
+    assert gap.startswith("gap: sum of all significant differences")
     assert lag == "lag 90.0 % (80.0 to 95.0 %) 90.0 % < 10⁻¹² ipc, glow"
     assert row_noise == "row_noise 90.0 % (80.0 to 95.0 %) 90.0 % 1.1 × 10⁻¹² -"
     assert frames == [

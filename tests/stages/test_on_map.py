@@ -9,7 +9,7 @@ from pixcal.effects.lag import Lag
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.estimators.detector.traps import FittedLoss
 from pixcal.simulation.effect import FringeMaps
-from pixcal.stages.advice import limit, moved_by, size_of
+from pixcal.stages.advice import limit, moved_by, size_of, unexplained
 from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.on_map import on_map
 
@@ -77,6 +77,21 @@ def test_the_size_of_an_effect_is_told_in_its_units():
     own = glow | {"units": {"rate": "e-/s", "reach_px": "px"}, "strengths": ["rate"]}
     assert size_of(own) == "rate 118.0 ± 2.0 e⁻/s"
     assert size_of({"parameters": {"share": 0.0}, **size("share")}) == "-"
+
+
+def test_what_no_cause_explains_has_a_size():
+    tone = {"title": "tone", "place": "0.24", "unit": "σ", "measured": 128.0, "after": 0.0}
+    shared = {"title": "correlation", "place": "x+2", "unit": "", "measured": -0.28, "after": 4e-5}
+    drift = {"title": "level", "place": "all", "unit": "e-", "measured": 5.02, "after": 5.01}
+    where = [tone | {"z_after": 30.0}, drift | {"z_after": 4.0}, shared | {"z_after": -9.0}]
+    found = {"verdict": "unexplained", "gap": {"where": where}, "more_would_tell": ["darks"]}
+    ((name, size, sigmas, _, action),) = unexplained(found)
+    assert (name, sigmas) == ("unexplained", "9.0 σ")
+    assert size == "correlation, x+2: −28.0 % (simulated: 0)"
+    assert action.endswith("recommended frames: darks")
+    found["gap"]["where"] = where[1:2]
+    assert unexplained(found)[0][1] == "level, all: 5.020 e⁻ (simulated: 5.010)"
+    assert unexplained(found | {"verdict": "explained"}) == unexplained(None) == ()
 
 
 def test_what_nothing_is_known_of_is_not_said_to_do_nothing():

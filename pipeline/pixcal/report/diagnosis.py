@@ -15,7 +15,7 @@ from pixcal.report.diagnosis_words import (
     worst,
 )
 from pixcal.report.tables import Table, is_table
-from pixcal.report.text import chance, exact, number, share_by_law, unit, with_error
+from pixcal.report.text import chance, digits_apart, exact, number, share_by_law, unit, with_error
 
 Facts = Mapping[str, Any]
 
@@ -148,7 +148,8 @@ def largest(curves: Sequence[Facts]) -> list[Facts]:
 
 def differing(result: DiagnosisContents) -> list[Facts]:
     """Statistics that differ, the most significant first."""
-    return sorted((c for c in result.curves if c["in_gap"]), key=lambda c: -c["significance"])
+    told = (c for c in result.curves if c["in_gap"] and c["significance"] > 0)
+    return sorted(told, key=lambda c: -c["significance"])
 
 
 def still_differing(result: DiagnosisContents) -> list[Facts]:
@@ -180,7 +181,7 @@ def _row(curve: Facts, causes: bool) -> list[str]:
     at = worst(curve)
     measured, nominal = curve["measured"][at], curve["nominal"]["value"][at]
     of = "" if curve["set"] == DETECTOR else f"set {curve['set']}: "
-    digits = _digits(measured, nominal)
+    digits = digits_apart(measured, nominal)
     value = f"{number(measured, digits)} {unit(curve['unit'])}".strip()
     row = [curve["domain"], curve["title"], of + place(curve, at), value]
     row += [number(nominal, digits), f"{curve['significance']:.1f}"]
@@ -189,14 +190,6 @@ def _row(curve: Facts, causes: bool) -> list[str]:
         after = number(curve["with_effects"]["value"][at], digits)
         row += [after, f"{curve['significance_after']:.1f}", left]
     return row
-
-
-def _digits(one: float, other: float) -> int:
-    """Significant digits that resolve the difference of two values."""
-    size, apart = max(abs(one), abs(other)), abs(one - other)
-    if not (math.isfinite(size) and apart > 0):
-        return 3
-    return min(max(3, 1 + math.ceil(math.log10(size / apart))), 6)
 
 
 def _sigma(value: float) -> str:
@@ -210,7 +203,7 @@ def absolute(facts: Facts) -> Table:
     each = causes if len(causes) > 1 else []
     rows = []
     for entry in facts["gap"]["absolute"]:
-        digits = _digits(entry["measured"], entry["simulated"])
+        digits = digits_apart(entry["measured"], entry["simulated"])
         row = [entry["quantity"], unit(entry["unit"]), number(entry["measured"], digits)]
         for key in ("simulated", "after") if causes else ("simulated",):
             ends = [number(end, digits) for end in entry.get(f"{key}_interval", ())]

@@ -115,6 +115,21 @@ _NOTATION = {
 }
 
 
+def digits_apart(one: float, other: float) -> int:
+    """Significant digits that resolve the difference of two values, at least three."""
+    size, apart = max(abs(one), abs(other)), abs(one - other)
+    if not (math.isfinite(size) and apart > 0):
+        return 3
+    return min(max(3, 1 + math.ceil(math.log10(size / apart))), 6)
+
+
+def not_tested(diagnosis: Mapping[str, Any]) -> str:
+    """Effects that the frames cannot show, and the frames that would; empty without any."""
+    groups = diagnosis.get("not_tested", {})
+    parts = [f"{', '.join(names)} (needs {frames})" for frames, names in groups.items()]
+    return f"not tested: {'; '.join(parts)}" if parts else ""
+
+
 def share(part: int, whole: int) -> str:
     """A part in per cent."""
     percent = 100 * part / max(whole, 1)

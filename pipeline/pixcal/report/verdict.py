@@ -111,6 +111,10 @@ def _diagnosis_card(diagnosis: DiagnosisContents) -> Card:
     verdict, gap = diagnosis.facts["verdict"], diagnosis.facts["gap"]
     causes = ", ".join(c["effect"] for c in diagnosis.facts["causes"])
     detail = "no significant difference" if verdict == "no gap" else f"The {residual_gap(gap)}"
+    if verdict == "no gap" and (
+        untested := sum(map(len, diagnosis.facts.get("not_tested", {}).values()))
+    ):
+        detail += f"; {untested} effects not tested for lack of frames"
     return Card("diagnosis", verdict, f"{causes}. {detail}" if causes else detail, level(diagnosis))
 
 

@@ -174,7 +174,7 @@ class Effect(ForwardModel):
     left_because : str
         Why maps need no correction for it all the same: it is noise, or small.
     remedy : str
-        What to do about it on a detector without fringes.
+        What to do about it on a detector without fringes; empty where it shows in fringes alone.
     is_gain : bool
         Whether it scales all samples alike, as photon transfer measures.
     fit_model : str
@@ -185,7 +185,7 @@ class Effect(ForwardModel):
 
     absorbed_because: ClassVar[str] = ""
     left_because: ClassVar[str] = ""
-    remedy: ClassVar[str] = "find and fix it on the bench"
+    remedy: ClassVar[str] = ""
     is_gain: ClassVar[bool] = False
     fit_model: ClassVar[str] = ""
     smooth_degree: ClassVar[int] = 3

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from pixcal.effects import known_effects
-from pixcal.report.text import NO_OFFSETS, number, with_error
+from pixcal.report.text import NO_OFFSETS, digits_apart, number, unit, with_error
 from pixcal.stages.treatment import CORRECTED, SUFFIX, fitted_shapes, treatment_of_kind
 from pixcal.storage.manifest import MANIFEST, read_json
-from pixcal.storage.stage import read_acquisition, require
+from pixcal.storage.stage import require, without_fringes
 
 Json = Mapping[str, Any]
 
@@ -38,7 +38,7 @@ def advice(run_dir: Path) -> Advice:
     sigma = _sigma(fit, correction)
     causes = diagnosis["causes"] if diagnosis else ()
     shapes = fitted_shapes(run_dir)
-    fringes = bool(read_acquisition(run_dir).frames.fringes)
+    fringes = not without_fringes(run_dir)
 
     def action(cause: Json) -> str:
         to_do = str(cause.get("remedy", ""))
@@ -47,11 +47,14 @@ def advice(run_dir: Path) -> Advice:
         return f"{to_do}{_to_distinguish(cause)}"
 
     rows: tuple[tuple[str, ...], ...] = tuple(
-        (c["effect"], size_of(c), moved_by(c, sigma), action(c)) for c in causes
+        (c["effect"], size_of(c), _sigmas(c.get("sigmas")), moved_by(c, sigma), action(c))
+        for c in causes
     )
-    rows = (("effect", "size", "effect on the offsets", "action"), *rows) if rows else ()
+    rows += unexplained(diagnosis)
+    header = ("effect", "size", "significance", "effect on the offsets", "action")
+    rows = (header, *rows) if rows else ()
     if not sigma:
-        rows = tuple((*row[:2], *row[3:]) for row in rows)
+        rows = tuple((*row[:3], *row[4:]) for row in rows)
     settled = all(fringes and _settled(c, correction, bool(sigma)) for c in causes)
     if not fit["outputs"]:
         return Advice((), rows, settled)
@@ -201,6 +204,28 @@ def _to_distinguish(cause: Json) -> str:
         return ""
     others = " or ".join(cause["not_told_apart_from"])
     return f"; to distinguish it from {others}, retake with {', '.join(cause['would_decide'])}"
+
+
+def unexplained(diagnosis: Json | None) -> tuple[tuple[str, ...], ...]:
+    """A row on the largest departure that no cause explains, where there is one."""
+    verdict, gap = (diagnosis or {}).get("verdict"), (diagnosis or {}).get("gap", {})
+    if not diagnosis or verdict not in ("unexplained", "partly explained") or not gap["where"]:
+        return ()
+    # The most significant comes first; some have a size in no other unit.
+    entry = min(gap["where"], key=lambda e: (e["unit"] == "σ", -abs(e["z_after"])))
+    scale, its_unit = (1, unit(entry["unit"])) if entry["unit"] else (100, "%")
+    ends = [scale * float(entry[key]) for key in ("measured", "after")]
+    digits = digits_apart(*ends)
+    decimals = digits - 1 - math.floor(math.log10(max(map(abs, ends))))
+    measured, simulated = (number(round(v, decimals), digits) for v in ends)
+    size = f"{entry['title']}, {entry['place']}: {measured} {its_unit} (simulated: {simulated})"
+    frames = "; recommended frames: ".join(["", ", ".join(diagnosis["more_would_tell"])])
+    action = f"find the cause on the bench{frames if diagnosis['more_would_tell'] else ''}"
+    return (("unexplained", size, _sigmas(abs(entry["z_after"])), "not known", action),)
+
+
+def _sigmas(value: float | None) -> str:
+    return "–" if value is None else f"{number(float(value), 2)} σ"
 
 
 def size_of(cause: Json) -> str:

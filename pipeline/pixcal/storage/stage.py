@@ -32,7 +32,7 @@ def require(run: Path, name: str) -> Manifest:
         error.advice = f"make it again with '{command}'"
         raise
     if manifest is None:
-        if stage.of_fringes and _without_fringes(run):
+        if stage.of_fringes and without_fringes(run):
             raise InputError(f"{run}: the acquisition lists no fringes, so there is no {name}")
         raise InputError(f"{folder}: not there yet; run '{command}' first")
     if manifest.stage != name or manifest.format not in (stage.format, *stage.earlier):
@@ -49,7 +49,7 @@ def read_acquisition(run: Local) -> Acquisition:
     return parse(Acquisition, read_json(file), str(file))
 
 
-def _without_fringes(run: Path) -> bool:
+def without_fringes(run: Path) -> bool:
     """Whether the acquisition that was ingested has detector frames alone."""
     try:
         return not read_json(run / "ingest" / "acquisition.json")["frames"]["fringes"]

@@ -17,6 +17,7 @@ class Candidate:
     name: str
     estimate: Estimate | None  # from the fitted frames
     reason: str = ""  # why it was rejected; empty when it was accepted
+    needs: tuple[str, ...] = ()  # frames that would give an estimate, where there is none
     alone: Trial | None = None  # the bench with this effect only
     ways: int = 1  # number of variants that were simulated; the likeliest one counts
     # fraction of its significance that the causes accepted before it do not produce

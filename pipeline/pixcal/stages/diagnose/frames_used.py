@@ -19,6 +19,7 @@ LADDER = 3  # exposure times of flats for a linearity curve
 # equal phase steps do not show light of neighbouring frames
 RANDOM = "fringes with random phases"
 MORE = "more frames of the same kind"
+FRINGES = "fringes"  # for what shows in nothing else
 
 
 def frames_of(half: Half) -> Frames:

@@ -19,7 +19,7 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Again, Effect, Estimate
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
-from pixcal.stages.diagnose.frames_used import MORE, FramesUsed
+from pixcal.stages.diagnose.frames_used import FRINGES, MORE, FramesUsed
 from pixcal.stages.diagnose.look import DiagnosisInput, look_at
 from pixcal.stages.diagnose.result import by_domain
 from pixcal.stages.diagnose.search import CONFIRM, SCREEN, Search, affordable
@@ -81,7 +81,10 @@ def inquire(
     look = look_at(run_dir, runtime, learnt)
     for name, candidate in candidates.items():
         if candidate.estimate is None and not candidate.reason:
-            candidate.reason = _needs(kinds[name], look.facts)
+            candidate.needs = _needs(kinds[name], look.facts)
+            candidate.reason = (
+                f"these frames give no estimate; {' or '.join(candidate.needs)} would help"
+            )
     estimates = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
     quick = tuple(s for s in signatures if kinds[s.name].quick)
     trials = Trials(look.windows, scratch, look.runtime, quick, estimates, SCREEN)
@@ -187,12 +190,14 @@ def _candidates(
     return candidates
 
 
-def _needs(kind: type[Effect], facts: FramesUsed) -> str:
-    """Why these frames give no estimate of an effect, and which would."""
-    frames = [words for name, words in facts.missing_frames.items() if name in kind.frames_needed]
-    if not frames:
-        frames = [MORE if facts.sets else "fringes"]
-    return f"these frames give no estimate; {' or '.join(frames)} would help"
+def _needs(kind: type[Effect], facts: FramesUsed) -> tuple[str, ...]:
+    """Frames that would give an estimate of an effect."""
+    if not facts.sets and not kind.remedy:
+        return (FRINGES,)
+    missing = facts.missing_frames
+    frames = tuple(words for name, words in missing.items() if name in kind.frames_needed)
+    # What fringes tell best may show in any frames of a sensor.
+    return frames or (() if facts.sets else tuple(missing.values())) or (MORE,)
 
 
 def _replayed(candidate: Candidate, unseen: Evidence) -> Effect | None:

@@ -32,7 +32,7 @@ from pixcal.stages.diagnose.comparison import (
     gap_interval,
     shrinkage,
 )
-from pixcal.stages.diagnose.frames_used import FramesUsed, recommend_frames
+from pixcal.stages.diagnose.frames_used import FRINGES, FramesUsed, recommend_frames
 
 Json = dict[str, Any]
 
@@ -124,6 +124,7 @@ class _Description:
                 "places": list(places),
             },
             "candidates": [self._candidate(c) for c in found.candidates.values()],
+            "not_tested": self._not_tested(),
             "more_would_tell": (
                 recommend_frames(self.facts.missing_frames)
                 if verdict in ("unexplained", "partly explained")
@@ -187,11 +188,19 @@ class _Description:
             "p_value": float(np.clip(chance, MIN_P_VALUE, 1.0)),
             "sigmas": _rounded(estimate.significance),
             "why": estimate.why,
-            "remedy": effect.remedy,
+            "remedy": effect.remedy or "find and fix it on the bench",
             "given_away_by": self._telling(found.without[name]),
             "not_told_apart_from": list(alike),
             "would_decide": recommend_frames(self.facts.missing_frames, kinds) if alike else [],
         }
+
+    def _not_tested(self) -> Json:
+        """Effects that these frames cannot show, by the frames that would."""
+        groups: Json = {}
+        for candidate in self.found.candidates.values():
+            if candidate.needs and candidate.needs != (FRINGES,):
+                groups.setdefault(" or ".join(candidate.needs), []).append(candidate.name)
+        return groups
 
     def _telling(self, without: Trial) -> list[dict[str, str]]:
         """Statistics that an effect makes most likely, best first."""
