@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pixcal.model.errors import InputError
 from pixcal.storage.fits_in import FrameFile, inspect
-from pixcal.storage.fits_rows import read_rows, unpack
+from pixcal.storage.fits_rows import BAND, by_fact, read_rows, unpack
 from pixcal.storage.sources import SourceFile
 
 EXTREMES = {
@@ -80,6 +80,30 @@ def test_round_trip(tmp_path: Path, dtype: str, name: str, shape: tuple[int, ...
     assert file.coding.dtype == np.dtype(dtype)
     found = load(file, tmp_path / "scratch")
     assert found.tobytes() == data.reshape(file.shape).tobytes()
+
+
+@pytest.mark.parametrize("scale", [None, (0.5, 7)], ids=["exact", "scaled"])
+@pytest.mark.parametrize("dtype", [*EXTREMES, "float32"])
+def test_facts_of_bands_are_those_of_their_values(
+    tmp_path: Path, dtype: str, scale: tuple[float, float] | None
+) -> None:
+    data = samples(dtype, (2, 2 * BAND + 9, 1500))
+    data[1, -4:] = data[1, 0, 0]
+    path = save(tmp_path / "a.fits", data, "plain")
+    if scale is not None:
+        for key, number in zip(("BSCALE", "BZERO"), scale, strict=True):
+            fits.setval(path, key, value=number)
+    file = inspect(source(path))
+    values, (_, ny, _) = load(file, tmp_path), file.shape
+    facts = by_fact(read_rows(file, [1, 0], (0, ny)))
+    for n, b in np.ndindex(2, 3):
+        band = values[1 - n, b * BAND : (b + 1) * BAND]
+        bits = band.view(f"u{band.itemsize}")
+        same = bits == bits[-1, -1]
+        constant = 4 if (n, b) == (0, 2) else 0
+        expected = (np.fmax.reduce(band, axis=None), band[-1, -1], same[-1].mean(), constant)
+        found = [facts[name][n, b] for name in ("largest", "last", "share", "constant")]
+        np.testing.assert_array_equal(found, np.array(expected, float))
 
 
 @pytest.mark.parametrize("tile", [(1, 9, 131), (2, 20, 50), (3, 67, 131)], ids=str)

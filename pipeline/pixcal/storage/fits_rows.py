@@ -40,7 +40,7 @@ def by_fact(catalogue: F64) -> dict[str, F64]:
     return dict(zip(FACTS, np.moveaxis(catalogue, -1, 0), strict=True))
 
 
-_PIECE = 1 << 20
+_PIECE = 1 << 20  # bytes to read at a time
 
 
 def bands(rows: tuple[int, int]) -> list[tuple[int, int]]:
@@ -72,38 +72,57 @@ def read_rows(
     """
     _, ny, nx = file.shape
     coding, within = file.coding, bands(rows)
-    stored = coding.stored
+    stored, each = coding.stored, rows_at_once(file) // BAND
     found = np.full((len(planes), len(within), len(FACTS)), np.nan)
-    scratch, spare = np.empty((2, min(BAND, rows[1] - rows[0]), nx), stored)
+    scratch, spare = np.empty((2, min(each * BAND, rows[1] - rows[0]), nx), stored)
     direct = out is not None and coding.exact and out.dtype == coding.dtype
     with file.source.open() as handle:
-        for (n, plane), (b, (y0, y1)) in product(enumerate(planes), enumerate(within)):
+        for (n, plane), first in product(enumerate(planes), range(0, len(within), each)):
+            some = within[first : first + each]
+            y0, y1 = some[0][0], some[-1][1]
             target = None if out is None else out[n, y0 - rows[0] : y1 - rows[0]]
-            raw, native = scratch[: y1 - y0], spare[: y1 - y0]
-            if direct and target is not None:
-                native = target.view(stored)
+            raw = scratch[: y1 - y0]
             start = file.offset + (plane * ny + y0) * nx * stored.itemsize
             _read_exactly(handle, start, raw, file.source.path)
-            found[n, b, 0] = google_crc32c.value(raw)
-            _make_native(raw, coding, native)
-            values = native.view(coding.dtype) if coding.exact else _scale(native, coding)
+            parts = [slice(a - y0, b - y0) for a, b in some]
+            of_bands = found[n, first : first + each]
+            of_bands[:, 0] = [google_crc32c.value(raw[part]) for part in parts]
+            # As they are: to turn bytes and sign bits takes longer than to find the facts.
+            values, zero = raw.view(stored.newbyteorder(">")), coding.bzero
+            if target is not None or not coding.exact:
+                native = spare[: y1 - y0]
+                if direct and target is not None:
+                    native = target.view(stored)
+                _make_native(raw, coding, native)
+                converted = native.view(coding.dtype) if coding.exact else _scale(native, coding)
+                if target is not None and not direct:
+                    target[...] = converted
+                if not coding.exact:
+                    values, zero = converted, 0.0
             if not crc_alone:
-                found[n, b, 1:] = np.fmax.reduce(values, axis=None), *_ending(values)
-            if target is not None and not direct:
-                target[...] = values
+                of_bands[:, 1:] = [_largest_and_ending(values[part], zero) for part in parts]
         # Written to since it was opened, it is partly another file.
         file.source.check_read(handle)
     return found
 
 
-def _ending(values: NDArray[Any]) -> tuple[float, float, int]:
-    """Last sample, share of the last row that equals it, and rows at the end of nothing else."""
+def rows_at_once(file: FrameFile) -> int:
+    """Rows, in whole bands, that `read_rows` holds at a time; they fit the cache of a core.
+
+    With a single band threads would wait for each other longer than they compute.
+    """
+    return BAND * max(1, _PIECE // (BAND * file.shape[2] * file.coding.stored.itemsize))
+
+
+def _largest_and_ending(values: NDArray[Any], zero: float) -> tuple[float, float, float, int]:
+    """The facts of a band beside its checksum, of samples less ``zero``."""
     bits = values.view(f"u{values.itemsize}")  # NaN equals itself
-    share = float((bits[-1] == bits[-1, -1]).mean())
+    largest, last = float(np.fmax.reduce(values, axis=None)) + zero, float(values[-1, -1]) + zero
+    share = np.count_nonzero(bits[-1] == bits[-1, -1]) / bits.shape[1]
     if share < 1:
-        return float(values[-1, -1]), share, 0
+        return largest, last, share, 0
     same = (bits == bits[-1, -1]).all(axis=1)
-    return float(values[-1, -1]), share, len(same) if same.all() else int(same[::-1].argmin())
+    return largest, last, share, len(same) if same.all() else int(same[::-1].argmin())
 
 
 def _make_native(raw: NDArray[Any], coding: SampleFormat, native: NDArray[Any]) -> None:

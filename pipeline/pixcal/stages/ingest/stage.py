@@ -34,7 +34,7 @@ from pixcal.storage.artefact import Build
 from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.cube_place import base_of, chosen_base, cubes_of
 from pixcal.storage.fits_in import FrameFile
-from pixcal.storage.fits_rows import BAND, by_fact, read_rows, unpack, unpack_bytes
+from pixcal.storage.fits_rows import BAND, by_fact, read_rows, rows_at_once, unpack, unpack_bytes
 from pixcal.storage.folder import transit_bytes
 from pixcal.storage.formats import STAGES
 from pixcal.storage.frame_reader import describe
@@ -243,11 +243,12 @@ def _plan(
 
 
 def _task_bytes(array: str, frames: Sequence[Frame], rows: int, copied: bool) -> int:
-    """Peak of one task: the rows, a band of samples in conversion, chunks in compression."""
+    """Peak of one task: the rows, some samples in conversion, chunks in compression."""
     files = _files(frames)
     _, ny, nx = files[0].shape
     dtype = _common_dtype(array, files)
-    conversion = min(BAND, ny) * nx * (np.dtype("f8").itemsize + 3 * dtype.itemsize)
+    held = min(max(map(rows_at_once, files)), ny)
+    conversion = held * nx * (np.dtype("f8").itemsize + 3 * dtype.itemsize)
     if not copied:
         return conversion
     chunk = CHUNK[0] * CHUNK[1] * CHUNK[2] * dtype.itemsize
