@@ -20,12 +20,10 @@ from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
-LEVEL = 5e4  # electrons at which powers of the level are one
-POWERS = 3  # of the response that is free beside
 _DISAGREE = 4.0
 # standard deviations, with a response that is free beside, from which it may explain all
 _HINTED = 1.5
-_NEEDED = 12.0  # chi-square of `POWERS` terms beyond which they are needed: one in 130 by chance
+_NEEDED = 12.0  # chi-square of three terms beyond which they are needed: one in 130 by chance
 _APART = 9.0  # chi-square from which shifts along x and y are not the same
 _MAX_ALONG_Y = 10.0  # of the shift along y over that along x
 _TURNS = 4  # of the inverse: each gains the size of the effect, a few per cent
@@ -121,10 +119,10 @@ class BrighterFatter(Effect):
         significance = float(size / np.sqrt(variance))
         why = "covariance of neighbours that rises with the square of the level"
         if evidence.fringes:
-            free = boundaries_beside(evidence, LEVEL, POWERS, falloff)
+            free = boundaries_beside(evidence, falloff)
             details |= {"of_harmonics": free.shift, "of_harmonics_error": float(free.variance**0.5)}
             if abs(free.shift - size) < _DISAGREE * np.sqrt(variance + free.variance):
-                both = boundaries_beside(evidence, LEVEL, POWERS, falloff, (size, variance))
+                both = boundaries_beside(evidence, falloff, (size, variance))
                 size, variance = both.shift, both.variance
                 # Of chi-square with a degree of freedom for each axis.
                 beyond = max(both.gain - both.axes + 1, 0.0)
@@ -167,9 +165,9 @@ def _explaining(evidence: Evidence, otherwise_px: float) -> Boundaries | None:
     A response that is free beside them makes them uncertain, and one uncertain beside the other
     either seems to be needed. What boundaries of another shape would explain as well asks for none.
     """
-    found = boundaries_alone(evidence, LEVEL, POWERS, otherwise_px)
+    found = boundaries_alone(evidence, otherwise_px)
     if found.against > _NEEDED:
-        found = boundaries_alone(evidence, LEVEL, POWERS, otherwise_px, by_axis=True)
+        found = boundaries_alone(evidence, otherwise_px, by_axis=True)
     return found if found.against <= max(_NEEDED, found.shapes) else None
 
 

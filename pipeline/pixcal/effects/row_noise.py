@@ -1,6 +1,7 @@
 """Noise of the electronics that all pixels of a row, or of a column, have in common in a frame."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -22,6 +23,7 @@ FREEDOM = 3  # parameters of a pixel in the fit of the fringes
 TURNS = 2.0  # fringes along a row from which its mean tells nothing of them
 # lowest mode across the rows that counts in frames with light, whose pattern is smooth
 FIRST_MODE = 3
+_rms = partial(quantity, unit="e-", low=0, high=1e5)
 
 
 @dataclass(frozen=True)
@@ -53,35 +55,14 @@ class RowNoise(Effect):
         "taken here as a tenth of a read noise of 16 e-",
     )
 
-    row_rms: float = quantity(
-        1.6, unit="e-", low=0, high=1e5, doc="white noise from row to row, rms"
+    row_rms: float = _rms(1.6, doc="white noise from row to row, rms")
+    flicker_rms: float = _rms(0.5, doc="1/f noise from row to row, rms per octave of frequency")
+    interlace_rms: float = _rms(
+        0.5, doc="rms difference of even rows from the mean; odd rows have the opposite sign"
     )
-    flicker_rms: float = quantity(
-        0.5,
-        unit="e-",
-        low=0,
-        high=1e5,
-        doc="1/f noise from row to row, rms per octave of frequency",
-    )
-    interlace_rms: float = quantity(
-        0.5,
-        unit="e-",
-        low=0,
-        high=1e5,
-        doc="rms difference of even rows from the mean; odd rows have the opposite sign",
-    )
-    column_rms: float = quantity(
-        0.8,
-        unit="e-",
-        low=0,
-        high=1e5,
-        doc="white noise from column to column, new in each frame, rms",
-    )
-    alternate_rms: float = quantity(
+    column_rms: float = _rms(0.8, doc="white noise from column to column, new in each frame, rms")
+    alternate_rms: float = _rms(
         0.0,
-        unit="e-",
-        low=0,
-        high=1e5,
         doc="noise from row to row, rms; half of its variance is shared with the second next row",
     )
 

@@ -22,6 +22,7 @@ from pixcal.model.arrays import F32, U16
 from pixcal.model.bench import Bench
 from pixcal.simulation.forward import ForwardModel
 from pixcal.simulation.recording import Recording
+from pixcal.simulation.shot import Shot
 
 K = TypeVar("K", tuple[int, int], tuple[int, str])
 
@@ -71,61 +72,6 @@ class Camera:
     def light(self, recording: Recording) -> LightMaps:
         """Mean and fringe amplitude of a recording on these rows and those around, e-."""
         return _Chain(self, recording).light
-
-
-class _Shot:
-    """`pixcal.simulation.shot.Shot` of a chain, seen by the effect at a place in it."""
-
-    def __init__(self, chain: "_Chain", frame: int, at: int) -> None:
-        self._chain, self._at = chain, at
-        self.recording = chain.recording
-        self.bench = chain.camera.bench
-        self.maps = chain.camera.maps
-        self.rows = chain.camera.rows
-        self.frame = frame
-
-    @property
-    def time_s(self) -> float:
-        """Start of the frame after that of the acquisition."""
-        return self.recording.start_s + float(self.recording.times_s[self.frame])
-
-    @property
-    def states(self) -> FrameStates:
-        """Of all frames of the recording."""
-        return self._chain.states
-
-    @property
-    def light(self) -> LightMaps:
-        """Mean and fringe amplitude of the recording on these rows, e-."""
-        return self._chain.light
-
-    def mean(self, frame: int) -> F32 | None:
-        """Mean electrons of another frame, without this effect; None outside the recording."""
-        inside = 0 <= frame < self.recording.count
-        return self._chain.mean(frame, self._at) if inside else None
-
-    def charge(self, frame: int) -> F32 | None:
-        """Charge of another frame, without this effect; None outside the recording."""
-        chain, frame = self._chain.of(frame)
-        inside = 0 <= frame < chain.recording.count
-        return chain.charge(frame, self._at) if inside else None
-
-    def surrounded(self, charge: F32, reach: int) -> F32:
-        """Charge of this frame with a margin, in which its light goes on."""
-        wide = self._chain.beyond(self.frame, reach)
-        inside = slice(reach, -reach)
-        wide[inside, inside] = charge
-        return wide
-
-    def rng(self, effect: str, *key: int) -> np.random.Generator:
-        """Random numbers of an effect in this frame."""
-        return self.recording.rng(effect, self.frame, *key)
-
-    def normals(self, effect: str, frame: int | None = None) -> F32:
-        """Standard normals (y, x) of an effect, the same however rows are cut; read only."""
-        chain, frame = self._chain.of(self.frame if frame is None else frame)
-        looks_back = chain.effects[self._at].frames_back > 0
-        return chain.normals(effect, frame, keep=looks_back)
 
 
 class _Latest(dict[K, F32]):
@@ -197,7 +143,7 @@ class _Chain:
         """Mean electrons, by the first ``upto`` effects."""
         mean = self._illuminated(self.light, frame, np.empty_like(self.dark))
         for at, effect in enumerate(self.effects[:upto]):
-            mean = effect.photons(mean, _Shot(self, frame, at))
+            mean = effect.photons(mean, Shot(self, frame, at))
         return mean
 
     def _illuminated(self, light: LightMaps, frame: int, out: F32, reach: int = 0) -> F32:
@@ -231,7 +177,7 @@ class _Chain:
         for at, effect in enumerate(self.effects[:upto]):
             if effect.frames_back:
                 self._charges.keep((frame, at), charge)
-            charge = effect.charge(charge, _Shot(self, frame, at))
+            charge = effect.charge(charge, Shot(self, frame, at))
         self._charges.keep(key, charge)
         return charge
 
@@ -255,13 +201,13 @@ class _Chain:
         """Samples of a frame before they are rounded, ADU."""
         signal = self.charge(frame, len(self.effects)).copy()
         for at, effect in enumerate(self.effects):
-            signal = effect.signal(signal, _Shot(self, frame, at))
+            signal = effect.signal(signal, Shot(self, frame, at))
         adu = np.empty_like(signal)
         read = self._normals(frame)[1]
         maps = self.camera.maps
         synthesis.amplify(signal, maps.bias, read, maps.read_noise, maps.adu_per_e, adu)
         for at, effect in enumerate(self.effects):
-            adu = effect.readout(adu, _Shot(self, frame, at))
+            adu = effect.readout(adu, Shot(self, frame, at))
         return adu
 
     def _normals(self, frame: int) -> F32:

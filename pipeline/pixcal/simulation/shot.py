@@ -1,6 +1,6 @@
 """A frame being made, as an effect sees it."""
 
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
@@ -11,8 +11,8 @@ from pixcal.model.bench import Bench
 from pixcal.simulation.recording import Recording
 
 
-class Shot(Protocol):
-    """Where, when and of what a frame is taken.
+class Shot:
+    """Where, when and of what a frame is taken, seen by the effect at a place among the others.
 
     Attributes
     ----------
@@ -27,32 +27,45 @@ class Shot(Protocol):
         Of these rows.
     """
 
-    bench: Bench
-    recording: Recording
-    frame: int
-    rows: Rows
-    maps: DetectorMaps
+    def __init__(self, chain: Any, frame: int, at: int) -> None:
+        # A chain of `pixcal.simulation.exposure`.
+        self._chain, self._at = chain, at
+        self.recording: Recording = chain.recording
+        self.bench: Bench = chain.camera.bench
+        self.maps: DetectorMaps = chain.camera.maps
+        self.rows: Rows = chain.camera.rows
+        self.frame = frame
 
     @property
     def time_s(self) -> float:
         """Start of the frame after that of the acquisition."""
+        return self.recording.start_s + float(self.recording.times_s[self.frame])
 
     @property
     def states(self) -> FrameStates:
         """Of all frames of the recording."""
+        states: FrameStates = self._chain.states
+        return states
 
     @property
     def light(self) -> LightMaps:
         """Mean and fringe amplitude of the recording on these rows, e-."""
+        light: LightMaps = self._chain.light
+        return light
 
     def mean(self, frame: int) -> F32 | None:
         """Mean electrons of another frame, without this effect; None outside the recording."""
+        inside = 0 <= frame < self.recording.count
+        return self._chain.mean(frame, self._at) if inside else None
 
     def charge(self, frame: int) -> F32 | None:
         """Charge of another frame, without this effect; None outside the recording.
 
         Frames -1, -2, ... are the last ones of the recording before, where it is known.
         """
+        chain, frame = self._chain.of(frame)
+        inside = 0 <= frame < chain.recording.count
+        return chain.charge(frame, self._at) if inside else None
 
     def surrounded(self, charge: F32, reach: int) -> F32:
         """Charge (y, x) of this frame with ``reach`` more pixels on every side, e-.
@@ -60,15 +73,24 @@ class Shot(Protocol):
         Beyond the rows at hand and the window's columns lies what the light of the frame collects
         there: fringes go on, pixels are like those at the edge, without noise.
         """
+        wide: F32 = self._chain.beyond(self.frame, reach)
+        inside = slice(reach, -reach)
+        wide[inside, inside] = charge
+        return wide
 
     def rng(self, effect: str, *key: int) -> np.random.Generator:
         """Random numbers of an effect in this frame, the same for all rows.
 
         What differs from pixel to pixel is drawn with ``recording.pixel_rng``.
         """
+        return self.recording.rng(effect, self.frame, *key)
 
     def normals(self, effect: str, frame: int | None = None) -> F32:
-        """Standard normals (y, x) of an effect, the same however rows are cut.
+        """Standard normals (y, x) of an effect, the same however rows are cut; read only.
 
         Of this frame, or of another one of the recording.
         """
+        chain, frame = self._chain.of(self.frame if frame is None else frame)
+        looks_back = chain.effects[self._at].frames_back > 0
+        normals: F32 = chain.normals(effect, frame, keep=looks_back)
+        return normals

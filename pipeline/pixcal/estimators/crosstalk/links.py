@@ -71,10 +71,10 @@ class PixelClasses:
         return Coupling(*step, share, self.rows, row, self.columns, column)
 
 
-def periods(shape: Place, longest: int = MAX_PERIOD) -> list[Place]:
+def periods(shape: Place) -> list[Place]:
     """Periods (rows, columns) that a window can tell, the shortest first."""
-    rows = range(1, max(1, min(longest, shape[0] // MIN_REPEATS)) + 1)
-    columns = range(1, max(1, min(longest, shape[1] // MIN_REPEATS)) + 1)
+    rows = range(1, max(1, min(MAX_PERIOD, shape[0] // MIN_REPEATS)) + 1)
+    columns = range(1, max(1, min(MAX_PERIOD, shape[1] // MIN_REPEATS)) + 1)
     both = ((n, m) for n in rows for m in columns if n * m <= MAX_CLASSES)
     return sorted(both, key=lambda p: (p[0] * p[1], p))
 

@@ -29,6 +29,9 @@ FALLOFFS_PX = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
 _FINE_PX = np.geomspace(FALLOFFS_PX[0], FALLOFFS_PX[-1], 61)
 _BESIDE = 5  # of the fine steps: the parabola about the best one goes so far
 LOOSE = 0.02  # departure from a response, of full scale, that is unlikely without data
+# of the response that is free beside boundaries: electrons at which powers of the level are one,
+# and how many powers
+LEVEL, POWERS = 5e4, 3
 TOLD = 0.5  # error of the falloff's logarithm with which it is told from others
 
 
@@ -151,46 +154,45 @@ class Boundaries:
 
 
 def boundaries_alone(
-    evidence: Evidence, level_e: float, powers: int, otherwise_px: float, *, by_axis: bool = False
+    evidence: Evidence, otherwise_px: float, *, by_axis: bool = False
 ) -> Boundaries:
     """Boundaries that explain the harmonics by themselves, with the falloff that does it best.
 
     Parameters
     ----------
-    level_e, powers : of the response that may be beside them, as of `fit_response`
     otherwise_px : falloff where the harmonics do not tell it; one of `FALLOFFS_PX`
     by_axis : boundaries between rows may move by another shift than those between columns: fringes
         across each tell of it
     """
-    sums = _sums_by_axis(evidence, level_e, powers)
+    sums = _sums_by_axis(evidence)
     if len(sums) < 2 or not by_axis:
         sums = [(sum(n for n, _ in sums), sum(r for _, r in sums))]  # type: ignore[list-item]
-    fine = _of_fine_falloffs(powers)
+    fine = _of_fine_falloffs()
     sums = [(fine @ normal @ fine.T, fine @ right) for normal, right in sums]
-    found = np.array([_alone(sums, powers, powers + n) for n in range(len(_FINE_PX))])
-    return _best_falloff(found, otherwise_px, _of_any_shape(sums, powers))
+    found = np.array([_alone(sums, POWERS + n) for n in range(len(_FINE_PX))])
+    return _best_falloff(found, otherwise_px, _of_any_shape(sums))
 
 
-def _of_any_shape(sums: Sequence[tuple[F64, F64]], powers: int) -> float:
+def _of_any_shape(sums: Sequence[tuple[F64, F64]]) -> float:
     """Chi-square that boundaries explain by themselves whose shift is any sum of all falloffs."""
-    every = [(normal[powers:, powers:], right[powers:]) for normal, right in sums]
+    every = [(normal[POWERS:, POWERS:], right[POWERS:]) for normal, right in sums]
     return float(sum(right @ inverse_normal(normal) @ right for normal, right in every))
 
 
-def _of_fine_falloffs(powers: int) -> F64:
+def _of_fine_falloffs() -> F64:
     """Powers and shifts of `_FINE_PX` as sums (to, from) of powers and those of `FALLOFFS_PX`."""
     coarse, fine = (
         np.stack([boundary_shifts(falloff).ravel() for falloff in falloffs], axis=1)
         for falloffs in (FALLOFFS_PX, _FINE_PX.tolist())
     )
-    shares: F64 = block_diag(np.eye(powers), np.linalg.lstsq(coarse, fine, rcond=None)[0].T)
+    shares: F64 = block_diag(np.eye(POWERS), np.linalg.lstsq(coarse, fine, rcond=None)[0].T)
     return shares
 
 
-def _boundary_sums(evidence: Evidence, level_e: float, powers: int) -> list[tuple[F64, F64]]:
+def _boundary_sums(evidence: Evidence) -> list[tuple[F64, F64]]:
     """Sums of `distortion_sums` for powers and falloffs, of fringes across columns and rows."""
     every = [UNIT * boundary_shifts(falloff) for falloff in FALLOFFS_PX]
-    signal = _signal_of(evidence, level_e, every)
+    signal = _signal_of(evidence, LEVEL, every)
     sets = evidence.fringes.values()
     across = [
         tuple(f for f in sets if (abs(f.k[0]) >= abs(f.k[1])) == of_columns)
@@ -199,13 +201,13 @@ def _boundary_sums(evidence: Evidence, level_e: float, powers: int) -> list[tupl
 
     def by_itself(normal: F64, right: F64) -> F64:
         explained = right**2 / np.diag(normal)
-        best = powers + int(np.argmax(explained[powers:]))
+        best = POWERS + int(np.argmax(explained[POWERS:]))
         sizes = np.zeros(len(right))
         sizes[best] = right[best] / normal[best, best]
         return sizes
 
     return [
-        distortion_sums(own, signal, powers + len(every), by_itself, margin=REACH)
+        distortion_sums(own, signal, POWERS + len(every), by_itself, margin=REACH)
         for own in across
         if own
     ]
@@ -224,52 +226,45 @@ class Beside:
 
 
 def boundaries_beside(
-    evidence: Evidence,
-    level_e: float,
-    powers: int,
-    falloff_px: float,
-    known: tuple[float, float] | None = None,
+    evidence: Evidence, falloff_px: float, known: tuple[float, float] | None = None
 ) -> Beside:
     """Boundaries of a given falloff, with a response that is free.
 
     One fringe period tells little of them but how boundaries along x and y differ, which no
-    response brings about. ``evidence, level_e, powers``: as of `boundaries_alone`. ``falloff_px``:
-    one of `FALLOFFS_PX`. ``known``: mean shift by an electron (px) and its variance, as the noise
-    of neighbours has it.
+    response brings about. ``falloff_px``: one of `FALLOFFS_PX`. ``known``: mean shift by an
+    electron (px) and its variance, as the noise of neighbours has it.
     """
-    sums = _sums_by_axis(evidence, level_e, powers)
-    normal, right = _joint(sums, powers, powers + FALLOFFS_PX.index(falloff_px))
+    sums = _sums_by_axis(evidence)
+    normal, right = _joint(sums, POWERS + FALLOFFS_PX.index(falloff_px))
     mean = np.zeros(len(right))
-    mean[powers:] = 1 / len(sums)
+    mean[POWERS:] = 1 / len(sums)
     if known is not None:
         information = UNIT**2 / known[1]
         normal = normal + information * np.outer(mean, mean)
         right = right + information * known[0] / UNIT * mean
-    inverse, only = inverse_normal(normal), inverse_normal(normal[:powers, :powers])
-    gain = float(right @ inverse @ right - right[:powers] @ only @ right[:powers])
+    inverse, only = inverse_normal(normal), inverse_normal(normal[:POWERS, :POWERS])
+    gain = float(right @ inverse @ right - right[:POWERS] @ only @ right[:POWERS])
     size, variance = float(mean @ inverse @ right), float(mean @ inverse @ mean)
     return Beside(UNIT * size, UNIT**2 * variance, max(gain, 0.0), len(sums))
 
 
-def _sums_by_axis(evidence: Evidence, level_e: float, powers: int) -> list[tuple[F64, F64]]:
-    return evidence.once(
-        "boundaries", level_e, powers, make=lambda: _boundary_sums(evidence, level_e, powers)
-    )
+def _sums_by_axis(evidence: Evidence) -> list[tuple[F64, F64]]:
+    return evidence.once("boundaries", make=lambda: _boundary_sums(evidence))
 
 
-def _joint(sums: Sequence[tuple[F64, F64]], powers: int, at: int) -> tuple[F64, F64]:
+def _joint(sums: Sequence[tuple[F64, F64]], at: int) -> tuple[F64, F64]:
     """Normal equations: powers that all sums share, and a shift of each."""
-    n = powers + len(sums)
+    n = POWERS + len(sums)
     joint, right = np.zeros((n, n)), np.zeros(n)
     for number, (normal, own) in enumerate(sums):
-        places, taken = [*range(powers), powers + number], [*range(powers), at]
+        places, taken = [*range(POWERS), POWERS + number], [*range(POWERS), at]
         joint[np.ix_(places, places)] += normal[np.ix_(taken, taken)]
         right[places] += own[taken]
     return joint, right
 
 
 def _alone(
-    sums: Sequence[tuple[F64, F64]], powers: int, at: int
+    sums: Sequence[tuple[F64, F64]], at: int
 ) -> tuple[float, float, float, float, float, float]:
     """Shift, its variance, the chi-square it explains, and that of a curved response beside it.
 
@@ -279,7 +274,7 @@ def _alone(
     rights = np.array([right[at] for _, right in sums])
     sizes = rights / information
     gain = float(sizes @ rights)
-    joint, right = _joint(sums, powers, at)
+    joint, right = _joint(sums, at)
     beside = float(right @ inverse_normal(joint) @ right) - gain
     ratio = float(sizes[-1] / sizes[0])
     relative = 1 / np.sqrt(information) / sizes

@@ -81,7 +81,7 @@ def line_spectrum(residual: F32, good: Mask, fitted: int = 1) -> LineSpectrum | 
 
 
 @dataclass(frozen=True)
-class LineNoise:
+class LineVariances:
     """Variances of several kinds of noise of rows."""
 
     size: F64  # (m,) e-²; of nothing zero on average, so some come out below
@@ -96,7 +96,7 @@ class LineNoise:
         return np.sqrt(size), above - np.sqrt(size)
 
 
-def fit_lines(spectra: Sequence[LineSpectrum], shapes: Sequence[F64]) -> LineNoise:
+def fit_lines(spectra: Sequence[LineSpectrum], shapes: Sequence[F64]) -> LineVariances:
     """Least-squares sizes of kinds of noise; ``shapes`` (m, n): their unit powers by spectrum."""
     power = np.concatenate([s.power for s in spectra])
     shape = np.concatenate(list(shapes), axis=1)
@@ -113,7 +113,7 @@ def fit_lines(spectra: Sequence[LineSpectrum], shapes: Sequence[F64]) -> LineNoi
         size = covariance @ (weighted @ power)
     chance, dof = variance(np.zeros(len(shape))), np.concatenate([s.dof for s in spectra])
     sigmas = [_alone(power, own, chance, dof) for own in shape]
-    return LineNoise(size, covariance, np.array(sigmas))
+    return LineVariances(size, covariance, np.array(sigmas))
 
 
 def _alone(power: F64, shape: F64, variance: F64, dof: F64) -> float:

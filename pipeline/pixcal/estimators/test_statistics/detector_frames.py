@@ -5,6 +5,7 @@ share of it, at several distances, and how that grows with the level.
 """
 
 from collections.abc import Iterable
+from functools import partial
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from pixcal.estimators.test_statistics import Curve, family, statistic
 from pixcal.estimators.test_statistics.look import STEPS, neighbour_sums
 from pixcal.kernels.line_means import without_line_means
 from pixcal.model.arrays import F32, F64, Mask
+
+of_noise = partial(statistic, "noise")
 
 REPEATS = (1, 2, 3, 4)  # rows or columns between two that may share noise
 WILD = 8.0
@@ -82,12 +85,8 @@ def _repeats(rest: F32, good: Mask, axis: int) -> F64:
     return np.array([float((means[:, n:] * means[:, :-n]).mean()) for n in REPEATS])
 
 
-@statistic(
-    "noise",
-    "correlation of neighbours in flats, bright minus dim",
-    "correlation",
-    x="neighbour",
-    sets=False,
+@of_noise(
+    "correlation of neighbours in flats, bright minus dim", "correlation", x="neighbour", sets=False
 )
 def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
     """Of the brighter half of the levels less that of the others."""

@@ -1,5 +1,7 @@
 """Statistics in intensity: harmonics of the phase, residuals by level, photon transfer, codes."""
 
+from functools import partial
+
 import numpy as np
 
 from pixcal.estimators.detector.flat_ladder import MIN_RUNGS, ladder, straight_line
@@ -8,10 +10,13 @@ from pixcal.estimators.test_statistics import Curve, statistic
 from pixcal.estimators.test_statistics.look import CODES, LEVELS, Look
 from pixcal.model.arrays import F64
 
+of_intensity = partial(statistic, "intensity")
+of_intensity_power = partial(statistic, "intensity", power=True)
+
 CLASSES = (4, 16, 64)
 
 
-@statistic("intensity", "harmonics of the fringes", "amplitude / α", x="harmonic (cosine, sine)")
+@of_intensity("harmonics of the fringes", "amplitude / α", x="harmonic (cosine, sine)")
 def harmonics(look: Look) -> Curve:
     """Two to four times the phase in the residuals, over the fringe amplitude."""
     found, good = look.found, look.good
@@ -30,20 +35,16 @@ def harmonics(look: Look) -> Curve:
     return Curve(np.array(places), np.array(values))
 
 
-@statistic(
-    "intensity", "mean residual against signal", "mean residual", unit="e-", x="bin of level"
-)
+@of_intensity("mean residual against signal", "mean residual", unit="e-", x="bin of level")
 def residual_by_level(look: Look) -> Curve:
     """Mean residual in bins of the level."""
     return Curve(np.arange(LEVELS, dtype=float), look.by_level[0])
 
 
-@statistic(
-    "intensity",
+@of_intensity_power(
     "photon transfer: variance of flats against signal",
     "noise / expected noise",
     x="flat",
-    power=True,
     sets=False,
 )
 def photon_transfer(evidence: Evidence) -> Curve | None:
@@ -67,12 +68,10 @@ def _noise_of_flats(evidence: Evidence) -> F64:
     return np.array(values)
 
 
-@statistic(
-    "intensity",
+@of_intensity_power(
     "photon transfer: shape of variance against signal",
     "noise / expected noise, over its mean",
     x="flat",
-    power=True,
     sets=False,
 )
 def photon_transfer_shape(evidence: Evidence) -> Curve | None:
@@ -83,8 +82,7 @@ def photon_transfer_shape(evidence: Evidence) -> Curve | None:
     return Curve(np.arange(len(values), dtype=float), values / values.mean())
 
 
-@statistic(
-    "intensity",
+@of_intensity(
     "linearity: deviation of the flats from a line over exposure time",
     "relative deviation",
     x="exposure time of flats",
@@ -99,7 +97,7 @@ def flat_ladder(evidence: Evidence) -> Curve | None:
     return Curve(found.times, found.levels / line - 1)
 
 
-@statistic("intensity", "frequency of each bit in the samples", "frequency − ½", x="bit")
+@of_intensity("frequency of each bit in the samples", "frequency − ½", x="bit")
 def bits(look: Look) -> Curve | None:
     """How much more often than every second time each of the lowest bits is set."""
     count = look.remainders
@@ -110,9 +108,7 @@ def bits(look: Look) -> Curve | None:
     return Curve(bit.astype(float), is_set @ count / count.sum() - 0.5)
 
 
-@statistic(
-    "intensity", "uniformity of ADC codes", "relative scatter", x="codes a class", power=True
-)
+@of_intensity_power("uniformity of ADC codes", "relative scatter", x="codes a class")
 def code_classes(look: Look) -> Curve | None:
     """Scatter of how often codes come up, by their remainders on division by powers of two."""
     count = look.remainders

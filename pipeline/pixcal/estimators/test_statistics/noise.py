@@ -1,6 +1,7 @@
 """Statistics of noise: its size, what neighbours, rows and columns share, pixels that stand out."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -20,50 +21,37 @@ from pixcal.estimators.test_statistics.look import (
 from pixcal.kernels.sample_sums import count_beyond
 from pixcal.model.arrays import F32, F64, Mask
 
+of_noise = partial(statistic, "noise")
+of_noise_power = partial(statistic, "noise", power=True)
+
 MIN_DARKS = 5
 CUT_OFF = 1e-3  # share of samples at code zero from which noise is cut off
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
 STILL = 1e-12  # ADU²: variance of pixels that do not change, whose square float32 still holds
 
 
-@statistic(
-    "noise",
-    "residual variance against signal",
-    "noise / expected noise",
-    x="bin of level",
-    power=True,
-)
+@of_noise_power("residual variance against signal", "noise / expected noise", x="bin of level")
 def variance_by_level(look: Look) -> Curve:
     """Mean square of residuals over their noise, in bins of the level."""
     return Curve(np.arange(LEVELS, dtype=float), look.by_level[1])
 
 
-@statistic("noise", "residual noise", "rms residual", unit="e-", power=True)
+@of_noise_power("residual noise", "rms residual", unit="e-")
 def residual_noise(look: Look) -> Curve:
     """Mean square of the residuals."""
     squares = np.einsum("tp,tp->p", look.electrons, look.electrons) / len(look.electrons)
     return Curve(np.zeros(1), np.array([float(squares[look.good.ravel()].mean())]))
 
 
-@statistic(
-    "noise",
-    "residual variance by position",
-    "noise / expected noise",
-    x="cell of 4 × 4",
-    power=True,
-)
+@of_noise_power("residual variance by position", "noise / expected noise", x="cell of 4 × 4")
 def variance_by_place(look: Look) -> Curve | None:
     """Mean square of residuals over their noise, in cells of the window, row by row."""
     cells = by_cell(look.moments[0], look.good)
     return None if cells is None else Curve(np.arange(float(CELLS**2)), cells)
 
 
-@statistic(
-    "noise",
-    "residual variance against time",
-    "noise / expected noise",
-    x="eighth of the frames",
-    power=True,
+@of_noise_power(
+    "residual variance against time", "noise / expected noise", x="eighth of the frames"
 )
 def variance_by_time(look: Look) -> Curve:
     """Mean square of residuals over their noise, in eighths of the frames."""
@@ -72,14 +60,14 @@ def variance_by_time(look: Look) -> Curve:
     return Curve(np.arange(1.0, 9.0), np.array(value))
 
 
-@statistic("noise", "correlation of adjacent pixels", "correlation", x="neighbour")
+@of_noise("correlation of adjacent pixels", "correlation", x="neighbour")
 def neighbours(look: Look) -> Curve:
     """Correlation of the residuals of pixels that touch: by itself, for most crosstalk is there."""
     sums, count = look.neighbours
     return Curve(np.arange(float(ADJACENT)), _mean_product(sums, count)[:ADJACENT])
 
 
-@statistic("noise", "correlation of pixels further apart", "correlation", x="far neighbour")
+@of_noise("correlation of pixels further apart", "correlation", x="far neighbour")
 def far_neighbours(look: Look) -> Curve:
     """Correlation of the residuals of pixels two to four rows or columns apart."""
     sums, count = look.neighbours
@@ -87,11 +75,8 @@ def far_neighbours(look: Look) -> Curve:
     return Curve(every[ADJACENT:], _mean_product(sums, count)[ADJACENT:])
 
 
-@statistic(
-    "noise",
-    "correlation of neighbours by row, modulo 4",
-    "correlation",
-    x="row of four, down then right",
+@of_noise(
+    "correlation of neighbours by row, modulo 4", "correlation", x="row of four, down then right"
 )
 def neighbours_by_row(look: Look) -> Curve:
     """Correlation with the pixel below and to the right, for each row of four."""
@@ -103,7 +88,7 @@ def neighbours_by_row(look: Look) -> Curve:
     return Curve(np.arange(8.0), (value - value.mean(axis=1, keepdims=True)).ravel())
 
 
-@statistic("noise", "correlation of neighbours, bright minus dark", "correlation", x="neighbour")
+@of_noise("correlation of neighbours, bright minus dark", "correlation", x="neighbour")
 def neighbours_by_level(look: Look) -> Curve:
     """Covariance over shot noise in bright samples less that in dark ones."""
     (bright, dark), count = neighbour_sums_by_level(
@@ -129,7 +114,7 @@ def _line_power(rest: F32, good: Mask) -> F64:
     return np.array(out)
 
 
-@statistic("noise", "row and column noise", "noise / white noise", x="rows, columns", power=True)
+@of_noise_power("row and column noise", "noise / white noise", x="rows, columns")
 def lines(look: Look) -> Curve:
     """Of the fringe frames' residuals."""
     return Curve(np.arange(2.0), _line_power(look.residual, look.good))
@@ -145,15 +130,14 @@ def _calm(frames: F32, good: Mask) -> F32:
     return np.asarray(rest * good, np.float32)
 
 
-@statistic("noise", "outliers", "outliers", x="sigma, low then high", unit="2 √number", floor=1.0)
+@of_noise("outliers", "outliers", x="sigma, low then high", unit="2 √number", floor=1.0)
 def outliers(look: Look) -> Curve:
     """Residuals of good pixels beyond 5, 7 and 10 sigma: twice the root of their number."""
     limits = np.array(OUTLIERS)
     return Curve(np.concatenate([-limits, limits]), 2 * np.sqrt(look.outliers.ravel()))
 
 
-@statistic(
-    "noise",
+@of_noise(
     "outliers in dark frames",
     "outliers",
     x="sigma, low then high",
@@ -175,27 +159,23 @@ def dark_outliers(evidence: Evidence) -> Curve | None:
     return Curve(np.concatenate([-limits, limits]), value) if stacks else None
 
 
-@statistic(
-    "noise", "noise distribution of the pixels", "noise / expected noise", x="quantile", power=True
-)
+@of_noise_power("noise distribution of the pixels", "noise / expected noise", x="quantile")
 def pixel_noise(look: Look) -> Curve:
     """Quantiles over the pixels of the mean square of their residuals."""
     return Curve(np.array(QUANTILES), np.quantile(look.moments[0][look.good], QUANTILES))
 
 
-@statistic("noise", "kurtosis of the pixels' residuals", "kurtosis", x="quantile")
+@of_noise("kurtosis of the pixels' residuals", "kurtosis", x="quantile")
 def pixel_peakedness(look: Look) -> Curve:
     """Quantiles over the pixels of the kurtosis of their residuals."""
     second, fourth = (moment[look.good] for moment in look.moments)
     return Curve(np.array(QUANTILES), np.quantile(fourth / second**2, QUANTILES))
 
 
-@statistic(
-    "noise",
+@of_noise_power(
     "read noise distribution of the pixels (bias frames)",
     "noise / expected noise",
     x="quantile",
-    power=True,
     sets=False,
 )
 def read_noise(evidence: Evidence) -> Curve | None:
@@ -240,8 +220,7 @@ def ranges_about(values: F64, quantiles: Sequence[float]) -> F64:
     return np.array(found)
 
 
-@statistic(
-    "noise",
+@of_noise(
     "neighbours of hot pixels",
     "dark current / that of hot pixel",
     x="left, right, above, below",

@@ -1,6 +1,7 @@
 """Statistics in space: structure of the maps, and how far fringe sets agree on them."""
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -19,11 +20,13 @@ from pixcal.estimators.test_statistics import Curve, family, statistic
 from pixcal.estimators.test_statistics.look import CELLS, Look, by_cell
 from pixcal.model.arrays import F64, Mask
 
+of_space = partial(statistic, "space")
+of_space_power = partial(statistic, "space", power=True)
+
 SAME = 0.98  # cosine of the angle below which two sets measure along the same axis
 
 
-@statistic(
-    "space",
+@of_space(
     "correlation of maps between sets",
     "correlation",
     x="contrast, light of each pair",
@@ -44,14 +47,8 @@ def _correlation(one: F64, other: F64) -> float:
     return float(np.corrcoef(one[good], other[good])[0, 1])
 
 
-@statistic(
-    "space",
-    "difference of offsets between sets",
-    "rms difference",
-    unit="px",
-    x="pair",
-    power=True,
-    together=True,
+@of_space_power(
+    "difference of offsets between sets", "rms difference", unit="px", x="pair", together=True
 )
 def apart(looks: Sequence[Look]) -> Curve | None:
     """Mean square of the difference of the offsets along one axis, by two baselines."""

@@ -1,5 +1,6 @@
 """Statistics in time: what changes from frame to frame, slowly or with the frame before."""
 
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -17,6 +18,9 @@ from pixcal.estimators.test_statistics.look import Look
 from pixcal.kernels.frame_order import follows
 from pixcal.kernels.sample_sums import frame_means
 from pixcal.model.arrays import F64
+
+of_time = partial(statistic, "time")
+of_time_power = partial(statistic, "time", power=True)
 
 SERIES = (
     ("intensity", "intensity", "relative intensity, rms", ""),
@@ -50,9 +54,7 @@ def power_of(series: F64) -> Curve:
     return Curve(np.array(middle), np.array(value))
 
 
-@statistic(
-    "time", "signal carried over from other frames", "share of the signal", x="frames before"
-)
+@of_time("signal carried over from other frames", "share of the signal", x="frames before")
 def frames_before(look: Look) -> Curve:
     """Share of another frame's fringes in the residuals.
 
@@ -73,8 +75,7 @@ def frames_before(look: Look) -> Curve:
     return Curve(np.array(LAGS, float), np.array(values))
 
 
-@statistic(
-    "time",
+@of_time(
     "contrast against the phase step from earlier frames",
     "slope of the contrast",
     x="frames before",
@@ -91,7 +92,7 @@ def contrast_by_step(look: Look) -> Curve:
     return Curve(np.array(LAGS[:3], float), np.array(values))
 
 
-@statistic("time", "contrast and intensity against phase", "relative amplitude", x="term")
+@of_time("contrast and intensity against phase", "relative amplitude", x="term")
 def frames_by_phase(look: Look) -> Curve:
     """Amplitudes of contrast and intensity at one, two and three times the frame's phase."""
     phi = look.found.phi
@@ -105,13 +106,11 @@ def frames_by_phase(look: Look) -> Curve:
     return Curve(np.arange(len(value), dtype=float), value)
 
 
-@statistic(
-    "time",
+@of_time_power(
     "Allan deviation of the offsets over batches",
     "Allan deviation",
     unit="px",
     x="batches averaged",
-    power=True,
 )
 def allan_of_batches(look: Look) -> Curve | None:
     """Allan variance of the pixels' offsets, over lengths of one, two and four batches."""
@@ -137,9 +136,7 @@ def allan_of_batches(look: Look) -> Curve | None:
     return Curve(np.array([1.0, 2.0, 4.0]), np.array(out))
 
 
-@statistic(
-    "time", "first flat of each level against the next ones", "relative intensity", sets=False
-)
+@of_time("first flat of each level against the next ones", "relative intensity", sets=False)
 def first_flats(evidence: Evidence) -> Curve | None:
     """Relative change: mean over the levels, and slope against the rise from the frame before."""
     # A lamp that flickers changes each level by itself. Lag changes the first frame by a share of
@@ -183,7 +180,7 @@ def means_of_frames(kind: str, evidence: Evidence) -> Curve | None:
     return Curve(np.arange(shortest, dtype=float), value)
 
 
-@statistic("time", "trend of the bias level", "change of level", unit="e-", sets=False)
+@of_time("trend of the bias level", "change of level", unit="e-", sets=False)
 def bias_trend(evidence: Evidence) -> Curve | None:
     """Slope of the mean of bias and dark frames over their run, last less first."""
     values = []

@@ -11,9 +11,10 @@ are what a simulation must bring about by some effect.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.fringe_fit.fringes import grid
@@ -30,12 +31,17 @@ from pixcal.simulation.shot import Shot
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.flat_light import FlatLight
-from pixcal.stages.diagnose.hot_pixels import uncoupled
 from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_change
 from pixcal.stages.diagnose.parts import Half, Raw, Table, select
 from pixcal.stages.diagnose.undone import IntensityBeforeEffects
 
 _GAIN, _NOISE, _DARK = 101, 102, 103  # keys of random numbers
+HOT = 40.0  # robust standard deviations of the dark current beyond which a pixel is hot
+# pixels around a hot one that may have got some of its charge: at most a share of `SHARED`
+HOT_REACH = 2
+SHARED = 0.1
+
+Dark = TypeVar("Dark", F32, F64)
 
 
 @dataclass(frozen=True)
@@ -128,26 +134,19 @@ class NominalBench:
     # array of each recording and the numbers of its frames there
     places: tuple[tuple[str, Indices], ...]
 
-    def simulate(
-        self,
-        half: Half,
-        effects: Sequence[Effect],
-        seed: int,
-        *,
-        fitted: bool = True,
-        window: int = 0,
-    ) -> Raw:
+    def simulate(self, half: Half, effects: Sequence[Effect], seed: int, *, window: int = 0) -> Raw:
         """Frames of a half of the acquisition, from this bench with some effects.
+
+        The measured maps have the effects in them, which are undone before they act anew.
 
         Parameters
         ----------
         seed : of everything random; the same seed gives the same noise with other effects
-        fitted : the measured maps have the effects in them, which are undone before they act anew
         window : which of the detector's, for noise of its own; what happens to a frame is the same
             in all of them
         """
         own_seed = seed + SEEDS_APART * window
-        undone = IntensityBeforeEffects(effects if fitted else (), self.bench.detector)
+        undone = IntensityBeforeEffects(effects, self.bench.detector)
         detector = replace(
             self.bench.detector,
             seed=own_seed,
@@ -157,8 +156,8 @@ class NominalBench:
         for effect in effects:
             effect.check(bench)
         rows = (0, bench.detector.shape[0])
-        measured = self._drawn(effects if fitted else (), own_seed)
-        if fitted and effects:
+        measured = self._drawn(effects, own_seed)
+        if effects:
             measured = self._of_measured_k(measured, bench, effects)
         change = photon_transfer_change(
             bench, measured, effects, self.recordings, self.gain.neighbours
@@ -252,3 +251,19 @@ class NominalBench:
             for own, fit in zip(self.measured.sets, fits, strict=True)
         )
         return replace(self.measured, maps=maps, sets=sets)
+
+
+def uncoupled(dark: Dark, rng: np.random.Generator) -> Dark:
+    """Dark current (y, x) where pixels beside hot ones have that of any others.
+
+    Not the median of all: a sum over few neighbours would then be the same in every simulation,
+    and that of a real detector, whose pixels differ, would stand out.
+    """
+    rest = dark - np.median(dark)
+    spread = 1.4826 * float(np.median(np.abs(rest)))
+    brightest = maximum_filter(rest, size=2 * HOT_REACH + 1, mode="nearest")
+    beside = (brightest > HOT * spread) & (rest < SHARED * brightest)
+    found = dark.copy()
+    if not beside.all():
+        found[beside] = rng.choice(dark[~beside & (rest <= HOT * spread)], np.count_nonzero(beside))
+    return found

@@ -49,18 +49,10 @@ class Window:
     # numbers, so that what chance does to one is not done to all of them
     seed: int = 0
 
-    def evidence(
-        self,
-        half: Half,
-        effects: Effects,
-        seed: int,
-        *,
-        fitted: bool = True,
-        number: int = 0,
-    ) -> Evidence:
+    def evidence(self, half: Half, effects: Effects, seed: int, *, number: int = 0) -> Evidence:
         """A half of the frames, taken again with some effects (`NominalBench.simulate`)."""
         own = self.seed + seed
-        raw = self.bench.simulate(half, effects, own, fitted=fitted, window=number)
+        raw = self.bench.simulate(half, effects, own, window=number)
         return evidence_of(raw, self.part, self.whole)
 
 
