@@ -217,3 +217,16 @@ def test_without_flats_and_darks_the_rest_is_there(tmp_path: Path) -> None:
     assert found["conversion_gain"]["note"] == "declared, not measured"
     curves = json.loads((made.path / "reduce" / "figures_of_merit.json").read_text())
     assert curves["dsnu"]["rows"]["frequency"][-1] == 0.5
+
+
+def test_a_pattern_of_period_two_is_named_with_its_amplitude(tmp_path: Path) -> None:
+    acquisition = write_camera(tmp_path / "acq", (500,))
+    with fits.open(acquisition / "bias.fits", mode="update") as file:
+        file[0].data[..., ::2] += 4
+    listed = yaml.safe_load((acquisition / "acquisition.yaml").read_text())
+    listed["frames"] = {"bias": ["bias.fits"]}
+    (acquisition / "acquisition.yaml").write_text(yaml.safe_dump(listed))
+    found = pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run")).reduction["warnings"]
+    (said,) = (text for text in found if "every second" in text)
+    assert "every second column" in said
+    assert abs(float(said.split("amplitude ")[1].split()[0]) - 5) < 0.6

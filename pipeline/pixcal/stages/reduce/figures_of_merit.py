@@ -24,6 +24,7 @@ from pixcal.estimators.detector.emva import (
 )
 from pixcal.estimators.detector.pair_noise import shared_by_lines
 from pixcal.model.arrays import F64, Mask
+from pixcal.report.text import with_error
 from pixcal.stages.reduce.detector_summary import Summary, pair_sums
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.halves import Window, frames_of, middle_of, read_halves
@@ -66,10 +67,10 @@ def characterise(
     curves["photon_transfer"] |= {"gain": gain[0], "read_variance": (noise or (0.0,))[0] ** 2}
     if halves.dark is not None:
         electrons = halves.dark * gain[0]
-        _spread(found, curves, "dsnu", "e-", electrons, halves.good)
+        facts["warnings"] += _spread(found, curves, "dsnu", "e-", electrons, halves.good)
     if halves.flat is not None:
         percent = np.stack([100 * without_trend(half, halves.good) for half in halves.flat])
-        _spread(found, curves, "prnu", "%", percent, halves.good)
+        facts["warnings"] += _spread(found, curves, "prnu", "%", percent, halves.good)
     _dark_current(found, made, source, gain[0] / facts["gain_e_per_adu"]["used"], middle)
     for name, figure in found.items():
         if (
@@ -184,16 +185,18 @@ _ALTERNATES = 6.0  # errors of a difference between every second line that is wo
 _ALTERNATING_SHARE = 0.04  # of the variance of the map that its square is at least
 
 
-def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: Mask) -> None:
-    """Standard deviations, spectra and profiles of a pair of maps."""
+def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: Mask) -> list[str]:
+    """Standard deviations, spectra and profiles of a pair of maps; what to say of a pattern."""
     pair = without_gaps(halves[0], good), without_gaps(halves[1], good)
     spread: Nonuniformity = nonuniformity(*pair, int((~good).sum()))
-    said = ["quadratic trend of the lamp removed"] if name == "prnu" else []
+    patterns = []
     for axis, lines in ((0, "row"), (1, "column")):
         size, error = alternation(*pair, axis=axis)
         if size > _ALTERNATES * error and size**2 > _ALTERNATING_SHARE * spread.total[0] ** 2:
-            said.append(f"every second {lines} is {size:.3g} {unit} higher: a fixed pattern")
-    note = "; ".join(said)
+            higher = f"every second {lines} is {with_error(size, error)} {unit} higher"
+            patterns.append((higher, size / 2))
+    trend = ["quadratic trend of the lamp removed"] if name == "prnu" else []
+    note = "; ".join([*trend, *(higher for higher, _ in patterns)])
     found[name] = _figure(_TITLES[name], unit, spread.total, note)
     for part in ("row", "column", "pixel"):
         title = f"{_TITLES[name]} of {part}s"
@@ -210,6 +213,12 @@ def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: 
         curves[name][along] |= _listed(
             (np.flatnonzero(filled), means - means.mean()), ("at", "profile")
         )
+    seen_in, removed_by = {"dsnu": ("bias or dark", "bias"), "prnu": ("flat", "flat")}[name]
+    return [
+        f"in the {seen_in} frames {higher}: a fixed pattern of period 2 px and amplitude "
+        f"{amplitude:.3g} {unit}; the {removed_by} map removes it"
+        for higher, amplitude in patterns
+    ]
 
 
 def _listed(columns: Any, names: tuple[str, ...]) -> Json:
