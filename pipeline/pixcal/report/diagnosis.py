@@ -8,6 +8,7 @@ from pixcal.report.contents import DiagnosisContents
 from pixcal.report.curve_places import place
 from pixcal.report.diagnosis_words import (
     DETECTOR,
+    considered,
     effect_title,
     listed,
     percent,
@@ -228,7 +229,7 @@ def by_domain(gap: Facts) -> str:
 def rejected(result: DiagnosisContents) -> Table:
     """Rejected candidates, the most likely first."""
     causes = {c["effect"] for c in result.facts["causes"]}
-    tried = [c for c in result.facts["candidates"] if c["effect"] not in causes]
+    tried = [c for c in considered(result.facts) if c["effect"] not in causes]
     rows = []
     for c in sorted(tried, key=lambda c: (-c["gap_closed"], -(c.get("sigmas") or 0.0))):
         size = _sigma(c["sigmas"]) if "sigmas" in c else "–"

@@ -66,7 +66,7 @@ def answer(diagnosis: DiagnosisContents) -> str:
     if verdict == "unexplained":
         return (
             f"Unexplained: the data differ from the nominal simulation in {count} of {tested} "
-            f"statistics{where}. None of the {len(facts['candidates'])} effects considered "
+            f"statistics{where}. None of the {len(considered(facts))} effects considered "
             "closes the gap."
         )
     causes = listed(effect_title(diagnosis, c["effect"]) for c in facts["causes"])
@@ -83,6 +83,12 @@ def answer(diagnosis: DiagnosisContents) -> str:
         f"{percent(1 - gap['after'])} of the gap between the data and the nominal simulation. The "
         f"{left}{_main_domain(gap, residual=True)}{held_out}."
     )
+
+
+def considered(facts: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Candidates, without those that show in fringes alone where there are none."""
+    sets = facts.get("looked_at", {}).get("sets", True)
+    return [c for c in facts["candidates"] if sets or "fringes would" not in c["rejected_because"]]
 
 
 def _shared(facts: Mapping[str, Any]) -> bool:

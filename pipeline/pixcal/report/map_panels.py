@@ -211,7 +211,8 @@ def flags(masks: Mapping[str, FlagSummary]) -> tuple[list[Panel], Legend]:
     panels = [_flags(", ".join(titles), summary, most) for titles, summary in merged.values()]
     if next(iter(masks.values())).block > 1:
         return panels, []
-    legend = [(FLAGS[f.value], f.words) for f in PixelFlag]
+    there = [f for f in PixelFlag if any(s.counts[f.value] for s in masks.values())]
+    legend = [(FLAGS[f.value], f.words) for f in there]
     return panels, [*legend, (SEVERAL, "several")]
 
 

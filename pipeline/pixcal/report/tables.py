@@ -63,7 +63,10 @@ def allan(measured: Sequence[SetContents]) -> Table:
 def flags(masks: Mapping[str, FlagSummary]) -> Table:
     """How many pixels have each flag, one column each mask."""
     rows = []
+    fitted = any(title.startswith("set ") for title in masks)
     for flag in PixelFlag:
+        if flag is PixelFlag.BAD_FIT and not fitted:
+            continue
         counts = [_count(s.counts[flag.value], s) for s in masks.values()]
         rows.append([flag.words, flag.meaning, *counts])
     rows.append(["any", "masked", *(_count(s.masked, s) for s in masks.values())])
@@ -180,7 +183,8 @@ def provenance(contents: Contents) -> Iterator[Table]:
     yield from _stages(contents.stages)
     # Detector frames alone have no optics.
     listed = {key: value for key, value in contents.acquisition.items() if value is not None}
-    yield Table("Acquisition as understood", ["key", "value"], _flat_rows(listed))
+    rows = [row for row in _flat_rows(listed) if row[0] != "frames.fringes"]
+    yield Table("Acquisition as understood", ["key", "value"], rows)
 
 
 def _columns_table(title: str, columns: Mapping[str, Mapping[str, Any]]) -> Table:
