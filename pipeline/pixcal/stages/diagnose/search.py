@@ -86,41 +86,36 @@ class Search:
         self._ask, self._estimates, self._most = simulate, estimates, most
         self._made: dict[frozenset[Effect], int] = {}  # simulations of each bench
         self.comparison = Comparison(reference, data)
+        self._causes = Accepted(self.comparison.nominal, {})
+        # all of them, and those that may yet be accepted
+        self._candidates: Mapping[str, Candidate] = {}
+        self._remaining: dict[str, Candidate] = {}
 
     def run(self, candidates: Mapping[str, Candidate]) -> SearchResult:
         """Search; ``reason`` of the rejected candidates is filled in."""
         remaining = {n: c for n, c in candidates.items() if c.estimate and not c.reason}
-        causes = Accepted(self.comparison.nominal, dict.fromkeys(remaining, 1.0))
-        self._accept_all(causes, remaining, candidates)
-        if len(causes.effects) < MAX_CAUSES and self._exchange(causes, remaining, candidates):
-            self._accept_all(causes, remaining, candidates)
-        if len(causes.effects) == MAX_CAUSES:
+        self._candidates, self._remaining = candidates, remaining
+        self._causes = Accepted(self.comparison.nominal, dict.fromkeys(remaining, 1.0))
+        self._accept_all()
+        if len(self._causes.effects) < MAX_CAUSES and self._exchange():
+            self._accept_all()
+        if len(self._causes.effects) == MAX_CAUSES:
             for candidate in remaining.values():
                 candidate.reason = f"not tested: the search stops after {MAX_CAUSES} causes"
-        return self._each_weighed(causes, candidates)
+        return self._each_weighed()
 
-    def _accept_all(
-        self,
-        causes: Accepted,
-        remaining: dict[str, Candidate],
-        candidates: Mapping[str, Candidate],
-    ) -> None:
-        while len(causes.effects) < MAX_CAUSES and self._accept_one(causes, remaining, candidates):
+    def _accept_all(self) -> None:
+        while len(self._causes.effects) < MAX_CAUSES and self._accept_one():
             pass
 
-    def _accept_one(
-        self,
-        causes: Accepted,
-        remaining: dict[str, Candidate],
-        candidates: Mapping[str, Candidate],
-    ) -> bool:
+    def _accept_one(self) -> bool:
         """Accept the candidate that the held-out frames favour most; False if they favour none."""
-        self._reject_insignificant(causes, remaining)
-        self._reject_undecided(causes, remaining)
+        causes, remaining, candidates = self._causes, self._remaining, self._candidates
+        self._reject_insignificant()
+        self._reject_undecided()
         if not remaining:
             return False
-        laws, replays = self._tried(causes, remaining)
-        gains, effect, best = self._favoured(laws, replays, causes, candidates)
+        gains, effect, best = self._favoured(*self._tried())
         if effect is None:
             return False
         del remaining[best]
@@ -134,29 +129,19 @@ class Search:
         candidates[best].reason = ""
         enough = max(gains[best] - MIN_LOGLIK_GAIN, MIN_LOGLIK_GAIN)
         causes.alike[best] = tuple(n for n, g in gains.items() if n != best and g > enough)
-        self._leave_explained(best, causes, remaining, candidates)
+        self._leave_explained(best)
         return True
 
-    def _leave_explained(
-        self,
-        cause: str,
-        causes: Accepted,
-        remaining: dict[str, Candidate],
-        candidates: Mapping[str, Candidate],
-    ) -> None:
+    def _leave_explained(self, cause: str) -> None:
         """Leave out the candidates most of whose significance the causes produce."""
-        causes.shares = self._unexplained(causes.bench, remaining)
-        for name in [n for n, share in causes.shares.items() if share < 1 - SIMILAR]:
-            candidates[name].reason = similar_to(cause)
-            del remaining[name], causes.shares[name]
+        shares = self._causes.shares = self._unexplained()
+        for name in [n for n, share in shares.items() if share < 1 - SIMILAR]:
+            self._candidates[name].reason = similar_to(cause)
+            del self._remaining[name], shares[name]
 
-    def _exchange(
-        self,
-        causes: Accepted,
-        remaining: dict[str, Candidate],
-        candidates: Mapping[str, Candidate],
-    ) -> bool:
+    def _exchange(self) -> bool:
         """Where the data still differ, put two other candidates in the place of a cause."""
+        causes, remaining, candidates = self._causes, self._remaining, self._candidates
         options = exchanges(causes.effects, candidates)
         count = len(causes.effects) + 1
         left = self._most - sum(self._made.values()) - CONFIRM * (1 + count * (count + 1) // 2)
@@ -190,17 +175,14 @@ class Search:
                 remaining[name] = one
         for name in best.new:
             remaining.pop(name, None)
-        self._leave_explained(" and ".join(best.new), causes, remaining, candidates)
+        self._leave_explained(" and ".join(best.new))
         return True
 
     def _favoured(
-        self,
-        laws: Additions,
-        replays: Additions,
-        causes: Accepted,
-        candidates: Mapping[str, Candidate],
+        self, laws: Additions, replays: Additions
     ) -> tuple[dict[str, float], Effect | None, str]:
         """Gain of every candidate, and effect and name of the best that gains enough."""
+        candidates = self._candidates
         # A replay takes the place of the law where it fits better.
         gains = {name: law.gain for name, law in laws.items()}
         enough = {n: g for n, g in gains.items() if g >= needed_gain(candidates[n])}
@@ -213,7 +195,7 @@ class Search:
             candidates[name].reason = too_little(gains[name], candidates[name])
         if not enough:
             return gains, None, ""
-        best = self._best(enough, causes, candidates)
+        best = self._best(enough)
         effect = laws[best].effect
         if best in replays and self.comparison.replay_fits_better(
             replays[best].trial, laws[best].trial
@@ -221,26 +203,23 @@ class Search:
             effect = replays[best].effect
         return gains, effect, best
 
-    def _best(
-        self, gains: dict[str, float], causes: Accepted, candidates: Mapping[str, Candidate]
-    ) -> str:
+    def _best(self, gains: dict[str, float]) -> str:
         """The candidate that gains most; among equals, the one that does so by its law."""
         # A curve measured at many levels can imitate another effect.
         most = max(gains.values())
         equals = {n: g for n, g in gains.items() if g >= (1 - AS_GOOD) * most}
         if len(equals) > 1:
-            curves = [(n, law) for n in equals if (law := candidates[n].law) is not None]
-            label = f"laws, round {len(causes.effects) + 1}"
-            by_law = self._added(causes, {n: candidates[n] for n in equals}, curves, SCREEN, label)
+            curves = [(n, law) for n in equals if (law := self._candidates[n].law) is not None]
+            by_law = self._added(curves, SCREEN, "laws", drop=False)
             equals |= {one.name: one.gain for one in by_law}
         return max(equals, key=lambda n: equals[n])
 
-    def _reject_insignificant(self, causes: Accepted, remaining: dict[str, Candidate]) -> None:
+    def _reject_insignificant(self) -> None:
         """Leave out candidates that the fitted frames do not show beyond what the causes produce.
 
         Where the data still differ, weak candidates are tried too.
         """
-        sizes = {n: c.significance * causes.shares.get(n, 1.0) for n, c in remaining.items()}
+        causes, remaining, sizes = self._causes, self._remaining, self._sizes()
         least = SIGNIFICANT
         if self.comparison.differs(causes.current):
             strong = max(sizes.values(), default=0.0) >= SIGNIFICANT
@@ -253,15 +232,20 @@ class Search:
                 remaining[name].reason = f"not significant ({size:z.1f} sigma{beside})"
                 del remaining[name]
 
-    def _reject_undecided(self, causes: Accepted, remaining: dict[str, Candidate]) -> None:
+    def _sizes(self) -> dict[str, float]:
+        """Significance of the remaining candidates beyond what the causes produce."""
+        shares = self._causes.shares
+        return {n: c.significance * shares.get(n, 1.0) for n, c in self._remaining.items()}
+
+    def _reject_undecided(self) -> None:
         """Leave out the weakest candidates where all would take more simulations than are left.
 
         What it takes to accept one more cause and to weigh all at the end is kept for that.
         """
+        causes, remaining, sizes = self._causes, self._remaining, self._sizes()
         count = len(causes.effects) + 1
         weighed = count * (2 * CONFIRM + SCREEN) + count * (count - 1) // 2 * CONFIRM
         left = self._most - sum(self._made.values()) - CONFIRM - weighed
-        sizes = {n: c.significance * causes.shares.get(n, 1.0) for n, c in remaining.items()}
         for name in sorted(sizes, key=lambda n: -sizes[n]):
             candidate = remaining[name]
             left -= SCREEN * (len(candidate.variants(causes.shares.get(name, 1.0))) + 1)
@@ -279,22 +263,20 @@ class Search:
             self._made[bench] = max(self._made.get(bench, 0), seeds)
         return self._ask(benches, seeds, label, asked)
 
-    def _tried(
-        self, causes: Accepted, remaining: dict[str, Candidate]
-    ) -> tuple[Additions, Additions]:
+    def _tried(self) -> tuple[Additions, Additions]:
         """Each candidate added to the causes: its likeliest variant by law, and its replay.
 
         A replay of single frames may imitate what another effect does by its law, so it is kept
         apart. One simulation of every variant shows which are promising; the others are simulated
         further if none of these gains enough, and else wait for the next round.
         """
+        causes, remaining = self._causes, self._remaining
         options = [
             (name, way)
             for name, one in remaining.items()
             for way in one.variants(causes.shares.get(name, 1.0))
         ]
-        label = f"candidates, round {len(causes.effects) + 1}"
-        once = self._added(causes, remaining, options, 1, label)
+        once = self._added(options, 1, "candidates")
         if not causes.effects:
             for name, addition in likeliest(once).items():
                 remaining[name].alone = addition.trial
@@ -307,31 +289,34 @@ class Search:
             for one in once
             if one.gain >= least or (one.name in hopeful and one in laws.values())
         ]
-        tried = self._added(
-            causes, remaining, [(o.name, o.effect) for o in promising], SCREEN, label
-        )
+        tried = self._added([(o.name, o.effect) for o in promising], SCREEN, "candidates")
         if all(one.gain < needed_gain(remaining[one.name]) for one in tried):
             # Some may be refused by now: of other seeds.
             rest = [one for one in once if one not in promising and one.name in remaining]
             others = [(one.name, one.effect) for one in rest if one.gain > 0]
-            tried += self._added(causes, remaining, others, SCREEN, label)
+            tried += self._added(others, SCREEN, "candidates")
             tried += [one for one in rest if one.gain <= 0 and one.name in remaining]
         replays = [o for o in tried if o.effect == remaining[o.name].replay]
         return likeliest(o for o in tried if o not in replays), likeliest(replays)
 
     def _added(
         self,
-        causes: Accepted,
-        remaining: dict[str, Candidate],
         options: Sequence[tuple[str, Effect]],
         simulations: int,
         label: str,
+        *,
+        drop: bool = True,
     ) -> list[Addition]:
-        """Variants added to the causes; log-likelihoods allow for other laws of these."""
-        # Candidates none of whose variants can be simulated are no longer among the remaining.
+        """Variants added to the causes; log-likelihoods allow for other laws of these.
+
+        Candidates none of whose variants can be simulated are no longer among the remaining, if
+        they are to ``drop``.
+        """
+        causes, candidates = self._causes, self._candidates
         beside = self._start(causes.bench, simulations)
         start = self.comparison.allowing_for_laws(beside, causes.current)
         benches = [(*causes.bench, effect) for _, effect in options]
+        label = f"{label}, round {len(causes.effects) + 1}"
         simulated = self._simulate(benches, simulations, label, ())
         made: list[Addition] = []
         refused: dict[str, str] = {}
@@ -339,20 +324,22 @@ class Search:
             if isinstance(curves, str):
                 refused[name] = f"cannot be simulated: {curves}"
                 continue
-            sure = remaining[name].significance
+            sure = candidates[name].significance
             if simulations == 1:
                 sure = min(sure, KNOWN_TO)
             trial = self.comparison.trial(bench, curves, sure, beside)
             trial = self.comparison.allowing_for_laws(trial, causes.current)
             gain = trial.log_likelihood - start.log_likelihood
-            if remaining[name].in_maps_alone:
+            if candidates[name].in_maps_alone:
                 # Chance does the same to all statistics of a pattern, which are no more unlikely
                 # together than one of them.
                 own = signature_key(effect.name, effect.domains[0])
                 gain = min(gain, self.comparison.gain_where_differing(start, trial, own))
             made.append(Addition(name, effect, trial, gain))
         for name in refused.keys() - {one.name for one in made}:
-            remaining.pop(name).reason = refused[name]
+            candidates[name].reason = refused[name]
+            if drop:
+                del self._remaining[name]
         return made
 
     def _confirmed(
@@ -369,21 +356,19 @@ class Search:
         trial = self._confirmed(effects, simulations) if effects else nominal
         return nominal if isinstance(trial, str) else trial
 
-    def _unexplained(
-        self, effects: Effects, remaining: Mapping[str, Candidate]
-    ) -> dict[str, float]:
-        """Fraction of each candidate's significance that some effects do not produce."""
-        if not remaining:
+    def _unexplained(self) -> dict[str, float]:
+        """Fraction of each remaining candidate's significance that the causes do not produce."""
+        if not self._remaining:
             return {}
-        produced = self._estimates(effects, list(remaining))
+        produced = self._estimates(self._causes.bench, list(self._remaining))
         return {
             name: float(np.clip(1 - max(produced.get(name, 0.0), 0.0) / c.significance, 0, 1))
-            for name, c in remaining.items()
+            for name, c in self._remaining.items()
         }
 
-    def _each_weighed(self, causes: Accepted, candidates: Mapping[str, Candidate]) -> SearchResult:
+    def _each_weighed(self) -> SearchResult:
         """Leave each cause out in turn, and reject those that add nothing to the others."""
-        effects, current = causes.effects, causes.current
+        candidates, effects, current = self._candidates, self._causes.effects, self._causes.current
         while True:
             without = self._each_left_out(effects)
             rejected = redundant(self.comparison, current, without) or doubtful(
@@ -398,7 +383,7 @@ class Search:
                 break
             _reject(name, reason, effects, candidates)
             current = fewer
-        while (replayed := self._needless(effects, current, candidates)) is not None:
+        while (replayed := self._needless(effects, current)) is not None:
             name, by, current = replayed
             _reject(name, explained_by_other_law(by), effects, candidates)
             effects |= {one: e for one in effects for e in current.effects if e.name == one}
@@ -408,7 +393,8 @@ class Search:
             alone = self._confirmed((effect,))
             if not isinstance(alone, str):
                 candidates[name].alone = alone
-        alike = {n: tuple(a for a in causes.alike[n] if a not in effects) for n in effects}
+        alike = self._causes.alike
+        alike = {n: tuple(a for a in alike[n] if a not in effects) for n in effects}
         return SearchResult(
             self.comparison.nominal,
             current,
@@ -416,17 +402,18 @@ class Search:
             without,
             candidates,
             {name: others for name, others in alike.items() if others},
-            self._by_laws(effects, candidates),
+            self._by_laws(effects),
         )
 
     def _needless(
-        self, effects: Mapping[str, Effect], current: Trial, candidates: Mapping[str, Candidate]
+        self, effects: Mapping[str, Effect], current: Trial
     ) -> tuple[str, str, Trial] | None:
         """A cause that others make needless as they were measured, whatever their laws.
 
         With the one that does, and the bench without the cause. Only causes of the same step of the
         light's way and of the same domains can stand in for each other so.
         """
+        candidates = self._candidates
         for name in sorted(effects, key=lambda n: candidates[n].significance):
             own = effects[name]
             replays = {
@@ -446,13 +433,11 @@ class Search:
                 return name, next(iter(replays)), trial
         return None
 
-    def _by_laws(
-        self, effects: Mapping[str, Effect], candidates: Mapping[str, Candidate]
-    ) -> dict[str, Trial]:
+    def _by_laws(self, effects: Mapping[str, Effect]) -> dict[str, Trial]:
         """Each effect alone, as the best of its laws describes it."""
         trials = {}
         for name, effect in effects.items():
-            law = candidates[name].by_law(effect)
+            law = self._candidates[name].by_law(effect)
             trial = None if law is None or law == effect else self._confirmed((law,), SCREEN)
             if isinstance(trial, Trial):
                 trials[name] = trial
