@@ -144,7 +144,9 @@ def _in_short(value: Any) -> str:
 
 def largest(curves: Sequence[Facts]) -> list[Facts]:
     """The most significant statistics."""
-    return sorted(curves, key=lambda c: -c["significance"])[:PLOTS]
+    return sorted((c for c in curves if c["significance"] > 0), key=lambda c: -c["significance"])[
+        :PLOTS
+    ]
 
 
 def differing(result: DiagnosisContents) -> list[Facts]:

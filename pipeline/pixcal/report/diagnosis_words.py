@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from pixcal.report.contents import DiagnosisContents
-from pixcal.report.text import not_tested, number
+from pixcal.report.text import number
 
 # what `curves.json` has for the name of a set where a curve is of no single set
 DETECTOR = "detector"
@@ -56,11 +56,9 @@ def answer(diagnosis: DiagnosisContents) -> str:
     tested = facts.get("statistics", len(diagnosis.curves))
     count = sum(bool(c["in_gap"]) for c in diagnosis.curves)
     if verdict == "no gap":
-        others = not_tested(facts)
         return (
             f"No gap: {'' if _shared(facts) else 'on held-out frames, '}none of {tested} "
             "statistics differs significantly from the nominal simulation."
-            f"{f' {others[:1].upper()}{others[1:]}.' if others else ''}"
         )
     where = _main_domain(gap, residual=False)
     if verdict == "unexplained":

@@ -77,6 +77,7 @@ def _fill(template: str, contents: Contents, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["not_tested"] = text.not_tested
     environment.filters |= vars(verdict) | vars(diagnosis_words) | vars(tables)
     environment.globals |= {
         "draw": _draw, "figures": FIGURES, "panels": vars(map_panels), "data": DATA,

@@ -159,8 +159,6 @@ def _mask_card(contents: Contents) -> Card:
 def findings(contents: Contents) -> list[Finding]:
     """Findings, the most serious first."""
     made = [(CHECK, text) for text in contents.warnings]
-    if not contents.acquisition.get("frames", {}).get("flat"):
-        made.append((CHECK, "there are no flat frames: the flat is taken as 1 everywhere"))
     if contents.has_fringes and not contents.sets:
         made.append((CHECK, "the fit has not been run: there are no maps of offsets yet"))
     made += _of_sets(contents.sets)
