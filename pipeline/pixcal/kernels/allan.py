@@ -83,5 +83,20 @@ def disjoint_differences(series: NDArray[np.floating], m: int, most: int) -> F64
     """
     pairs = len(series) // (2 * m)
     chosen = np.unique(np.linspace(0, pairs - 1, min(pairs, most)).round().astype(np.int64))
-    means = series[: 2 * m * pairs].reshape(pairs, 2, m, -1)[chosen].mean(axis=2, dtype=float)
-    return np.asarray(means[:, 1] - means[:, 0])
+    out = np.zeros((len(chosen), series.shape[1]))
+    _differences(np.ascontiguousarray(series), 2 * m * chosen, m, out)
+    return out
+
+
+@kernel()
+def _differences(series: Any, starts: Any, m: int, out: Any) -> None:
+    before = np.empty(series.shape[1])
+    for number in range(len(starts)):
+        after, first = out[number], starts[number]
+        before[:] = 0.0
+        for k in range(first, first + m):
+            for p in range(before.size):
+                before[p] += series[k, p]
+                after[p] += series[k + m, p]
+        for p in range(before.size):
+            after[p] = after[p] / m - before[p] / m

@@ -33,11 +33,12 @@ def quantiles_of_parts(
         for digit, found in within.items():
             of_digit = bits[bits >> _DIGIT == digit] & ((1 << _DIGIT) - 1)
             found += np.bincount(of_digit, minlength=len(found))
+    upto = {digit: np.cumsum(found) for digit, found in within.items()}
     values = np.empty(ranks.shape, np.float32)
     for place in np.ndindex(ranks.shape):
         digit = int(first[place])
         rank = ranks[place] - before[digit]
-        last = int(np.searchsorted(np.cumsum(within[digit]), rank, side="right"))
+        last = int(np.searchsorted(upto[digit], rank, side="right"))
         values[place] = np.array(digit << _DIGIT | last, np.uint32).view(np.float32)
     shares = at - ranks[0]
     return np.array([np.quantile(v, s) for v, s in zip(values.T, shares, strict=True)]), n

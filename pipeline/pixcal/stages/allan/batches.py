@@ -98,8 +98,10 @@ def _sums_task(
         noise[noise <= 0] = np.nan
         counts += np.isfinite(series).sum(axis=1)
         for number, m in enumerate(lengths):
+            steps = disjoint_differences(series, m, 32)
+            steps /= noise
             # Missing batches and pixels without errors are NaN both, and add nothing.
-            steps = np.nan_to_num(disjoint_differences(series, m, 32) / noise)
+            steps[np.isnan(steps)] = 0.0
             grams[number] = grams[number] + steps @ steps.T
     return counts, grams
 

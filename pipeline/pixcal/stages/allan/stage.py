@@ -167,7 +167,7 @@ def _root_mean_square(sigma: F32) -> F64:
     total, count = np.zeros(sigma.shape[1:]), np.zeros(sigma.shape[1:])
     for plane in sigma:
         there = np.isfinite(plane)
-        total[there] += plane[there].astype(float) ** 2
+        total += np.where(there, plane, 0).astype(float) ** 2
         count += there
     return np.sqrt(np.where(count > 0, total, np.nan) / np.maximum(count, 1))
 
