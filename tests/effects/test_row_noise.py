@@ -8,10 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pixcal.effects.bias_drift import BiasDrift
-from pixcal.effects.row_noise import RowNoise
+from pixcal.effects.row_noise import RowNoise, line_spectrum
 from pixcal.effects.telegraph_noise import TelegraphNoise
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.line_noise import line_spectrum
 from pixcal.kernels.processes import flicker, flicker_power
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect

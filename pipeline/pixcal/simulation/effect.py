@@ -304,12 +304,12 @@ class Again:
     Attributes
     ----------
     effect : Effect
-    ask : callable
+    detect : callable
         Its significance in an evidence; None where that does not tell.
     """
 
     effect: Effect
-    ask: Callable[[Evidence], float | None] = field(repr=False, compare=False)
+    detect: Callable[[Evidence], float | None] = field(repr=False, compare=False)
 
     @property
     def name(self) -> str:
@@ -325,10 +325,6 @@ class Again:
     def quick(self) -> bool:
         """Of the effect."""
         return self.effect.quick
-
-    def detect(self, evidence: Evidence) -> float | None:
-        """Its significance."""
-        return self.ask(evidence)
 
 
 def _of_light(found: LightFit, degree: int) -> Estimate:

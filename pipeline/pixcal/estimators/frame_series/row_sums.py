@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
-from pixcal.estimators.maps.map_fit import centred
+from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.frame_order import with_neighbours
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.model.arrays import F64, Indices
@@ -80,7 +80,7 @@ class RowSums:
             return modes
         _, c, s = self.found.g[self.inside].T
         turned = np.stack([np.zeros(t), -s, c], axis=1)
-        turns = centred(self.found.good.shape)[0][None] * turned[:, None]
+        turns = grid(self.found.good.shape)[0][None] * turned[:, None]
         return np.concatenate([modes, turns[:, :, None]], axis=2)
 
     @cached_property

@@ -120,7 +120,7 @@ def phase_map(fringes: FringeEvidence) -> F64:
 
     In ±pi: the bending of the fringes across the part must stay below half a fringe.
     """
-    y, x = centred(fringes.good.shape)
+    y, x = grid(fringes.good.shape)
     kx, ky = fringes.k
     phasor = (fringes.theta[2] + 1j * fringes.theta[1]) * np.exp(-1j * (kx * x + ky * y))
     phasor = np.where(fringes.good, phasor, 0)
@@ -140,11 +140,6 @@ def polynomial(shape: tuple[int, ...], degree: int) -> F64:
     """Polynomials (term, y, x) up to a degree."""
     basis = polynomial_basis(shape, degree)
     return np.ascontiguousarray(basis.T).reshape(-1, *shape)
-
-
-def centred(shape: tuple[int, ...]) -> tuple[F64, F64]:
-    """Coordinates y (y, 1) and x (1, x) of the pixels from the middle of a map."""
-    return grid(shape)
 
 
 def without(columns: F64, free: F64) -> F64:

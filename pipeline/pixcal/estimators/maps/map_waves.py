@@ -13,9 +13,9 @@ import numpy as np
 from scipy.special import ndtri_exp
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.estimators.maps.map_fit import (
     MapPart,
-    centred,
     fit_maps,
     fitted_values,
     gauge_terms,
@@ -89,7 +89,7 @@ class _Map:
 
     def signals(self, q: F64) -> F64:
         """What a unit of each of the six numbers does (6, y, x)."""
-        y, x = centred(self.good.shape)
+        y, x = grid(self.good.shape)
         e = np.exp(1j * (q[0] * x + q[1] * y))
         waves = [factor * wave for factor, wave in zip(self.row, (e, e, e.conj()), strict=True)]
         return np.stack([part for w in waves for part in (w.real, -w.imag)])
@@ -255,7 +255,7 @@ def _fitted(
     for turn in range(_ITERATIONS):
         parts = []
         for name, m in maps:
-            y, x = centred(m.good.shape)
+            y, x = grid(m.good.shape)
             own = slice(6 * names.index(name), 6 * names.index(name) + 6)
             signals = np.zeros((size + 2, *m.good.shape))
             signals[own] = m.signals(q)
@@ -292,7 +292,7 @@ def _quarter(six: F64) -> F64:
 
 def _plain_gain(m: _Map, q: F64) -> float:
     """Chi-square of a wave of any amplitude and phase in one map."""
-    y, x = centred(m.good.shape)
+    y, x = grid(m.good.shape)
     e = np.exp(1j * (q[0] * x + q[1] * y))
     signals = np.stack([e.real, e.imag])
     return fit_maps([MapPart.of(signals, m.data, m.free, m.good)]).gain
