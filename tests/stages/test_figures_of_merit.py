@@ -230,3 +230,37 @@ def test_a_pattern_of_period_two_is_named_with_its_amplitude(tmp_path: Path) -> 
     (said,) = (text for text in found if "every second" in text)
     assert "every second column" in said
     assert abs(float(said.split("amplitude ")[1].split()[0]) - 5) < 0.6
+
+
+def without_gain(acquisition: Path, *kinds: str) -> Path:
+    listed = yaml.safe_load((acquisition / "acquisition.yaml").read_text())
+    del listed["detector"]["gain_e_per_adu"]
+    listed["frames"] = {kind: listed["frames"][kind] for kind in kinds}
+    (acquisition / "acquisition.yaml").write_text(yaml.safe_dump(listed))
+    return acquisition
+
+
+def test_a_gain_that_is_not_declared_is_that_of_the_flats(tmp_path: Path) -> None:
+    acquisition = write_camera(tmp_path / "acq", (500, 1500, 3000, 4500, 6000))
+    declared = pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "declared")).reduction
+    without_gain(acquisition, "bias", "dark", "flat")
+    found = pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run")).reduction
+    gain = found["gain_e_per_adu"]
+    assert gain["declared"] is None
+    assert gain["used"] == gain["measured"]
+    assert abs(gain["used"] / declared["gain_e_per_adu"]["measured"] - 1) < 1e-3
+    assert any("no gain is declared" in text for text in found["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("kinds", "why"),
+    [(("bias", "dark"), "without flat frames"), (("flat",), "neither bias nor dark frames")],
+)
+def test_a_gain_that_nothing_tells_is_asked_for(
+    kinds: tuple[str, ...], why: str, tmp_path: Path
+) -> None:
+    acquisition = without_gain(write_camera(tmp_path / "acq", (500, 1500)), *kinds)
+    with pytest.raises(pixcal.InputError, match=r"detector.gain_e_per_adu: missing") as raised:
+        pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run"))
+    assert why in str(raised.value)
+    assert "give it in e-/ADU" in str(raised.value)

@@ -20,8 +20,10 @@ class Detector:
     """The detector as declared."""
 
     pitch_um: float = quantity(unit="um", low=0.01, high=1000, doc="pixel pitch")
-    gain_e_per_adu: float = quantity(unit="e-/ADU", low=1e-6, high=1e6, doc="conversion gain")
     read_noise_e: float = quantity(unit="e-", low=0, high=1e6, doc="read noise, rms")
+    gain_e_per_adu: float | None = quantity(
+        None, unit="e-/ADU", low=1e-6, high=1e6, doc="conversion gain; else that of the flats"
+    )
     name: str = quantity("", doc="free text")
     full_well_e: float | None = quantity(None, unit="e-", low=1, high=1e12, doc="full well")
     saturation_adu: float | None = quantity(
@@ -116,6 +118,11 @@ class Acquisition:
         kinds = (self.frames.bias, self.frames.dark, self.frames.flat, self.frames.fringes)
         if not any(kinds):
             raise InputError("frames: no files are listed; give globs")
+        if self.detector.gain_e_per_adu is None and not self.frames.flat:
+            raise InputError(
+                "detector.gain_e_per_adu: missing, and without flat frames it cannot be measured; "
+                "give it in e-/ADU"
+            )
 
     @property
     def fibres(self) -> Optics:

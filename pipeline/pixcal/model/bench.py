@@ -1,6 +1,6 @@
 """A bench to simulate: everything ``pixcal simulate`` needs to know, schema ``pixcal/bench/1``."""
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, ClassVar
@@ -30,7 +30,9 @@ class SimulatedDetector:
         unit="px", low=1, high=65536, doc="window that is read out: [rows, columns]"
     )
     pitch_um: float = as_in(Detector, "pitch_um")
-    gain_e_per_adu: float = as_in(Detector, "gain_e_per_adu")
+    gain_e_per_adu: float = as_in(
+        Detector, "gain_e_per_adu", default=MISSING, doc="conversion gain"
+    )
     read_noise_e: float = as_in(Detector, "read_noise_e")
     name: str = as_in(Detector, "name")
     seed: int = quantity(

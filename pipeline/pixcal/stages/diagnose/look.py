@@ -125,7 +125,12 @@ def _acquisition(run_dir: Path, ingested: Ingested) -> Acquisition:
     """The acquisition; every window is looked at with the saturation of the whole detector."""
     acquisition = read_acquisition(run_dir)
     saturation = acquisition.detector.saturation_adu or ingested.saturation_found
-    return replace(acquisition, detector=replace(acquisition.detector, saturation_adu=saturation))
+    used = read_json(run_dir / "reduce" / "reduce.json")["gain_e_per_adu"]["used"]
+    gain = acquisition.detector.gain_e_per_adu or float(used)
+    return replace(
+        acquisition,
+        detector=replace(acquisition.detector, saturation_adu=saturation, gain_e_per_adu=gain),
+    )
 
 
 def _memory(half: Half, pixels: int, runtime: Runtime) -> tuple[Runtime, Runtime, bool]:

@@ -65,12 +65,16 @@ class Summary:
 
     def gain_to_use(self, choice: str) -> float:
         """Gain (e-/ADU), ``declared`` or ``measured``; InputError if there is no measured one."""
-        if choice == "declared":
-            return self.declared.gain_e_per_adu
+        declared = self.declared.gain_e_per_adu
+        if choice == "declared" and declared is not None:
+            return declared
         if self.gain is None:
+            asked, remedy = "gain: 'measured'", "use gain: declared"
+            if declared is None:
+                asked, remedy = "detector.gain_e_per_adu: missing", "give it in e-/ADU"
             raise InputError(
-                "gain: 'measured', but the flats show no photon noise above the read noise, or "
-                "there are neither bias nor dark frames; use gain: declared"
+                f"{asked}, but the flats show no photon noise above the read noise, or there are "
+                f"neither bias nor dark frames; {remedy}"
             )
         return self.gain.gain
 

@@ -86,6 +86,11 @@ def _of_gain(fit: GainFit, summary: Summary, used: float) -> list[str]:
             "effect"
         )
     value, error = fit.gain, fit.error
+    if declared is None:
+        return [
+            *found,
+            f"no gain is declared: that of the flats is used, {used:.4g} ± {error:.2g} e-/ADU",
+        ]
     if abs(value - declared) > max(3 * error, 0.02 * declared):
         found.append(
             f"photon transfer gives a gain of {value:.4g} ± {error:.2g} e-/ADU, not the "

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from pixcal.model.arrays import F64, I64
+from pixcal.model.errors import InputError
 from pixcal.storage.frame_reader import Reader
 
 ROWS = 64  # rows that are looked at, in the middle of the frames
@@ -29,6 +30,7 @@ NEIGHBOURS = 16  # codes below the highest that are held against it
 MIN_DARKS = 5  # fewest steps between levels of darks that tell groups apart
 # least step between two groups: over the median step, and over the noise of a sample
 JUMP, NOTABLE = 20.0, 0.1
+OUTLIER = 9.0  # median deviations beyond which a difference of two frames is no noise
 PILED = 4  # how many times as many samples as at any of these are a pile
 
 
@@ -98,6 +100,37 @@ class FlatSurvey:
 
     def _mean(self, frames: I64) -> float:
         return float(self.levels[frames].mean())
+
+
+def rough_gain(arrays: Mapping[str, Reader], levels: F64, groups: Sequence[Sequence[int]]) -> float:
+    """Gain (e-/ADU) to some tens of per cent, by two frames of the level with most photon noise.
+
+    ``levels``: (t,) of the flats (ADU above bias); ``groups``: numbers of the flats of each level.
+    InputError if no two flats are of one level, or they show no photon noise.
+    """
+    dark = next((arrays[name] for name in ("bias", "dark") if name in arrays), None)
+    read = 0.0 if dark is None or dark.shape[0] < 2 else _noise_of_pair(dark, 0, 1)
+    pairs = [(group[0], group[1]) for group in groups if len(group) > 1]
+    found = [
+        (_noise_of_pair(arrays["flat"], *pair) - read, float(levels[[*pair]].mean()))
+        for pair in pairs
+    ]
+    photons, level = max(found, default=(0.0, 0.0))
+    if not (photons > 0 and level > 0):
+        raise InputError(
+            "detector.gain_e_per_adu: missing, and no two flats of one level show photon noise by "
+            "which it could be measured; give it in e-/ADU"
+        )
+    return level / photons
+
+
+def _noise_of_pair(frames: Reader, one: int, other: int) -> float:
+    """Variance (ADU²) of a sample by the difference of two frames, without outliers."""
+    first, second = (middle_rows(frames, n, n + 1)[0].astype(float) for n in (one, other))
+    change = second - first
+    change -= np.nanmedian(change)
+    within = np.abs(change) <= OUTLIER * np.nanmedian(np.abs(change)) + 1
+    return float(np.nanmean(change[within] ** 2)) / 2
 
 
 def of_several_levels(frames: Reader) -> bool:

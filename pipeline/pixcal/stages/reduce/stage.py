@@ -26,7 +26,7 @@ from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, lineari
 from pixcal.stages.reduce.detector_warnings import detector_warnings
 from pixcal.stages.reduce.electrons import convert_bytes
 from pixcal.stages.reduce.figures_of_merit import characterise
-from pixcal.stages.reduce.flat_survey import noise_above, share_at_zero
+from pixcal.stages.reduce.flat_survey import noise_above, rough_gain, share_at_zero
 from pixcal.stages.reduce.frame_statistics import (
     Measuring,
     measure,
@@ -101,7 +101,7 @@ class Reduction:
                 "levels_adu": list(fitted.levels) if fitted else None,
                 "neighbours": [list(lag) for lag in fitted.neighbours] if fitted else [],
                 "used": gain,
-                "used_from": config.gain,
+                "used_from": "measured" if summary.declared.gain_e_per_adu is None else config.gain,
             },
             "read_noise_e": {
                 "declared": summary.declared.read_noise_e,
@@ -116,7 +116,12 @@ class Reduction:
 
 def reduce_frames(made: Workspace, source: Ingested, config: Config, runtime: Runtime) -> Reduction:
     """Write ``calibration.zarr`` and ``reduced.zarr``; InputError if the gain cannot be told."""
-    if config.gain == "measured" and len(source.tables.get("flat", {}).get("file", ())) < 2:
+    undeclared = source.detector.gain_e_per_adu is None
+    if (
+        config.gain == "measured"
+        and not undeclared
+        and len(source.tables.get("flat", {}).get("file", ())) < 2
+    ):
         raise InputError(
             "gain: 'measured' needs two flat frames or more; list them under frames.flat of "
             "acquisition.yaml, or use gain: declared"
@@ -149,6 +154,10 @@ def reduce_frames(made: Workspace, source: Ingested, config: Config, runtime: Ru
 
 def _measuring(source: Ingested, config: Config, folder: Place) -> Measuring:
     exposures, detector = source.exposures, source.detector
+    gain = detector.gain_e_per_adu
+    if gain is None:
+        levels = np.zeros(0) if source.survey is None else source.survey.levels
+        gain = rough_gain(source.arrays, levels, [group.frames for group in exposures.flat])
     return Measuring(
         frames={
             name: source.arrays[name] for name in ("bias", "dark", "flat") if name in source.arrays
@@ -162,8 +171,8 @@ def _measuring(source: Ingested, config: Config, folder: Place) -> Measuring:
         full=min(map(source.saturation, source.tables)),
         quantum=source.quantum,
         cut_off={name: noise_above(source.arrays[name]) for name in _cut_off(source)},
-        gain=detector.gain_e_per_adu,
-        read_noise=max(detector.read_noise_e / detector.gain_e_per_adu, ROUNDING_ADU),
+        gain=gain,
+        read_noise=max(detector.read_noise_e / gain, ROUNDING_ADU),
         options=config,
         writers=statistics_writers(folder, source.shape, len(exposures.flat)),
     )
