@@ -8,11 +8,10 @@ import pytest
 
 from pixcal.effects.bias_drift import BiasDrift
 from pixcal.effects.cosmic_hits import CosmicHits
-from pixcal.effects.output_jitter import OutputJitter
+from pixcal.effects.output_jitter import OutputJitter, find_outputs, output_numbers
 from pixcal.effects.row_noise import RowNoise
 from pixcal.effects.telegraph_noise import TelegraphNoise
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.outputs import find_outputs, output_numbers
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import frames_of

@@ -1,6 +1,5 @@
 """Offset of the whole frame: it jumps from frame to frame, wanders, and settles as things warm."""
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
@@ -30,7 +29,7 @@ from pixcal.estimators.frame_series.variance_components import (
 )
 from pixcal.kernels.processes import brownian
 from pixcal.kernels.significance import SIGNIFICANT
-from pixcal.kernels.synthesis import Stream, generator
+from pixcal.kernels.synthesis import walk_normals
 from pixcal.model.arrays import F32, F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
@@ -110,12 +109,7 @@ class BiasDrift(Effect):
         """Offset of a frame, e-: of the bench's seed, and of the frame's random numbers."""
         offset = float(self.trend(np.array(time_s))) + self.jitter_rms * rng.standard_normal()
         if self.walk_e_h:
-            name = zlib.crc32(self.name.encode())
-
-            def normal(level: int, place: int) -> float:
-                own = generator(seed, Stream.EFFECT, name, _KEY + level, place)
-                return float(own.standard_normal())
-
+            normal = walk_normals(seed, self.name, _KEY)
             offset += self.walk_e_h * brownian(time_s, normal) / np.sqrt(HOUR_S)
         return offset
 

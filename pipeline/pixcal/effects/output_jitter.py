@@ -1,22 +1,37 @@
-"""Levels of the outputs that read parts of the detector: each varies from frame to frame."""
+"""Levels of the outputs that read parts of the detector: each varies from frame to frame.
 
-import zlib
-from collections.abc import Callable
+Beside an edge between two outputs, the means of some rows (columns) on either side differ anew in
+every frame; noise of rows, white or 1/f, does so alike at all places.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.outputs import MIN_FRAMES, Outputs, find_outputs, output_numbers
+from pixcal.estimators.frame_series.walk_modes import walk_modes
 from pixcal.kernels.processes import brownian
-from pixcal.kernels.synthesis import Stream, generator
-from pixcal.model.arrays import F32, F64
+from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best, sigmas_of_chi2
+from pixcal.kernels.synthesis import walk_normals
+from pixcal.model.arrays import F32, F64, Indices, Mask
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 HOUR_S = 3600.0
-_NAME, _WALK = zlib.crc32(b"output_jitter"), 1000  # keys of the walk's random numbers
+_WALK = 1000  # first key of the walk's random numbers
+MIN_FRAMES = 8
+MAX_EDGES = 15  # along each axis
+NARROWEST = 8  # rows or columns of an output at least; even: two that alternate cancel
+# lines on either side whose means are compared: levels differ little beside the noise of few lines
+WIDTHS = (NARROWEST, 3 * NARROWEST, 9 * NARROWEST)
+_FAR = 24  # lines on either side by which an edge is placed
+_WILD = 5.0  # standard deviations from which a sample, _CLIP from which a step of a frame is cut
+_CLIP = 3.0
+_STEPS = 30  # of the likelihood's maximisation
+_LEAST = 1e-9  # noise of a level, e-²: frames may be alike
 
 
 @dataclass(frozen=True)
@@ -67,7 +82,8 @@ class OutputJitter(Effect):
         count = (len(self.row_edges) + 1) * (len(self.column_edges) + 1)
         levels = self.output_rms * shot.rng(self.name).standard_normal(count)
         if self.walk_e_h:
-            walks = [brownian(shot.time_s, _normals(shot.bench.seed, n)) for n in range(count)]
+            normals = [walk_normals(shot.bench.seed, self.name, _WALK, n) for n in range(count)]
+            walks = [brownian(shot.time_s, normal) for normal in normals]
             levels += self.walk_e_h * np.array(walks) / np.sqrt(HOUR_S)
         return np.asarray(levels)
 
@@ -101,7 +117,7 @@ class OutputJitter(Effect):
         return None if found is None else found.sigmas
 
 
-def _outputs(evidence: Evidence) -> Outputs | None:
+def _outputs(evidence: Evidence) -> "Outputs | None":
     """Outputs of the frames without light, edges in the window at hand."""
     stacks = [s for s in evidence.stacks if s.kind in ("bias", "dark") and len(s.adu) >= MIN_FRAMES]
     gain = np.float32(evidence.gain)
@@ -109,11 +125,174 @@ def _outputs(evidence: Evidence) -> Outputs | None:
     return find_outputs(rests, [s.time_s for s in stacks], evidence.good)
 
 
-def _normals(seed: int, output: int) -> Callable[[int, int], float]:
-    """Random numbers of the walk of an output, the same in all frames."""
+@dataclass(frozen=True)
+class Outputs:
+    """Edges between outputs, and the noise of their levels."""
 
-    def normal(level: int, place: int) -> float:
-        own = generator(seed, Stream.EFFECT, _NAME, _WALK + level, place, output)
-        return float(own.standard_normal())
+    row_edges: tuple[int, ...]  # row_edges, column_edges: first line of each output but the first
+    column_edges: tuple[int, ...]
+    # size, error: white noise of an output's level (e-²), and its random walk (e-²/s)
+    size: tuple[float, float]
+    error: tuple[float, float]
+    sigmas: float  # significance of the clearest edge
 
-    return normal
+
+def find_outputs(stacks: Sequence[F32], times: Sequence[F64], good: Mask) -> Outputs | None:
+    """Outputs of stacks (t, y, x), e-, less the mean of each pixel, at times (t,), s.
+
+    None with too few frames. Where no edge is significant, the clearest one is given.
+    """
+    chosen = [n for n, rest in enumerate(stacks) if len(rest) >= MIN_FRAMES]
+    rests = [_calm(stacks[n], good) for n in chosen]
+    if not rests:
+        return None
+    found = [_edges(rests, good, axis) for axis in (0, 1)]
+    clearest = max(found, key=lambda own: own[1])
+    if clearest[1] == -np.inf:
+        return None
+    kept = [[e for e, s in own[0] if s > SIGNIFICANT] for own in found]
+    if not any(kept):
+        kept[found.index(clearest)] = [clearest[0][0][0]]
+    rows, columns = (tuple(sorted(own)) for own in kept)
+    numbers = output_numbers(rows, columns, np.arange(good.shape[0]), np.arange(good.shape[1]))
+    size, error = _sizes(rests, [times[n] for n in chosen], good, numbers)
+    return Outputs(rows, columns, size, error, clearest[1])
+
+
+def output_numbers(
+    row_edges: Sequence[int], column_edges: Sequence[int], rows: Indices, columns: Indices
+) -> Indices:
+    """Number (y, x) of the output that reads each pixel of some rows and columns."""
+    along = np.searchsorted(column_edges, columns, side="right")
+    down = np.searchsorted(row_edges, rows, side="right")
+    return np.asarray(down[:, None] * (len(column_edges) + 1) + along)
+
+
+def _calm(rest: F32, good: Mask) -> F32:
+    """Without the mean of each frame; samples of bad pixels and outliers are zero."""
+    rest = rest - rest[:, good].mean(axis=1)[:, None, None]
+    spread = 1.4826 * float(np.median(np.abs(rest[:, good])))
+    rest[np.abs(rest) > _WILD * max(spread, 1e-6)] = 0
+    return np.asarray(rest * good, np.float32)
+
+
+def _edges(rests: Sequence[F32], good: Mask, axis: int) -> tuple[list[tuple[int, float]], float]:
+    """Edges along an axis with their significance, clearest first, and that of the clearest."""
+    size = good.shape[axis]
+    if size < 6 * NARROWEST - 1:
+        return [], -np.inf
+    count = np.maximum(good.sum(axis=1 - axis), 1)
+    lines = [rest.sum(axis=2 - axis, dtype=float) / count for rest in rests]
+    dof = sum(len(own) - 1 for own in lines)
+    free = {width: _steps(lines, width, dof) for width in WIDTHS if 4 * width < size}
+    looks = 2 * sum(np.count_nonzero(square) for square in free.values())
+    found: list[tuple[int, float]] = []
+    while len(found) < MAX_EDGES and max(square.max() for square in free.values()) > 0:
+        best = max(free.values(), key=np.max)
+        at = int(best.argmax())
+        chance = sigmas_of_chi2(float(best[at]), dof)
+        sigmas = sigmas_of_best(*[chance] * looks)
+        edge = _placed(lines, at)
+        found.append((edge, sigmas))
+        if sigmas < SIGNIFICANT:
+            break
+        # Steps that are cut are alike at several places, of which the first need not be the edge.
+        for width, square in free.items():
+            for middle in (at, edge):
+                square[max(middle - width, 0) : middle + width + 1] = 0
+    return found, found[0][1] if found else -np.inf
+
+
+def _steps(lines: Sequence[F64], width: int, dof: int) -> F64:
+    """Sum over frames of the squared step at each place over the usual one: chi-square by chance.
+
+    Between the means of ``width`` lines on either side; zero where there are fewer.
+    """
+    size = lines[0].shape[1]
+    places = np.arange(width, size - width + 1)
+    square = np.zeros(len(places))
+    for own in lines:
+        # Noise may differ from place to place.
+        noise = _line_noise(own)[None]
+        expected = _means(noise, places, width)[0] + _means(noise, places - width, width)[0]
+        steps = _means(own, places, width) - _means(own, places - width, width)
+        steps /= np.sqrt(np.maximum(expected, 1e-12))
+        usual = 1.4826 * np.median(np.abs(steps)) or 1.0
+        square += np.square(np.clip(steps / usual, -_CLIP, _CLIP)).sum(axis=0)
+    found = np.zeros(size + 1)
+    found[places] = square * dof / max(float(np.median(square)), 1e-9)
+    return found
+
+
+def _line_noise(lines: F64) -> F64:
+    """Variance (n,) of means (t, n) of lines, by how they differ from the next; no step counts."""
+    change = np.square(np.diff(lines, axis=1)).mean(axis=0) / 2
+    near = np.pad(change, (NARROWEST, NARROWEST + 1), mode="reflect")
+    return np.asarray(np.median(sliding_window_view(near, 2 * NARROWEST + 1), axis=1))
+
+
+def _means(lines: F64, first: Indices, count: int) -> F64:
+    """Means (t, n) of so many lines from some on."""
+    total = np.concatenate([np.zeros((len(lines), 1)), np.cumsum(lines, axis=1)], axis=1)
+    return np.asarray((total[:, first + count] - total[:, first]) / count)
+
+
+def _placed(lines: Sequence[F64], about: int) -> int:
+    """Place about an edge that parts the lines best."""
+    size = lines[0].shape[1]
+    first, last = max(about - _FAR, 0), min(about + _FAR, size)
+    places = range(max(about - NARROWEST, first + 1), min(about + NARROWEST, last - 1) + 1)
+    gains = []
+    for place in places:
+        before, after = place - first, last - place
+        step = [own[:, place:last].mean(axis=1) - own[:, first:place].mean(axis=1) for own in lines]
+        gains.append(before * after / (before + after) * sum(float(s @ s) for s in step))
+    return places[int(np.argmax(gains))]
+
+
+def _sizes(
+    rests: Sequence[F32], times: Sequence[F64], good: Mask, numbers: Indices
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """White noise and walk of the levels of outputs beyond the noise of pixels, rows and columns.
+
+    By the likelihood of the modes in which both are independent; with their errors.
+    """
+    masks = [good & (numbers == n) for n in range(int(numbers.max()) + 1)]
+    masks = [mask for mask in masks if np.count_nonzero(mask) >= NARROWEST**2]
+    if len(masks) < 2:
+        return (0.0, 0.0), (1.0, 1.0)
+    parts = []
+    for rest, time in zip(rests, times, strict=True):
+        levels = np.stack([rest[:, mask].mean(axis=1, dtype=float) for mask in masks], axis=1)
+        levels -= levels.mean(axis=1, keepdims=True)
+        basis = walk_modes(time)
+        square = (basis.of(levels) ** 2).sum(axis=1) / (len(masks) - 1)
+        noise = np.full(len(square), np.mean([_noise(rest, mask) for mask in masks]) + _LEAST)
+        parts.append((square, noise, np.ones(len(square)), basis.walk))
+    square, noise, *shapes = (np.concatenate(own) for own in zip(*parts, strict=True))
+    shape, size = np.stack(shapes), np.zeros(2)
+    for _ in range(_STEPS):
+        weight = (len(masks) - 1) / (2 * (np.maximum(size, 0) @ shape + noise) ** 2)
+        normal = (weight * shape) @ shape.T
+        size = np.linalg.solve(normal, (weight * shape) @ (square - noise))
+        if size.min() < 0:
+            # The other one alone.
+            other = int(size.argmax())
+            size = np.zeros(2)
+            size[other] = (weight * shape[other]) @ (square - noise) / normal[other, other]
+    error = np.sqrt(np.diag(np.linalg.inv(normal)))
+    return (float(size[0]), float(size[1])), (float(error[0]), float(error[1]))
+
+
+def _noise(rest: F32, mask: Mask) -> float:
+    """Variance of the mean of some pixels that are a rectangle but for bad ones."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    cut = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+    own, used = rest[:, *cut] * mask[cut], np.maximum(np.count_nonzero(mask), 1)
+    ny, nx = mask[cut].shape
+    own = own - own.sum(axis=(1, 2), keepdims=True) / used
+    pixels = float(np.square(own, dtype=float).sum()) / len(own) / used
+    lines = [own.sum(axis=a) / np.maximum(mask[cut].sum(axis=a - 1), 1) for a in (2, 1)]
+    # Neighbours: what rows share over long distances is no less than between them.
+    of_rows, of_columns = (float(np.square(line, dtype=float).mean()) for line in lines)
+    return float(max(of_rows / ny + of_columns / nx - pixels / used, 0.0))

@@ -11,9 +11,11 @@ depends on how the work is cut or who does it.
 """
 
 import math
+from collections.abc import Callable
 from enum import IntEnum
 from functools import lru_cache
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +48,17 @@ class Stream(IntEnum):
 def generator(seed: int, stream: Stream, *key: int) -> np.random.Generator:
     """The random generator of one purpose and place; the same whoever asks, in whatever order."""
     return np.random.Generator(np.random.PCG64(_Seed.of(seed, int(stream), *key)))
+
+
+def walk_normals(seed: int, effect: str, first: int, *last: int) -> Callable[[int, int], float]:
+    """Normals of an effect's walk through all frames (`pixcal.kernels.processes.brownian`)."""
+    name = crc32(effect.encode())
+
+    def normal(level: int, place: int) -> float:
+        own = generator(seed, Stream.EFFECT, name, first + level, place, *last)
+        return float(own.standard_normal())
+
+    return normal
 
 
 def pixel_key(seed: int, stream: Stream, *key: int) -> Key:
