@@ -111,10 +111,7 @@ class _Taken:
 
 
 def _taken(
-    kind: type[ForwardModel],
-    evidence: Evidence,
-    leave: Sequence[str],
-    halvings: int = HALVINGS,
+    kind: type[ForwardModel], evidence: Evidence, leave: Sequence[str], halvings: int = HALVINGS
 ) -> _Taken | None:
     changes = evidence.once("changes of frames", make=lambda: FrameChanges(evidence))
     every = changes.series(kind())

@@ -10,13 +10,7 @@ import math
 import numpy as np
 
 from pixcal.estimators.detector.emva import Measure
-from pixcal.kernels.photon_transfer import (
-    BLOCK,
-    COLUMNS,
-    LAGS,
-    bin_pairs,
-    pair_statistics,
-)
+from pixcal.kernels.photon_transfer import BLOCK, COLUMNS, LAGS, bin_pairs, pair_statistics
 from pixcal.kernels.robust import lit, median_and_sigma, median_of_columns
 from pixcal.model.arrays import F32, F64
 

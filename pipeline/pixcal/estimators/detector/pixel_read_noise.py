@@ -33,11 +33,7 @@ class PixelNoise:
 
     @classmethod
     def of(
-        cls,
-        stacks: Sequence[F32],
-        good: Mask,
-        rounding: float = 0.0,
-        noisy: Mask | None = None,
+        cls, stacks: Sequence[F32], good: Mask, rounding: float = 0.0, noisy: Mask | None = None
     ) -> "PixelNoise | None":
         """From frames (t, y, x) without light, ADU; None of fewer than `FEWEST` frames.
 

@@ -62,11 +62,7 @@ class FrameLight:
         """Covariance (t - 1, 2, 2) of the modes of a series for a unit of a kind of change."""
         kind, _, time = name.partition("_")
         n, level, walk = len(series), self.level.get(series.name), series.walk_modes.walk
-        power = {
-            "": np.ones(n - 1),
-            "walk": walk,
-            "smooth": (walk / series.step_s / n) ** 2,
-        }[time]
+        power = {"": np.ones(n - 1), "walk": walk, "smooth": (walk / series.step_s / n) ** 2}[time]
         if level is None:
             pattern = PATTERNS["power"] * (kind == "offset")
         else:

@@ -7,13 +7,7 @@ a statistic too.
 
 import numpy as np
 
-from pixcal.estimators.test_statistics import (
-    DETECTOR,
-    Curve,
-    Key,
-    Statistic,
-    known_statistics,
-)
+from pixcal.estimators.test_statistics import DETECTOR, Curve, Key, Statistic, known_statistics
 
 STRAIGHT = 10.0  # standard deviations beyond which they count by their logarithm
 _PREFIX, _INFIX = "estimate_of_", "_in_"

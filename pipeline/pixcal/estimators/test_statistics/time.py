@@ -6,12 +6,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.fft import dct
 
-from pixcal.estimators.detector.flat_ladder import (
-    FLICKER_KNOWN,
-    flicker,
-    level_before,
-    light_of,
-)
+from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker, level_before, light_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics import Curve, family, statistic
 from pixcal.estimators.test_statistics.look import Look

@@ -56,11 +56,7 @@ class Inquiry:
 
 
 def inquire(
-    run_dir: Path,
-    kinds: Mapping[str, type[Effect]],
-    base: Effects,
-    scratch: Path,
-    runtime: Runtime,
+    run_dir: Path, kinds: Mapping[str, type[Effect]], base: Effects, scratch: Path, runtime: Runtime
 ) -> Inquiry:
     """Look at a reduced run, simulate its nominal bench, and search for causes among ``kinds``.
 
@@ -173,10 +169,7 @@ def places(made: Inquiry) -> list[dict[str, Any]]:
 
 
 def _candidates(
-    evidence: Evidence,
-    kinds: Mapping[str, type[Effect]],
-    base: Effects,
-    runtime: Runtime,
+    evidence: Evidence, kinds: Mapping[str, type[Effect]], base: Effects, runtime: Runtime
 ) -> dict[str, Candidate]:
     there = {effect.name for effect in base}
     tried = {name: kind for name, kind in kinds.items() if name not in there}

@@ -24,12 +24,7 @@ from pixcal.stages.diagnose.description import bench_of, pedestal_of, recordings
 from pixcal.stages.diagnose.fitted_set import FittedSet, contrast_surface, light_surface
 from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain
-from pixcal.stages.diagnose.nominal import (
-    Measured,
-    NominalBench,
-    SetTruth,
-    uncoupled,
-)
+from pixcal.stages.diagnose.nominal import Measured, NominalBench, SetTruth, uncoupled
 from pixcal.stages.diagnose.parts import Half, Table
 from pixcal.stages.reduce.calibration import FLAT_FLOOR
 

@@ -66,11 +66,7 @@ def groups(table: Table) -> list[Indices]:
 
 
 def take(
-    ingested: Ingested,
-    acquisition: Acquisition,
-    half: Half,
-    part: Part,
-    reduction: reduce.Config,
+    ingested: Ingested, acquisition: Acquisition, half: Half, part: Part, reduction: reduce.Config
 ) -> Raw:
     """Read a part of a run's frames."""
     arrays = {}

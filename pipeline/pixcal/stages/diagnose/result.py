@@ -25,13 +25,7 @@ from pixcal.model.config import to_plain
 from pixcal.report.curve_places import place
 from pixcal.simulation.effect import DOMAINS
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
-from pixcal.stages.diagnose.comparison import (
-    Shrinkage,
-    Trial,
-    differing,
-    gap_interval,
-    shrinkage,
-)
+from pixcal.stages.diagnose.comparison import Shrinkage, Trial, differing, gap_interval, shrinkage
 from pixcal.stages.diagnose.frames_used import FRINGES, FramesUsed, recommend_frames
 
 Json = dict[str, Any]

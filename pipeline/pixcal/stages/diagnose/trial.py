@@ -194,9 +194,7 @@ def _kept(file: Path) -> dict[str, Any] | None:
 
 
 def _made(
-    windows: tuple[Window, ...],
-    signatures: tuple[Signature, ...],
-    item: tuple[Effects, int, int],
+    windows: tuple[Window, ...], signatures: tuple[Signature, ...], item: tuple[Effects, int, int]
 ) -> Curves | str:
     effects, seed, number = item
     window = windows[number]
