@@ -26,7 +26,6 @@ from pixcal.kernels.normal_matrix import root_diagonal
 from pixcal.kernels.psf import MARGIN, Psf
 from pixcal.model.arrays import F32, F64, Mask
 
-Good = Mask
 # least variance of a pixel, as a share of the star's electrons: dark rings weigh no more
 TINY = 1e-9
 MAX_STEPS = 50
@@ -62,7 +61,7 @@ class Star:
         """
         return np.asarray(self.electrons * self._at(place, offsets)[0] + self.background)
 
-    def fit(self, data: F64, offsets: F64, good: Good) -> F64:
+    def fit(self, data: F64, offsets: F64, good: Mask) -> F64:
         """Fit each star from the middle of its window: a, b (px), N, B (e-), (n, 4).
 
         Of electrons and pixels to use (n, side, side), and of where the fit takes the pixels to
@@ -106,7 +105,7 @@ class Star:
         places = np.indices((4, 4)).reshape(2, -1).T / 4 - 0.375
         return np.asarray(np.sqrt(np.mean([self.bound(p) ** 2 for p in places], axis=0)))
 
-    def weights(self, place: F64, good: Good | None = None) -> F64:
+    def weights(self, place: F64, good: Mask | None = None) -> F64:
         """Error of the fitted centroid (x, y) per displacement (x, y) of each pixel.
 
         The fit does not know of them; one common to all moves the centroid by its opposite. (2, 2,
@@ -119,7 +118,7 @@ class Star:
             np.einsum("ai,iyx,yx,cyx->acyx", covariance[:2], jacobian, weight, slopes)
         )
 
-    def _of_pixels(self, place: F64, good: Good | None) -> tuple[F64, F64, F64]:
+    def _of_pixels(self, place: F64, good: Mask | None) -> tuple[F64, F64, F64]:
         """Of one star: derivatives by a, b, N, B; weights; derivatives by the pixels' places."""
         theta = np.array([[*place, self.electrons, self.background]])
         jacobian, weight, _, slopes = (part[0] for part in self._linear(theta))
