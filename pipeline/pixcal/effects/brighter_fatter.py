@@ -11,8 +11,7 @@ from pixcal.estimators.detector.response import (
     boundaries_alone,
     boundaries_beside,
 )
-from pixcal.estimators.diagnosis.central_crop import central_crop
-from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence, central_crop
 from pixcal.kernels.boundaries import REACH, area_changes, boundary_shifts, moved_charge
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import F32, F64

@@ -9,8 +9,7 @@ from pixcal.estimators.detector.frame_lag import CLEAR, MAX_DECAY, common_lag, l
 from pixcal.estimators.detector.noiseless_charge import missing_noise
 from pixcal.estimators.detector.pixel_lag import Uneven, seen_share
 from pixcal.estimators.detector.traps import BANDS, LossFit, in_bands
-from pixcal.estimators.diagnosis.central_crop import MAX_SAMPLES, central_crop
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.diagnosis.evidence import MAX_SAMPLES, Evidence, FringeEvidence, central_crop
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import sigmas_of_best
 from pixcal.kernels.transfer import fill_traps, left_behind

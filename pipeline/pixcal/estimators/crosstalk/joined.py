@@ -10,8 +10,7 @@ from pixcal.estimators.crosstalk.dense import CouplingFrames, Dense, frames_of, 
 from pixcal.estimators.crosstalk.links import Place, links
 from pixcal.estimators.crosstalk.pattern import visibility_pattern
 from pixcal.estimators.crosstalk.support import Choice, choose
-from pixcal.estimators.diagnosis.central_crop import central_crop
-from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence, central_crop
 from pixcal.kernels.crosstalk import Coupling
 from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
