@@ -86,8 +86,8 @@ def test_what_no_cause_explains_has_a_size():
     where = [tone | {"z_after": 30.0}, drift | {"z_after": 4.0}, shared | {"z_after": -9.0}]
     found = {"verdict": "unexplained", "gap": {"where": where}, "more_would_tell": ["darks"]}
     ((name, size, sigmas, _, action),) = unexplained(found)
-    assert (name, sigmas) == ("unexplained", "9.0 σ")
-    assert size == "correlation, x+2: −28.0 % (simulated: 0)"
+    assert (name, sigmas) == ("unexplained", "30 σ")
+    assert size.endswith("128 σ (simulated: 0); correlation, x+2: −28.0 % (simulated: 0)")
     assert action.endswith("recommended frames: darks")
     found["gap"]["where"] = where[1:2]
     assert unexplained(found)[0][1] == "level, all: 5.020 e⁻ (simulated: 5.010)"

@@ -211,17 +211,24 @@ def unexplained(diagnosis: Json | None) -> tuple[tuple[str, ...], ...]:
     verdict, gap = (diagnosis or {}).get("verdict"), (diagnosis or {}).get("gap", {})
     if not diagnosis or verdict not in ("unexplained", "partly explained") or not gap["where"]:
         return ()
-    # The most significant comes first; some have a size in no other unit.
-    entry = min(gap["where"], key=lambda e: (e["unit"] == "σ", -abs(e["z_after"])))
+    ranked = sorted(gap["where"], key=lambda e: -abs(e["z_after"]))
+    first, sized = ranked[0], [e for e in ranked if e["unit"] != "σ"]
+    # The size of what only has a significance shows best in another statistic.
+    shown = ranked[:1] + (sized[:1] if first["unit"] == "σ" else [])
+    size = "; ".join(map(_departure, shown))
+    frames = "; recommended frames: ".join(["", ", ".join(diagnosis["more_would_tell"])])
+    action = f"find the cause on the bench{frames if diagnosis['more_would_tell'] else ''}"
+    return (("unexplained", size, _sigmas(abs(first["z_after"])), "not known", action),)
+
+
+def _departure(entry: Json) -> str:
+    """What a statistic measures, and what the simulation has."""
     scale, its_unit = (1, unit(entry["unit"])) if entry["unit"] else (100, "%")
     ends = [scale * float(entry[key]) for key in ("measured", "after")]
     digits = digits_apart(*ends)
     decimals = digits - 1 - math.floor(math.log10(max(map(abs, ends))))
     measured, simulated = (number(round(v, decimals), digits) for v in ends)
-    size = f"{entry['title']}, {entry['place']}: {measured} {its_unit} (simulated: {simulated})"
-    frames = "; recommended frames: ".join(["", ", ".join(diagnosis["more_would_tell"])])
-    action = f"find the cause on the bench{frames if diagnosis['more_would_tell'] else ''}"
-    return (("unexplained", size, _sigmas(abs(entry["z_after"])), "not known", action),)
+    return f"{entry['title']}, {entry['place']}: {measured} {its_unit} (simulated: {simulated})"
 
 
 def _sigmas(value: float | None) -> str:
