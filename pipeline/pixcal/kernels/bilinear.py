@@ -282,15 +282,28 @@ def solve_pixels(sums: F64) -> tuple[F64, F64, F64]:
     where it is not determined; the upper triangle (6, ...) of the covariance of theta; and the
     weighted square (...) of the residual that remains.
     """
-    a, b, c, d, e, f, r0, r1, r2, square = np.asarray(sums[:10], float)
-    *adjugate, det = _adjugate.py_func(a, b, c, d, e, f)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        i00, i01, i02, i11, i12, i22 = adjugate / np.where(det > SINGULAR * a * d * f, det, np.nan)
-    s0 = i00 * r0 + i01 * r1 + i02 * r2
-    s1 = i01 * r0 + i11 * r1 + i12 * r2
-    s2 = i02 * r0 + i12 * r1 + i22 * r2
-    covariance = np.stack([i00, i01, i02, i11, i12, i22])
-    return np.stack([s0, s1, s2]), covariance, square - (s0 * r0 + s1 * r1 + s2 * r2)
+    ten = np.asarray(sums[:10], float)
+    out = np.empty(ten.shape)
+    _solve(ten.reshape(10, -1), out.reshape(10, -1))
+    return out[:3], out[3:9], out[9]
+
+
+@kernel(error_model="numpy")
+def _solve(sums: F64, out: F64) -> None:
+    for i in range(sums.shape[1]):
+        a, b, c, d, e, f = sums[0, i], sums[1, i], sums[2, i], sums[3, i], sums[4, i], sums[5, i]
+        r0, r1, r2 = sums[6, i], sums[7, i], sums[8, i]
+        i00, i01, i02, i11, i12, i22, det = _adjugate(a, b, c, d, e, f)
+        det = det if det > SINGULAR * a * d * f else np.nan
+        i00, i01, i02 = i00 / det, i01 / det, i02 / det
+        i11, i12, i22 = i11 / det, i12 / det, i22 / det
+        s0 = i00 * r0 + i01 * r1 + i02 * r2
+        s1 = i01 * r0 + i11 * r1 + i12 * r2
+        s2 = i02 * r0 + i12 * r1 + i22 * r2
+        out[0, i], out[1, i], out[2, i] = s0, s1, s2
+        out[3, i], out[4, i], out[5, i] = i00, i01, i02
+        out[6, i], out[7, i], out[8, i] = i11, i12, i22
+        out[9, i] = sums[9, i] - (s0 * r0 + s1 * r1 + s2 * r2)
 
 
 @inner(inline="always")
