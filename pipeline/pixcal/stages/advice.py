@@ -15,6 +15,7 @@ from pixcal.storage.stage import require, without_fringes
 
 Json = Mapping[str, Any]
 
+_BEYOND = 1000.0  # significance (sigma) of which the number says nothing more
 MATTERS = 0.3  # share of SIGMA from which an error that SIGMA does not hold limits a map
 
 
@@ -232,7 +233,9 @@ def _departure(entry: Json) -> str:
 
 
 def _sigmas(value: float | None) -> str:
-    return "–" if value is None else f"{number(float(value), 2)} σ"
+    if value is None:
+        return "–"
+    return "> 1000 σ" if value > _BEYOND else f"{number(float(value), 2)} σ"
 
 
 def size_of(cause: Json) -> str:
