@@ -65,6 +65,8 @@ def places(curve: Mapping[str, Any]) -> list[str]:
     """A name for each value of a curve."""
     label, x = str(curve["x_label"]), list(curve["x"])
     names = _AXES[label].names if label in _AXES else ()
+    if not label and len(x) == 1:
+        return ["all frames"]
     if len(names) >= len(x):
         return list(names[: len(x)])
     if label == "harmonic (cosine, sine)":
@@ -79,8 +81,6 @@ def places(curve: Mapping[str, Any]) -> list[str]:
 def place(curve: Mapping[str, Any], at: int) -> str:
     """Position of a value in a curve, in words."""
     label, name = str(curve["x_label"]), places(curve)[at]
-    if not label and len(curve["x"]) == 1:
-        return "all frames"
     if label in _AXES:
         return _AXES[label].phrase.format(name)
     if label.startswith("cycles a ") and curve["x"][at] > 0:

@@ -16,7 +16,16 @@ from pixcal.report.diagnosis_words import (
     worst,
 )
 from pixcal.report.tables import Table, is_table
-from pixcal.report.text import chance, digits_apart, exact, number, share_by_law, unit, with_error
+from pixcal.report.text import (
+    chance,
+    digits_apart,
+    exact,
+    number,
+    share_by_law,
+    sigmas,
+    unit,
+    with_error,
+)
 
 Facts = Mapping[str, Any]
 
@@ -47,7 +56,7 @@ def about_cause(cause: Facts) -> str:
     if evidence := cause.get("why"):
         sentences.append(f"Evidence: {evidence.rstrip('.')}.")
     if size := cause.get("sigmas"):
-        sentences.append(f"Detection significance in the fitted frames: {number(size, 2)}σ.")
+        sentences.append(f"Detection significance in the fitted frames: {sigmas(size)}.")
     if law := cause.get("law"):
         sentences.append(f"Law: {law}.")
     if (by_law := share_by_law(cause)) is not None:

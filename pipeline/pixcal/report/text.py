@@ -115,6 +115,13 @@ _NOTATION = {
 }
 
 
+def sigmas(value: float | None) -> str:
+    """A significance; beyond a thousand sigma the number says nothing more."""
+    if value is None:
+        return "–"
+    return "> 1000 σ" if value > 1000 else f"{number(float(value), 2)} σ"
+
+
 def digits_apart(one: float, other: float) -> int:
     """Significant digits that resolve the difference of two values, at least three."""
     size, apart = max(abs(one), abs(other)), abs(one - other)

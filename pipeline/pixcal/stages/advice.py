@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from pixcal.effects import known_effects
-from pixcal.report.text import NO_OFFSETS, digits_apart, number, unit, with_error
+from pixcal.report.text import NO_OFFSETS, digits_apart, number, sigmas, unit, with_error
 from pixcal.stages.treatment import CORRECTED, SUFFIX, fitted_shapes, treatment_of_kind
 from pixcal.storage.manifest import MANIFEST, read_json
 from pixcal.storage.stage import require, without_fringes
 
 Json = Mapping[str, Any]
 
-_BEYOND = 1000.0  # significance (sigma) of which the number says nothing more
 MATTERS = 0.3  # share of SIGMA from which an error that SIGMA does not hold limits a map
 
 
@@ -48,7 +47,7 @@ def advice(run_dir: Path) -> Advice:
         return f"{to_do}{_to_distinguish(cause)}"
 
     rows: tuple[tuple[str, ...], ...] = tuple(
-        (c["effect"], size_of(c), _sigmas(c.get("sigmas")), moved_by(c, sigma), action(c))
+        (c["effect"], size_of(c), sigmas(c.get("sigmas")), moved_by(c, sigma), action(c))
         for c in causes
     )
     rows += unexplained(diagnosis)
@@ -219,7 +218,7 @@ def unexplained(diagnosis: Json | None) -> tuple[tuple[str, ...], ...]:
     size = "; ".join(map(_departure, shown))
     frames = "; recommended frames: ".join(["", ", ".join(diagnosis["more_would_tell"])])
     action = f"find the cause on the bench{frames if diagnosis['more_would_tell'] else ''}"
-    return (("unexplained", size, _sigmas(abs(first["z_after"])), "not known", action),)
+    return (("unexplained", size, sigmas(abs(first["z_after"])), "not known", action),)
 
 
 def _departure(entry: Json) -> str:
@@ -230,12 +229,6 @@ def _departure(entry: Json) -> str:
     decimals = digits - 1 - math.floor(math.log10(max(map(abs, ends))))
     measured, simulated = (number(round(v, decimals), digits) for v in ends)
     return f"{entry['title']}, {entry['place']}: {measured} {its_unit} (simulated: {simulated})"
-
-
-def _sigmas(value: float | None) -> str:
-    if value is None:
-        return "–"
-    return "> 1000 σ" if value > _BEYOND else f"{number(float(value), 2)} σ"
 
 
 def size_of(cause: Json) -> str:
