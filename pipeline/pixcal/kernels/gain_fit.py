@@ -119,8 +119,9 @@ def _fit_range(
     if not used.any() or not (dof * shot).sum() > 0:
         return None
     top = float(level.max())
-    bends = not straight and len(level) > _TERMS + _SPARE and top >= _RANGE * level.min()
-    terms, sizes = (_TERMS, _SIZES) if bends else (0, _SIZES[:1])
+    bends = not straight and top >= _RANGE * level.min()
+    terms = min(_TERMS, max(len(level) - _SPARE, 0)) if bends else 0
+    sizes = _SIZES if terms else _SIZES[:1]
     design = np.stack(
         [np.ones_like(level), *(level * (level / top) ** n for n in range(terms + 1))]
     )

@@ -84,8 +84,9 @@ def _shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
                 noise.residual, noise.variance, noise.charge, shared, noise.covariance,
                 noise.of_place, step, REACH,
             )  # fmt: skip
-            normal[np.ix_(at, at)] += noise.kept**2 * more
-            right[at] += noise.kept * more_right
+            # Independent products are as many as degrees of freedom: one of a pair, not two.
+            normal[np.ix_(at, at)] += noise.kept * more
+            right[at] += more_right
     if not normal[-1, -1]:
         return None
     alike = np.eye(n)[:, :-1]
