@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pixcal.effects.gain_error import GainError
+from pixcal.effects.gain_error import GainError, shot_share_of_flats
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import frames_of
@@ -100,3 +100,21 @@ def test_without_light_nothing_is_said(acquired: Callable[..., Evidence]) -> Non
     evidence = acquired()
     bare = replace(evidence, fringes={}, stacks=evidence.of_kind("bias"))
     assert GainError.estimate(bare) is None
+
+
+def test_levels_of_a_lamp_that_was_changed_do_not_bend_the_gain(
+    acquired: Callable[..., Evidence],
+) -> None:
+    whole = replace(acquired(), fringes={})
+    rng, one = np.random.default_rng(8), whole.of_kind("flat")[0]
+    flats = []
+    for n, off in enumerate((3, -4, 2, -3, 4, -2, 3, -4, 2), start=1):
+        light = whole.flat * 4000.0 * n
+        electrons = rng.normal(light, np.sqrt(light + whole.read_noise**2), (2, *light.shape))
+        # A lamp brighter by a quarter at the top, and set anew for each level.
+        time = 0.01 * n * (1 - 0.25 * n / 9 + 0.01 * off)
+        adu = (electrons / whole.gain + whole.bias).astype(np.float32)
+        flats.append(replace(one, adu=adu, exptime_s=time, time_s=one.time_s[:2]))
+    stacks = (*(s for s in whole.stacks if s.kind != "flat"), *flats)
+    share, error = shot_share_of_flats(replace(whole, stacks=stacks)) or (0.0, 0.0)
+    assert abs(share - 1) < 4 * error < 0.2

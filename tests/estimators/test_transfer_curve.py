@@ -11,9 +11,11 @@ from scipy.special import chdtrc
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.effects.quantisation import Quantisation
 from pixcal.estimators.detector.ladder_curve import ladder_curve
+from pixcal.estimators.detector.neighbours import shared_charge
 from pixcal.estimators.detector.transfer_curve import transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.estimators.test_statistics.noise import read_noise
+from pixcal.kernels.boundaries import boundary_shifts
 
 SHAPE = (93, 101)
 READ, GAIN, BIAS, DARK = 1.0, 1.5, 200.3, 0.4
@@ -34,6 +36,7 @@ def evidence(
     response: Response = lambda charge: charge,
     lamp: float | None = None,
     count: int = 8,
+    rows: float = 0.0,
 ) -> Evidence:
     """Flats in pairs, and bias and dark frames whose signal is about the read noise."""
     rng = np.random.default_rng(seed)
@@ -44,6 +47,7 @@ def evidence(
         charge *= 1 + quadratic * charge / 2e4
         charge = response(charge)
         charge += read * rng.standard_normal(charge.shape)
+        charge[:, ::2] += rows * rng.standard_normal((frames, 1, 1))
         adu = np.rint(BIAS + charge / GAIN).astype(np.float32)
         return Stack(
             kind, seconds, np.arange(frames), np.arange(float(frames)), adu, step=int(light)
@@ -141,3 +145,22 @@ def test_masked_pixels_are_part_of_the_read_noise_only_if_they_jump() -> None:
     jumps = 20.0 * ((rng.random((40, 60)) < 0.2).cumsum(axis=0) % 2)
     loud, quiet = with_pixels(jumps)
     assert loud[-1] > 2 * quiet[-1]
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_what_every_second_row_has_in_common_is_no_shot_noise(seed: int) -> None:
+    """Of two frames it may be much or nothing."""
+    curve = transfer_curve(evidence(seed, rows=60.0))
+    assert curve is not None
+    assert np.abs((curve.shares - 1) / curve.errors).max() < 4
+
+
+def test_pairs_of_flats_without_shared_charge_show_none_within_the_error() -> None:
+    shifts = boundary_shifts(0.5)
+    found = [shared_charge(evidence(seed, count=4), shifts) for seed in range(60)]
+    pulls = [[one.size / one.variance**0.5, *(one.axes / np.diag(one.covariance) ** 0.5)]
+             for one in found if one is not None]  # fmt: skip
+    scatter = np.std(pulls, axis=0)
+    # Of 60 a standard deviation is known to a tenth.
+    assert (scatter > 0.78).all()
+    assert (scatter < 1.3).all()

@@ -280,6 +280,23 @@ def test_a_response_that_bends_leaves_the_gain_at_level_zero(size: float, power:
     assert np.sqrt(np.mean(np.square(pulls))) < 1.5
 
 
+@pytest.mark.parametrize("count", [5, 6])
+def test_few_levels_do_not_take_a_bend_for_another_gain(count: int) -> None:
+    rng = np.random.default_rng(21)
+    electrons = np.linspace(2e3, 4e4, count)
+    bent, slope = electrons * (1 - 1.5e-6 * electrons) / GAIN, 1 - 3e-6 * electrons
+    variance = electrons * slope**2 / GAIN**2 + READ_ADU**2
+    dof, pulls = np.full(count, 70_000.0), []
+    for _ in range(20):
+        seen = variance * (1 + rng.standard_normal(count) * np.sqrt(2 / dof))
+        fitted = fit_gain(np.stack([dof, dof * bent, dof * seen], 1), (READ_ADU**2, 0.02), np.inf)
+        assert fitted is not None
+        assert fitted.error < 0.03 * GAIN
+        pulls.append((fitted.gain - GAIN) / fitted.error)
+    assert np.abs(pulls).max() < 4
+    assert np.sqrt(np.mean(np.square(pulls))) < 1.6
+
+
 def test_a_bias_that_wanders_does_not_bias_the_gain() -> None:
     rng = np.random.default_rng(14)
     level, dof = np.linspace(100, 8000, 10), np.full(10, 65_000.0)

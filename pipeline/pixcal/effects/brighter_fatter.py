@@ -25,6 +25,7 @@ _HINTED = 1.5
 _NEEDED = 12.0  # chi-square of three terms beyond which they are needed: one in 130 by chance
 _APART = 9.0  # chi-square from which shifts along x and y are not the same
 _MAX_ALONG_Y = 10.0  # of the shift along y over that along x
+_MAX_SHIFT = 1e-3  # px per electron: a hundredth of a pixel by the few of a tiny well
 _TURNS = 4  # of the inverse: each gains the size of the effect, a few per cent
 
 
@@ -60,7 +61,7 @@ class BrighterFatter(Effect):
         2.0e-7,
         unit="px/e-",
         low=0,
-        high=1e-5,
+        high=_MAX_SHIFT,
         doc="shift of a pixel's boundaries by each electron in it",
     )
     falloff_px: float = quantity(
@@ -141,7 +142,7 @@ class BrighterFatter(Effect):
             errors, together = _errors(alone)
             why += "; no nonlinearity is needed in addition"
         details["a_00"] = size * float(area_changes(falloff)[REACH, REACH])
-        effect = cls(float(np.clip(size, 0, 1e-5)), falloff, along_y)
+        effect = cls(float(np.clip(size, 0, _MAX_SHIFT)), falloff, along_y)
         return Estimate(effect, errors, significance, why, details, together)
 
 

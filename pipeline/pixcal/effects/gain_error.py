@@ -9,6 +9,7 @@ from pixcal.estimators.detector.transfer_curve import (
     CLIP,
     MIN_PIXELS,
     STEPS,
+    TransferCurve,
     shot_share,
     sums_of_stacks,
     transfer_curve,
@@ -26,6 +27,7 @@ from pixcal.simulation.shot import Shot
 _DISAGREE = 2.5
 _MIN_FRAMES = 8
 _CURVED = 3.0
+_STEP = 1e-4  # of the deviations of a response, for derivatives
 
 
 @dataclass(frozen=True)
@@ -120,15 +122,27 @@ def shot_share_of_flats(evidence: Evidence) -> tuple[float, float] | None:
     if pooled is None or curve is None:
         return pooled
     response = ladder_response(evidence, curve.top)
-    if response is None:
-        curved = abs(curve.slope) > _CURVED * curve.slope_error
-        return (curve.share, curve.error) if curved else pooled
-    (quadratic, cubic), _ = response
-    u = curve.levels / curve.top
-    rise = 1 + u * (2 * quadratic + 3 * u * cubic)
-    weight = curve.errors**-2
-    straight = curve.shares * (1 + u * (quadratic + u * cubic)) / rise**2
-    return float(np.average(straight, weights=weight)), float(weight.sum() ** -0.5)
+    straight = None if response is None else _straightened(curve, *response)
+    # Levels of a lamp that was changed in between tell less of the response than the noise does.
+    if straight is not None and straight[1] < curve.error:
+        return straight
+    curved = abs(curve.slope) > _CURVED * curve.slope_error
+    return (curve.share, curve.error) if curved else pooled
+
+
+def _straightened(curve: TransferCurve, sizes: F64, covariance: F64) -> tuple[float, float]:
+    """Share of noise without a response of relative deviations (2,) at the highest level."""
+    u, weight = curve.levels / curve.top, curve.errors**-2
+
+    def share(sizes: F64) -> float:
+        rise = 1 + u * (2 * sizes[0] + 3 * u * sizes[1])
+        straight = curve.shares * (1 + u * (sizes[0] + u * sizes[1])) / rise**2
+        return float(np.average(straight, weights=weight))
+
+    found = share(sizes)
+    slope = np.array([share(sizes + step) - found for step in _STEP * np.eye(2)]) / _STEP
+    slope[sizes == 0] = 0  # a power that few levels do not tell
+    return found, float(np.sqrt(1 / weight.sum() + slope @ covariance @ slope))
 
 
 def _joined(found: dict[str, tuple[float, float]]) -> tuple[float, float]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.kernels.line_means import without_line_means
 from pixcal.kernels.residual_sums import residual_sums
 from pixcal.model.arrays import F64, Mask
 
@@ -148,8 +149,10 @@ def _of_stack(stack: Stack, evidence: Evidence) -> F64 | None:
     change = more[:, good].sum(axis=1) / (pattern**2 / noise).sum()
     brighter = change[:, None, None] * pattern
     ones = np.ones(level.shape)
+    # Few frames are no average of what every second row has in common.
+    residual = without_line_means(frames - level - brighter, good)
     return residual_sums(
-        frames - level - brighter, usual + brighter, ones, evidence.read_noise**2 * ones, good,
+        residual, usual + brighter, ones, evidence.read_noise**2 * ones, good,
         np.ones((len(frames), 1)), (noise / len(frames))[None], np.full(len(STEPS), 1 / pixels),
         STEPS, CLIP,
     )  # fmt: skip
