@@ -76,8 +76,9 @@ def test_dark_signal_of_the_order_of_the_read_noise_leaves_the_photon_transfer_r
     assert abs(curve.slope) < 4 * curve.slope_error
 
 
-def test_a_knee_is_measured_from_level_to_level() -> None:
-    frames = evidence(5, response=knee, lamp=0.0, count=16)
+@pytest.mark.parametrize("seed", range(6, 9))
+def test_a_knee_is_measured_from_level_to_level(seed: int) -> None:
+    frames = evidence(seed, response=knee, lamp=0.0, count=16)
     found = Nonlinearity.estimate(frames)
     assert found is not None
     assert isinstance(found.effect, Nonlinearity)
