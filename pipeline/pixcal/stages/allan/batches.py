@@ -1,7 +1,7 @@
 """The batch maps of a fringe set, as the fit left them, and what their pixels share."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -107,18 +107,22 @@ def _sums_task(
 
 
 def quantiles_of_region(
-    path: Path, region: Region, usable: Sequence[int]
+    path: Path, region: Region, usable: Sequence[int], runtime: Runtime
 ) -> tuple[dict[int, tuple[float, float, float]], int]:
     """Central 68 % and median over a region for each length's number, and how many pixels."""
-    quantiles, pixels = {}, 0
-    for n in usable:
-        parts = partial(_positive, path, (n, n + 1), region)
-        found, count = quantiles_of_parts(parts, (ONE_SIGMA[0], 0.5, ONE_SIGMA[1]))
-        pixels = max(pixels, count)
-        if count:
-            low, median, high = found.tolist()
-            quantiles[n] = (low, median, high)
-    return quantiles, pixels
+    quiet = replace(runtime, quiet=True)
+    found = run_tasks(partial(_quantiles, path, region), usable, quiet, label="quantiles")
+    quantiles = {
+        n: (float(q[0]), float(q[1]), float(q[2]))
+        for n, (q, count) in zip(usable, found, strict=True)
+        if count
+    }
+    return quantiles, max((count for _, count in found), default=0)
+
+
+def _quantiles(path: Path, region: Region, n: int) -> tuple[F64, int]:
+    parts = partial(_positive, path, (n, n + 1), region)
+    return quantiles_of_parts(parts, (ONE_SIGMA[0], 0.5, ONE_SIGMA[1]))
 
 
 def _positive(path: Path, lengths: Range | None, region: Region) -> Iterator[F32]:

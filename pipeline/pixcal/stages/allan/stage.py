@@ -91,10 +91,10 @@ def _measure_set(
     lengths = averaging_lengths(batches.n)
     cy, cx = batches.chunks
     tile_bytes = 4 * cy * cx * (2 * batches.n + len(lengths) * (TILES_HIGH + 2))
-    # Some rows of a map in copies; counts of its values; draws of the curve.
-    rows = 16 * TILES_HIGH * cy * batches.window[1]
-    held = rows + COUNT_BYTES + 40 * MAX_DRAWS * len(lengths)
-    runtime = within_memory(f"the Allan deviation of {name}", tile_bytes, held, runtime)
+    # Some rows of a map in copies, and counts of its values.
+    values = 16 * TILES_HIGH * cy * batches.window[1] + COUNT_BYTES
+    per_task, held = max(tile_bytes, values), values + 40 * MAX_DRAWS * len(lengths)
+    runtime = within_memory(f"the Allan deviation of {name}", per_task, held, runtime)
     if lengths:
         _write_maps(made, folder, name, batches, lengths, runtime)
     whole = (0, batches.window[0], 0, batches.window[1])
@@ -184,7 +184,7 @@ def _measure_region(
     # Gaps may leave no two neighbouring means.
     runs = [np.convolve(present, np.ones(2 * m, int), "valid") for m in lengths]
     usable = [n for n, m in enumerate(lengths) if np.isin(2 * m, runs[n])]
-    quantiles, pixels = quantiles_of_region(folder / "adev", region, usable)
+    quantiles, pixels = quantiles_of_region(folder / "adev", region, usable, runtime)
     if filled < 3 or not quantiles:
         reason = f"{filled} of {batches.n} batches have data: too few for an Allan deviation"
         return _as_json(batches, [], NO_CURVE, [], [reason]) | common | {"pixels": 0}
