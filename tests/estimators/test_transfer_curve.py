@@ -165,3 +165,13 @@ def test_pairs_of_flats_without_shared_charge_show_none_within_the_error() -> No
     # Of 60 a standard deviation is known to a tenth.
     assert (scatter > 0.78).all()
     assert (scatter < 1.3).all()
+
+
+def test_a_simulation_has_the_levels_of_what_it_is_held_against() -> None:
+    data = evidence()
+    top = float(np.quantile(data.ladder[-1].adu, 0.995))
+    brighter = replace(data, saturation_adu=top)
+    assert brighter.saturated == {data.ladder[-1].level}
+    assert len(brighter.ladder) == len(data.ladder) - 1
+    assert len(replace(brighter, full=data.saturated).ladder) == len(data.ladder)
+    assert len(replace(data, full=brighter.saturated).ladder) == len(brighter.ladder)

@@ -105,6 +105,9 @@ class FringeEvidence:
         return halves[0], halves[1]
 
 
+Level = tuple[float, int]
+
+
 @dataclass(frozen=True)
 class Stack:
     """Calibration frames of one kind and exposure time, as the camera wrote them."""
@@ -117,6 +120,11 @@ class Stack:
     # time of the first of its kind after the first frame of the acquisition; nan when unknown
     start_s: float = np.nan
     step: int = 0  # of the lamp, among flats of one exposure time; 0 is the dimmest
+
+    @property
+    def level(self) -> Level:
+        """Exposure time (s, negative when unknown) and step of the lamp."""
+        return (float(np.nan_to_num(self.exptime_s, nan=-1.0)), self.step)
 
 
 @dataclass(frozen=True)
@@ -144,6 +152,8 @@ class Evidence:
     # lags (rows, columns) whose noise that gain counts
     neighbours: tuple[tuple[int, int], ...] = ()
     step_adu: int = 1  # of which all calibration samples are multiples
+    # flats that saturate in the frames that a simulation is held against; None of those themselves
+    full: frozenset[Level] | None = None
     _found: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def once(self, name: str, *given: Any, make: Callable[[], T]) -> T:
@@ -185,11 +195,18 @@ class Evidence:
     @cached_property
     def ladder(self) -> tuple[Stack, ...]:
         """Flats by exposure time, without those that are saturated in part."""
-        return tuple(s for s in self.of_kind("flat") if self._saturated(s) < SATURATED)
+        full = self.saturated if self.full is None else self.full
+        return tuple(s for s in self.of_kind("flat") if s.level not in full)
 
-    def _saturated(self, stack: Stack) -> float:
-        """Share of the samples of good pixels."""
-        return float((stack.adu[:, self.good] >= self.saturation_adu).mean())
+    @cached_property
+    def saturated(self) -> frozenset[Level]:
+        """Flats of which so many samples of good pixels saturate that they tell nothing."""
+        limit = self.saturation_adu
+        return frozenset(
+            s.level
+            for s in self.of_kind("flat")
+            if (s.adu[:, self.good] >= limit).mean() >= SATURATED
+        )
 
     def without_frames(self) -> "Evidence":
         """The maps alone: fringe sets without samples, and no calibration frames."""

@@ -95,13 +95,16 @@ def look_at(
             continue
         finally:
             del raws
+        # A bench whose flats are a little brighter is looked at in the same levels.
+        full = halves[0].saturated | halves[1].saturated
+        halves = [replace(half, full=full) for half in halves]
         if not windows:
             signatures = tuple(learnt(halves[0], halves[1], few))
         bench = nominal_bench(
             acquisition, ingested.tables, halves, (own.learn, own.test), shape, reduction, dtypes
         )
         assert seed is not None
-        windows.append(Window(part, bench, own.learn, own.test, shape, seed))
+        windows.append(Window(part, bench, own.learn, own.test, shape, seed, full))
         if part in parts:
             measured.append(measured_curves(halves[1], signatures))
     tried = tuple(w for w in windows if w.part in parts)

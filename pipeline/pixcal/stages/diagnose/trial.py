@@ -4,7 +4,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,7 +13,7 @@ import numpy as np
 
 from pixcal.engine.bounds import Bound, Exceeded
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence, Level
 from pixcal.estimators.test_statistics import Curve, Key, measure
 from pixcal.estimators.test_statistics.signature import signature_curve, signature_key
 from pixcal.model.config import to_plain
@@ -48,12 +48,13 @@ class Window:
     # to which those of simulations are added: every acquisition is held against other random
     # numbers, so that what chance does to one is not done to all of them
     seed: int = 0
+    full: frozenset[Level] = frozenset()  # flats that saturate
 
     def evidence(self, half: Half, effects: Effects, seed: int, *, number: int = 0) -> Evidence:
         """A half of the frames, taken again with some effects (`NominalBench.simulate`)."""
         own = self.seed + seed
         raw = self.bench.simulate(half, effects, own, window=number)
-        return evidence_of(raw, self.part, self.whole)
+        return replace(evidence_of(raw, self.part, self.whole), full=self.full)
 
 
 @dataclass(frozen=True)
