@@ -325,14 +325,17 @@ def _uneven(
     rest = widths.without(found.bits, found.law).scatter()[0]
     # Bits repeat too: the least of them as a ripple of two or four codes.
     clearer = 2 * rest < variance - share * line.amplitude**2
+    bits: F64 | None = None
     if wrong > SIGNIFICANT and (wrong > sure or clearer):
         start = None
         if far and (other := widths.far_bits(found.law)):
             found, start = other, other.bits
             rest = widths.without(found.bits, found.law).scatter()[0]
         bits, covariance = widths.bits(2 * rest, found.law, start)
-        values, errors, others, _ = _uneven(widths.without(bits, found.law))
         levelled = np.stack([widths.level(one) for one in np.eye(len(bits))], 1)
+    # No bit is off by more than itself: few codes, on a slope, may seem to say so.
+    if bits is not None and (np.abs(levelled @ bits) <= 2.0 ** np.arange(len(bits))).all():
+        values, errors, others, _ = _uneven(widths.without(bits, found.law))
         covariance = levelled @ covariance @ levelled.T
         values |= {"bits": tuple(map(float, levelled @ bits)), **found.law._asdict()}
         spread = np.sqrt(np.diag(covariance))
