@@ -283,6 +283,15 @@ def test_weights_are_found_where_levels_overlap_by_many_codes() -> None:
     assert np.abs(near["bits"] - true).max() > 2
 
 
+def test_no_bit_is_told_to_be_off_by_more_than_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where the codes at hand leave the common factor of the weights open."""
+    widths = widths_of(FITS, (*[0.0] * 7, -0.5, *[0.0] * 4))
+    assert "bits" in _uneven(widths)[0]
+    factor = -43.8 * 2.0 ** np.arange(12)
+    monkeypatch.setattr(CodeWidths, "level", lambda _, bits: bits + factor * (np.ptp(bits) > 0))
+    assert "bits" not in _uneven(widths)[0]
+
+
 def test_bits_that_do_not_turn_over_are_not_told() -> None:
     """Codes below 2048 say nothing of bit 11, whatever its weight."""
     rng = np.random.default_rng(4)
