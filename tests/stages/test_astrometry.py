@@ -12,6 +12,7 @@ import pytest
 from astropy.io import fits
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.signal import correlate
 
 from pixcal.engine.run import Runtime
 from pixcal.kernels.optics import Geometry, phase
@@ -47,7 +48,7 @@ SYNC = Runtime("sync")
 SHAPE = (97, 131)
 K = 2 * np.pi / 9.5
 PAPER = Telescope(7.0, 130.0, 600.0, 0.0, 4.4)
-DECLARED = Declared(4.4, 1.0, 16.0, "", 50_000.0)
+DECLARED = Declared(4.4, read_noise_e=16.0, gain_e_per_adu=1.0, full_well_e=50_000.0)
 PARAXIAL = {"model": "paraxial", "phase_at_origin_rad": 0.0}
 STRAIGHT = {
     "vertical": PARAXIAL | {"kx": K, "ky": 0.0, "axis": [1.0, 0.0]},
@@ -431,7 +432,12 @@ def test_one_fringe_axis(tmp_path: Path, truth: bool) -> None:
     seen = the_star()
     weights = np.einsum("a,abyx,b->yx", axis, seen.weights(np.zeros(2)), axis)
     expected = SIGMA * np.sqrt(np.sum(weights**2))
-    assert found["axes"]["fringe"]["everywhere"]["measured_px"] == pytest.approx(expected, rel=0.1)
+    # Stars at neighbouring places have pixels in common: of a map's rms that is its chance.
+    shared = np.sum(correlate(weights, weights) ** 2) / np.sum(weights**2) ** 2
+    chance = np.sqrt(shared / (2 * SHAPE[0] * SHAPE[1]))
+    assert chance < 0.06
+    everywhere = found["axes"]["fringe"]["everywhere"]["measured_px"]
+    assert everywhere == pytest.approx(expected, rel=4 * chance)
     assert (run / "astrometry" / "astrometry.zarr" / "measured_fringe").is_dir()
 
 

@@ -219,7 +219,7 @@ def strongest_period(difference: F64, sigma: F64) -> Period | None:
     order = int(np.argmax(power)) + 1
     wave = np.exp(-2j * np.pi * order * np.arange(n) / n)
     amplitude = 2 * abs(np.where(good, difference, 0.0) @ wave) / good.sum()
-    chance = -np.expm1(len(power) * np.log1p(-np.exp(-power.max()))) if power.max() > 0 else 1.0
+    chance = -np.expm1(len(power) * np.log(-np.expm1(-power.max()))) if power.max() > 0 else 1.0
     return Period(n / order, float(amplitude), float(chance))
 
 
