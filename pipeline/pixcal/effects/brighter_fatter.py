@@ -25,7 +25,7 @@ _HINTED = 1.5
 _NEEDED = 12.0  # chi-square of three terms beyond which they are needed: one in 130 by chance
 _APART = 9.0  # chi-square from which shifts along x and y are not the same
 _MAX_ALONG_Y = 10.0  # of the shift along y over that along x
-_MAX_SHIFT = 1e-3  # px per electron: a hundredth of a pixel by the few of a tiny well
+_MAX_SHIFT = 1e-3  # px/e-; wells of a few thousand electrons have 1e-5 and more
 _TURNS = 4  # of the inverse: each gains the size of the effect, a few per cent
 
 
