@@ -333,7 +333,7 @@ def _uneven(
             rest = widths.without(found.bits, found.law).scatter()[0]
         bits, covariance = widths.bits(2 * rest, found.law, start)
         levelled = np.stack([widths.level(one) for one in np.eye(len(bits))], 1)
-    # No bit is off by more than itself: few codes, on a slope, may seem to say so.
+    # No bit is off by more than its own weight; a fit to few codes may give that.
     if bits is not None and (np.abs(levelled @ bits) <= 2.0 ** np.arange(len(bits))).all():
         values, errors, others, _ = _uneven(widths.without(bits, found.law))
         covariance = levelled @ covariance @ levelled.T
