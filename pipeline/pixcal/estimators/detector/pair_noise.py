@@ -37,10 +37,14 @@ def shared_by_lines(dark: F64) -> dict[str, Measure]:
     error = total[2] / total[0] / math.sqrt(total[0])
     # A coupling reaches the next pixel, and a row that repeats the row after it; not both.
     lags = [[3 + LAGS.tolist().index(list(lag)) for lag in own] for own in LINES.values()]
-    seen = np.array([float(total[at].min() / total[0]) for at in lags])
-    # The mean of its block was taken off: of what the rows share a part, and of what the columns
-    # share as much from all that are not the same column.
+    covariances = total[lags] / total[0]
+    seen = covariances.min(axis=1)
+    # The mean of its block was taken off: of what the rows share a part, more of it where every
+    # second row repeats it, and of what the columns share as much from all that are not the same
+    # column.
     kept, taken = BLOCK / (BLOCK + 1), (BLOCK - 1) / BLOCK**2
+    repeated = np.maximum(covariances[:, 1] - covariances[:, 0], 0)[::-1]
+    seen += 2 * (BLOCK - 2) / (BLOCK**2 - 1) * repeated
     shared = np.linalg.solve([[kept, -taken], [-taken, kept]], seen)
     return {
         name: (float(own) if own > _SHARED * error else 0.0, error)

@@ -17,8 +17,8 @@ from pixcal.model.arrays import F32, F64, Indices, Mask
 
 FEWEST = 8  # frames that tell pixels apart
 OUTLIER = 4.0  # standard deviations of all pixels beyond which one does not count in their mean
-FINENESS, MOST = 4, 256  # points of the grid: for each error of a logarithm, and at most
-STEPS = 300  # of expectation maximisation
+FINENESS, MOST = 8, 256  # points of the grid: for each error of a logarithm, and at most
+STEPS = 1000  # of expectation maximisation
 BROAD = 0.01  # share of the distribution to begin with that is spread over the whole grid
 
 

@@ -26,6 +26,9 @@ of_noise_power = partial(statistic, "noise", power=True)
 
 MIN_DARKS = 5
 CUT_OFF = 1e-3  # share of samples at code zero from which noise is cut off
+# Steps of the converter that the read noise has to span for a pixel's variance to be its own: below
+# it depends on where the pixel's level lies between two codes.
+COARSE = 0.65
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
 STILL = 1e-12  # ADU²: variance of pixels that do not change, whose square float32 still holds
 
@@ -184,7 +187,7 @@ def read_noise(evidence: Evidence) -> Curve | None:
     Of masked pixels only those count that jump between levels: white noise is why they are masked.
     """
     stacks = [s for s in evidence.of_kind("bias") if len(s.adu) >= 8]
-    if not stacks or not evidence.dithered:
+    if not stacks or evidence.amplifier_noise < COARSE * evidence.gain * evidence.step_adu:
         return None
     # Where noise is cut off at code zero, its size tells the level of a pixel.
     if (stacks[0].adu[:, evidence.good] == 0).mean() > CUT_OFF:

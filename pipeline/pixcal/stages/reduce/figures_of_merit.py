@@ -57,7 +57,7 @@ def characterise(
     note = "" if facts["gain_e_per_adu"]["measured"] is not None else "declared, not measured"
     found: Json = {"conversion_gain": _figure("conversion gain", "e-/ADU", gain, note)}
     noise = _read_noise(found, summary, gain[0], source.quantum)
-    _row_noise(found, dark, gain[0])
+    _line_noise(found, dark, gain[0], job.shape)
     if top is not None:
         _full_well(found, gain, top, reached, noise)
     if facts["linearity"] is not None:
@@ -117,10 +117,13 @@ def _read_noise(found: Json, summary: Summary, gain: float, step: float) -> Meas
     return whole
 
 
-def _row_noise(found: Json, dark: F64, gain: float) -> None:
+def _line_noise(found: Json, dark: F64, gain: float, shape: tuple[int, int]) -> None:
     """Noise in time that the pixels of a row, or of a column, have in common."""
+    lengths = {"row": shape[1], "column": shape[0]}
     for name, (shared, error) in shared_by_lines(dark).items():
         if shared:
+            # Each line of each pair of frames is one draw of it.
+            error = math.hypot(error, shared * math.sqrt(2 * lengths[name] / dark[:, 0].sum()))
             noise = math.sqrt(shared)
             title, note = f"noise of whole {name}s", "part of the read noise"
             found[f"{name}_noise"] = _figure(
