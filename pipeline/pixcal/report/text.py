@@ -131,9 +131,14 @@ def digits_apart(one: float, other: float) -> int:
 
 
 def not_tested(diagnosis: Mapping[str, Any]) -> str:
-    """Effects that the frames cannot show, and the frames that would; empty without any."""
+    """Effects that the frames cannot show, with the frames that would, and statistics left out.
+
+    Empty without any.
+    """
     groups = diagnosis.get("not_tested", {})
     parts = [f"{', '.join(names)} (needs {frames})" for frames, names in groups.items()]
+    if statistics := diagnosis.get("not_compared"):
+        parts.append(f"{', '.join(statistics)} (the simulations do not show it alike)")
     return f"not tested: {'; '.join(parts)}" if parts else ""
 
 

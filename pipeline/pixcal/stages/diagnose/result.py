@@ -76,6 +76,14 @@ def by_domain(
     return found
 
 
+def not_compared(measured: Mapping[Key, Curve], data: Mapping[Key, F64]) -> list[str]:
+    """Titles of statistics that were measured and that the simulations lack, or have otherwise."""
+    return [
+        statistic_named(name).title + ("" if of == DETECTOR else f" of {of}")
+        for name, of in sorted(set(measured) - set(data))
+    ]
+
+
 @dataclass(frozen=True)
 class _Description:
     """Arguments of `describe`, and what follows from them."""
@@ -119,6 +127,7 @@ class _Description:
             },
             "candidates": [self._candidate(c) for c in found.candidates.values()],
             "not_tested": self._not_tested(),
+            "not_compared": not_compared(self.measured, self.data),
             "more_would_tell": (
                 recommend_frames(self.facts.missing_frames)
                 if verdict in ("unexplained", "partly explained")
