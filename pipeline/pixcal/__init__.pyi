@@ -11,10 +11,10 @@ from pixcal.api.arrays import calibrate as calibrate
 from pixcal.api.centroids import correct_centroids as correct_centroids
 from pixcal.api.centroids import distortion_wcs as distortion_wcs
 from pixcal.api.opened import FringeSet as FringeSet
+from pixcal.api.opened import OffsetMap as OffsetMap
+from pixcal.api.opened import Picture as Picture
 from pixcal.api.opened import Run as Run
 from pixcal.api.opened import open_run as open_run
-from pixcal.api.maps import OffsetMap as OffsetMap
-from pixcal.api.maps import Picture as Picture
 from pixcal.api.sample import sample_acquisition as sample_acquisition
 from pixcal.engine.run import Runtime as Runtime
 from pixcal.model.errors import InputError as InputError

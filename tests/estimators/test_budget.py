@@ -23,7 +23,7 @@ from pixcal.stages.budget.expected import (
     planned_split,
     sample_variance,
 )
-from pixcal.stages.budget.levers import levers
+from pixcal.stages.budget.stage import levers
 
 ROOT = Path(__file__).parents[2]
 

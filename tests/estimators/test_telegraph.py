@@ -9,8 +9,7 @@ from scipy.special import logsumexp
 
 from pixcal.estimators.detector.telegraph.classes import Mixture
 from pixcal.estimators.detector.telegraph.dwell import LitSeries, find_stays
-from pixcal.estimators.detector.telegraph.find import find_telegraph
-from pixcal.estimators.detector.telegraph.levels import find_upper, own_levels
+from pixcal.estimators.detector.telegraph.find import find_telegraph, find_upper, own_levels
 from pixcal.estimators.detector.telegraph.moments import QUIET, Series, moments_of, thinned
 from pixcal.model.arrays import F64, Indices
 

@@ -21,8 +21,7 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages import correct, fit
 from pixcal.stages.correct.gain import repeating, worsened
-from pixcal.stages.correct.restored_set import RestoredSet
-from pixcal.stages.correct.sweep_to_correct import corrected
+from pixcal.stages.correct.sweep_to_correct import RestoredSet, corrected
 from pixcal.stages.correct.uncertainty import moved
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.treatment import treatments

@@ -11,7 +11,7 @@ from pixcal.estimators.detector.traps import FittedLoss
 from pixcal.simulation.effect import FringeMaps
 from pixcal.stages.advice import limit, moved_by, size_of, unexplained
 from pixcal.stages.diagnose.fitted_set import FittedSet
-from pixcal.stages.diagnose.on_map import on_map
+from pixcal.stages.diagnose.stage import on_map
 
 K = (0.03, 2 * np.pi / 9)
 

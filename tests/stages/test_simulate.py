@@ -23,7 +23,7 @@ from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import recordings
 from pixcal.stages.simulate import Config, run
 from pixcal.stages.simulate import stage as simulate
-from pixcal.stages.simulate import truth as simulated_truth
+from pixcal.stages.simulate import stage as simulated_truth
 from pixcal.storage.artefact import artefact_key
 from pixcal.storage.manifest import read_manifest
 

@@ -8,28 +8,33 @@ the shapes of the fringes and combines the sets.
 import hashlib
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pixcal import __version__
+from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.errors import InputError
 from pixcal.model.options import Fit as Config
 from pixcal.model.options import Sweep
+from pixcal.simulation.effect import Effect
 from pixcal.stages import fit
 from pixcal.stages.correct.correct_maps import correct_sweep
 from pixcal.stages.correct.gain import Maps, measure_gain, worsened
-from pixcal.stages.correct.remeasure import remeasured
-from pixcal.stages.correct.restored_set import RestoredSet
 from pixcal.stages.correct.surroundings import sides_of
-from pixcal.stages.correct.sweep_to_correct import Swept
+from pixcal.stages.correct.sweep_to_correct import RestoredSet, Swept
 from pixcal.stages.correct.uncertainty import parameter_errors
+from pixcal.stages.diagnose.look import ESTIMATE_BYTES, EVIDENCE_BYTES
+from pixcal.stages.diagnose.windows import chosen_windows
+from pixcal.stages.evidence import Part, load_evidence
 from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
 from pixcal.stages.fit.maps import Totals, write_maps
 from pixcal.stages.fit.products import header_of, publish_maps, published
@@ -37,7 +42,7 @@ from pixcal.stages.fit.sweep import load_run, sweep_set
 from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.stages.treatment import HYPERBOLIC, SUFFIX, Treatments, treatments
+from pixcal.stages.treatment import HYPERBOLIC, SUFFIX, Treatment, Treatments, treatments
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import create_group
 from pixcal.storage.formats import STAGES
@@ -47,6 +52,7 @@ from pixcal.storage.products import Card
 from pixcal.storage.stage import make, require
 
 Json = dict[str, Any]
+SAMPLES = 5_000_000  # of each fringe set that are in memory at a time
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -233,3 +239,60 @@ def _publish(run_dir: Path) -> None:
             history.append(f"{effect['effect']}: {effect['treatment']}: {parameters}")
     publish_maps(run_dir, folder / "corrected.zarr", result["outputs"], cards, history, SUFFIX)
     write_json(run_dir / "products" / "correction.json", result)
+
+
+# Effects measured again on all frames: the diagnosis fits half of them
+
+
+def remeasured(run_dir: Path, plan: Treatments, runtime: Runtime) -> Treatments:
+    """The same treatments, with effects on maps remeasured on all frames where possible."""
+    # Where the memory does not suffice, effects stay as the diagnosis found them.
+    chosen = [
+        t
+        for t in plan.every
+        if t.how == "corrected on maps"
+        and t.origin == "diagnosis"
+        and type(t.effect).measured_again is not Effect.measured_again
+    ]
+    if not chosen:
+        return plan
+    try:
+        refined = {t.effect.name: _again(t, _parts(run_dir, runtime)) for t in chosen}
+    except (InputError, FileNotFoundError, np.linalg.LinAlgError):
+        # Frames are missing, or too large: what the diagnosis found is good, only less precise.
+        return plan
+    return Treatments(tuple(refined.get(t.effect.name, t) for t in plan.every))
+
+
+def _again(treatment: Treatment, parts: Iterator[Evidence]) -> Treatment:
+    estimate = treatment.effect.measured_again(parts)
+    if estimate is None:
+        return treatment
+    covariance = estimate.details.get("covariance")
+    return replace(
+        treatment,
+        effect=estimate.effect,
+        errors=estimate.errors,
+        why=f"{treatment.why}; {estimate.why}",
+        covariance=None if covariance is None else np.asarray(covariance, float),
+    )
+
+
+def _parts(run_dir: Path, runtime: Runtime) -> Iterator[Evidence]:
+    """Frames in turn, of the window that effects are fitted on."""
+    ingested = Ingested(run_dir / "ingest")
+    part: Part = chosen_windows(ingested.shape)[0]
+    pixels = (part[0][1] - part[0][0]) * (part[1][1] - part[1][0])
+    counts = [len(t["time_s"]) for name, t in ingested.tables.items() if "/" in name]
+    if not counts:
+        return
+    frames = max(1, SAMPLES // pixels)
+    number = min(4, -(-min(counts) // frames))
+    samples = min(frames, min(counts)) * pixels
+    held = EVIDENCE_BYTES * samples * len(counts)
+    make_plan("remeasuring effects", ESTIMATE_BYTES * samples, held, runtime)
+    ends = np.linspace(0, min(min(counts), number * frames), number + 1).astype(int)
+    for first, last in pairwise(ends.tolist()):
+        evidence = load_evidence(run_dir, part, slice(first, last))
+        yield evidence if first == 0 else replace(evidence, stacks=())
+        del evidence  # one at a time
