@@ -80,10 +80,7 @@ def _told(step: Callable[..., Any], file: Path, gives_back: bool) -> Callable[..
 
 
 def _asked(name: str, method: Any, check: Callable[[Any, type[Effect]], None], file: Path) -> Any:
-    """A class method of the evidence, which names the file where it fails or gives another thing.
-
-    That ends a diagnosis (no InputError): of frames that cannot tell, it gives None instead.
-    """
+    """A class method of the evidence, whose failure or wrong result names the file."""
     if not isinstance(method, classmethod):
         raise InputError(f"{name} is not a class method: put @classmethod above it")
 

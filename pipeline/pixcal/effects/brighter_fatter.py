@@ -160,11 +160,7 @@ def _by_axis(noise: SharedCharge) -> tuple[float, float, float, float]:
 
 
 def _explaining(evidence: Evidence, otherwise_px: float) -> Boundaries | None:
-    """Boundaries that leave nothing of the harmonics to a bent response.
-
-    A response that is free beside them makes them uncertain, and one uncertain beside the other
-    either seems to be needed. What boundaries of another shape would explain as well asks for none.
-    """
+    """Boundaries that explain all harmonics; None where a bent response is needed too."""
     found = boundaries_alone(evidence, otherwise_px)
     if found.against > _NEEDED:
         found = boundaries_alone(evidence, otherwise_px, by_axis=True)

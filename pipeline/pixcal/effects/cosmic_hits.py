@@ -175,10 +175,7 @@ class CosmicHits(Effect):
 
 
 def _rates(counts: F64, chances: F64, exposures: F64) -> tuple[list[float], list[float]]:
-    """Hits per exposure of both kinds, and errors; the second is zero unless it is significant.
-
-    ``counts, chances``: (n,) hits, and how many of them are none; ``exposures``: (1 or 2, n).
-    """
+    """Hits (n,) per exposure of both kinds, and errors; the second is zero unless significant."""
     found: list[tuple[F64, F64]] = []
     for own in (exposures[:1], exposures):
         # Maximum of the likelihood of Poisson counts, by expectation and maximisation.
@@ -280,10 +277,7 @@ def _counts(searches: Sequence[_Search]) -> tuple[F64, F64]:
 
 
 def _hits(outliers: Mask, joined: Mask, residual: F32) -> _Hits:
-    """Each group of outliers that lie together in a frame.
-
-    Fainter samples join what noise tears apart of a long track.
-    """
+    """Groups of outliers that lie together in a frame, with fainter samples that join them."""
     found = []
     for frame in np.flatnonzero(outliers.any(axis=(1, 2))):
         bright = joined[frame] | outliers[frame]
@@ -344,10 +338,7 @@ class _Drawn:
         self._noise = self._rng.standard_normal(self._charges.shape)
 
     def noise_at(self, sigma: F32) -> F64:
-        """Noise (track, pixel) where tracks at random places of frames (t, y, x) lie; e-.
-
-        Infinite in samples that do not count.
-        """
+        """Noise (track, pixel), e-, at random places; infinite where samples do not count."""
         t, y, x = (self._rng.integers(0, n, (_DRAWN, 1)) for n in sigma.shape)
         dy, dx = np.divmod(self._pixels, _TILE)
         # A track that leaves the window comes in on the other side, as others do from beyond it.
@@ -374,11 +365,7 @@ class _Drawn:
 def _laws(
     start: CosmicHits, searches: list[_Search], pitch_um: float
 ) -> list[tuple[CosmicHits, float]]:
-    """Length, width and spread of charge of tracks whose hits are like those found.
-
-    The likeliest first; then others, and by how many errors they are less likely, up to
-    `_AS_LIKELY`. No law is exact: the misfit of the likeliest sets the size of an error.
-    """
+    """Length, width and spread of charge of the tracks: the likeliest, then those nearly as likely."""
     if sum(len(s.hits.peaks) for s in searches) < _SHAPED:
         return [(start, 0.0)]
     tried: dict[CosmicHits, float] = {}
@@ -411,10 +398,7 @@ def _laws(
 def _fitted(
     law: CosmicHits, searches: list[_Search], pitch_um: float
 ) -> tuple[CosmicHits, dict[str, float], float] | None:
-    """A law with the rates and the charge that fit best, their errors, and cm² s looked at.
-
-    None if it says that nothing is seen.
-    """
+    """A law with its best rates and charge, errors, and cm² s searched; None if nothing is seen."""
     drawn = _Drawn(law, pitch_um)
     places = [drawn.noise_at(s.sigma) for s in searches]
     scale, scale_error = _scale(searches, places, drawn)

@@ -272,10 +272,7 @@ def _templates(shape: tuple[int, int]) -> tuple[F64, F64]:
 
 
 def _of_short_waves(shape: tuple[int, int], scale: float) -> F64:
-    """Mean power (y, x) of all directions: transform of the Bessel function that products follow.
-
-    A parabola takes next to nothing of them.
-    """
+    """Mean power (y, x) of all directions: the transform of a Bessel function."""
     ny, nx = shape
     dy, dx = np.arange(1 - ny, ny)[:, None], np.arange(1 - nx, nx)
     products = (1 - abs(dy) / ny) * (1 - abs(dx) / nx) * j0(np.hypot(dy, dx) / scale)

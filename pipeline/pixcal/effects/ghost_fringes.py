@@ -289,11 +289,7 @@ def _law(waves: Sequence[WaveFit]) -> tuple[str, TiedWaves, float]:
 
 
 def _of_a_beam(waves: Sequence[WaveFit], law: str, left: float, evidence: Evidence) -> bool:
-    """Whether the waves are a reflection's, by their law and the share of them that it leaves.
-
-    Beams interfere with each other: fringes alone, or a static pattern that is not theirs, is none.
-    What multiplies both alike, in all sets, is the flat's.
-    """
+    """Whether waves are a reflection's, by their law and the share of them that it leaves."""
     moving = law == BOTH or any(SINGLE[law][1:])
     return left < UNTIED and not (moving and _of_the_flat(waves, evidence))
 
@@ -335,10 +331,7 @@ def _tied_of_both(w: WaveFit) -> Tied:
 
 
 def _of_the_flat(waves: Sequence[WaveFit], evidence: Evidence) -> bool:
-    """Whether the waves of all sets are one pattern of the light, as an error of the flats makes.
-
-    It leaves the phase.
-    """
+    """Whether the waves of all sets are one pattern of the light, as an error of flats makes."""
     first = waves[0]
     same = [w for w in waves if w.q == first.q]
 

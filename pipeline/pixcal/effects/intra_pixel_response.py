@@ -157,11 +157,7 @@ def _bias_variance(evidence: Evidence) -> float:
 def _scatter(
     sets: list[FringeEvidence], width: float, bias_variance: float
 ) -> tuple[float, float, bool]:
-    """Variance of the width from pixel to pixel and its error, px².
-
-    And whether most scatter of the visibility is the same for fringes of other directions, which
-    widths along x and y do not bring about.
-    """
+    """Variance of the width, px², its error, and whether other directions share most of it."""
     normal, right = np.zeros((2, 2)), np.zeros(2)
     maps, scatters = [], []
     for found in sets:
@@ -206,10 +202,7 @@ def _light(found: FringeEvidence) -> float:
 
 
 def _visibility(found: FringeEvidence, half: int) -> F64:
-    """Logarithm of the visibility (y, x) of half the frames, without fringes; NaN of outliers.
-
-    A hot pixel without a dark has so little of it that the mean of its row would show it.
-    """
+    """Logarithm of the visibility (y, x) of half the frames, without fringes; NaN of outliers."""
     good = found.good
     theta = half_theta(found, half, good)
     rest = np.full(good.shape, np.nan)

@@ -242,10 +242,7 @@ def _couplings_of(kernel: F64) -> list[Coupling]:
 
 
 def _worth_it(couplings: Sequence[Coupling]) -> tuple[Coupling, ...]:
-    """The couplings, with zero for those too small to matter: they cost nothing then.
-
-    They stay in the list, for their errors hang together with the others'.
-    """
+    """The couplings, too small ones at zero: they stay, since their errors go with the others'."""
     return tuple(c if abs(c.share) > MIN_SHARE else c.scaled(0.0) for c in couplings)
 
 

@@ -319,10 +319,7 @@ def _shares(lag: Lag, detector: SimulatedDetector, rows: Rows) -> F32:
 
 
 def _by_level(evidence: Evidence, lag: Lag) -> tuple[Lag, dict[str, float]]:
-    """The lag with what it does at each level, and errors of that, where it is not the same at all.
-
-    Either a share of each band of the level stays, whatever stayed before, or traps fill up.
-    """
+    """The lag by level, and its errors: a share of each band, or traps that fill up."""
 
     def banded(shares: F64, charge: F32) -> F32:
         return _banded(lag, shares).lost(charge)[0]

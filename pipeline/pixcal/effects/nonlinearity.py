@@ -265,10 +265,7 @@ def _size(charge: float, change: float, error: float) -> dict[str, object]:
 def _bends(
     evidence: Evidence, response: Callable[[F32], F32], chi2_of_polynomial: float
 ) -> tuple[tuple[tuple[Bend, ...], list[float]] | None, Agreement]:
-    """Points of the response beside a polynomial, and their errors; None where it has none.
-
-    Then how far the sets agree on the response.
-    """
+    """Points of the response beside a polynomial, errors, and the sets' agreement; None without."""
     ends = [np.nanquantile(f.electrons[::7], [TAIL, 1 - TAIL]) for f in evidence.fringes.values()]
     low, top = max(min(float(a) for a, _ in ends), 0.0), max(float(b) for _, b in ends)
     seen = low + KNOTS * (top - low)
@@ -283,10 +280,7 @@ def _bends(
 
 
 def _straight_on(curve: Nonlinearity, evidence: Evidence) -> list[Bend]:
-    """Points beyond the fringes, up to the brightest flats, where the response goes straight on.
-
-    The polynomial beside the points is a fit to darker samples, and may bend anywhere.
-    """
+    """Points up to the brightest flats, where the response goes straight on beyond the fringes."""
     flats = [(s.adu[0] - evidence.bias) * evidence.gain for s in evidence.of_kind("flat")]
     top = curve.bends[-1].level_e
     brightest = max((float(np.quantile(f, 1 - TAIL)) for f in flats), default=0.0)

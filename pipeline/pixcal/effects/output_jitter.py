@@ -204,10 +204,7 @@ def _edges(rests: Sequence[F32], good: Mask, axis: int) -> tuple[list[tuple[int,
 
 
 def _steps(lines: Sequence[F64], width: int, dof: int) -> F64:
-    """Sum over frames of the squared step at each place over the usual one: chi-square by chance.
-
-    Between the means of ``width`` lines on either side; zero where there are fewer.
-    """
+    """Sum over frames of the squared step at each place, between means of lines: chi-square."""
     size = lines[0].shape[1]
     places = np.arange(width, size - width + 1)
     square = np.zeros(len(places))
@@ -253,10 +250,7 @@ def _placed(lines: Sequence[F64], about: int) -> int:
 def _sizes(
     rests: Sequence[F32], times: Sequence[F64], good: Mask, numbers: Indices
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """White noise and walk of the levels of outputs beyond the noise of pixels, rows and columns.
-
-    By the likelihood of the modes in which both are independent; with their errors.
-    """
+    """White noise and walk of the outputs' levels beyond pixels, rows and columns; with errors."""
     masks = [good & (numbers == n) for n in range(int(numbers.max()) + 1)]
     masks = [mask for mask in masks if np.count_nonzero(mask) >= NARROWEST**2]
     if len(masks) < 2:

@@ -246,10 +246,7 @@ class _ByLaw:
 
 
 def _by_law(evidence: Evidence, far: bool = False) -> _ByLaw | None:
-    """What the counts of the codes say; None where samples are no codes, or too few.
-
-    ``far``: as `_uneven` says.
-    """
+    """What the counts of the codes say; None where samples are no codes, or too few."""
     lit = [f.adu for f in evidence.fringes.values()]
     counts = histogram([*(s.adu for s in evidence.stacks), *lit], evidence.good)
     if counts is None or not counts.any():
@@ -289,10 +286,7 @@ def _thresholds(effect: Quantisation, specimen: int, codes: int) -> F32:
 
 @lru_cache(maxsize=4)
 def _reached(effect: Quantisation, specimen: int, codes: int) -> tuple[F64, Indices, Indices]:
-    """From where on a sample has a code or one that begins higher, and the codes in this order.
-
-    With the place in it of the lowest code of each of `_CELLS` to a step.
-    """
+    """Lowest sample of each code reached, these codes in order, and the first of each cell."""
     begins = effect.thresholds(specimen, codes)
     order = code_cells(np.array(effect.bits), effect.law, codes)[1]
     begins = np.minimum.accumulate(begins[::-1])[::-1]
@@ -308,11 +302,7 @@ def _has_wrong_bits(widths: CodeWidths | None) -> bool:
 def _uneven(
     widths: CodeWidths, far: bool = False
 ) -> tuple[dict[str, Any], dict[str, float], list[float], tuple[dict[str, float], ...]]:
-    """Wrong bits, scatter and ripple of the widths, their errors, and how sure they are.
-
-    With independent steps of the bits, of one sigma each. ``far``: whether levels may overlap by
-    many codes; to tell that bits are wrong nobody need know by how much.
-    """
+    """Wrong bits, scatter and ripple, their errors, significance; ``far``: levels may overlap."""
     variance, error, scatter_sigmas = widths.scatter()
     line = widths.ripple(variance)
     sure = sigmas(line.log_chance)

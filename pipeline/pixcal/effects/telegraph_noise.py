@@ -197,10 +197,7 @@ def _pixels(
     upper: float,
     measured: tuple[MeasuredPixels, ...],
 ) -> tuple[Indices, Indices, F32, F32, F32]:
-    """Pixels of a block that have it.
-
-    Their rows, columns, amplitudes over the mean, places among stays, shares of the time above.
-    """
+    """Pixels of a block that jump: rows, columns, amplitudes, stays, shares of time above."""
     rows = block * BLOCK_ROWS, min((block + 1) * BLOCK_ROWS, detector.shape[0])
 
     def draw(rng: np.random.Generator) -> F64:
@@ -226,11 +223,7 @@ def _pixels(
 
 @lru_cache(maxsize=4)
 def _states(seed: int, frames: int, kept: bytes, upper: bytes) -> U8:
-    """Whether each pixel is in its upper level, in bits: (frame, pixel / 8).
-
-    ``kept``: of each pixel, float64, the correlation from frame to frame. ``upper``: of each,
-    float32, the share of the time in the upper level.
-    """
+    """Whether each pixel is in its upper level, in bits: (frame, pixel / 8)."""
     rng, keep, share = np.random.default_rng(seed), np.frombuffer(kept), np.frombuffer(upper, "f4")
     pixels = len(keep)
     up = np.zeros(pixels, bool)

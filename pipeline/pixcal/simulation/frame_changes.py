@@ -187,10 +187,7 @@ class FrameChanges:
 
 
 def _rounded(bench: Bench) -> Bench:
-    """A bench that all simulations of an acquisition share: states do not ask for its electronics.
-
-    Of what is measured, the visibility bounds the contrast.
-    """
+    """A bench that all simulations of an acquisition share; states need no electronics."""
     electronics: Any = {"gain_e_per_adu": 1.0, "read_noise_e": 0.0, "bias_adu": 0.0}
     sets = tuple(replace(s, peak_e=1.0) for s in bench.frames.fringes)
     return replace(

@@ -250,10 +250,7 @@ def _slopes(
     here: Sequence[F64],
     lengths: dict[str, float],
 ) -> list[F64]:
-    """Derivatives (n, 3, y, x) of the maps of each set by some numbers.
-
-    By steps of lengths that are kept for the next time.
-    """
+    """Derivatives (n, 3, y, x) of the maps of each set by numbers, in steps kept for next time."""
     found = [np.zeros((len(values), *at.shape)) for at in here]
     for n, (key, value) in enumerate(values.items()):
         step, of = lengths.get(key, STEP * max(abs(value), 1.0)), set_of(model, key)
@@ -331,10 +328,7 @@ def _shows(largest: F64, kind: int) -> bool:
 def _gain(
     lit: Sequence[_Lit], changes: Sequence[F64], degree: int
 ) -> tuple[float, dict[str, float]]:
-    """Chi-square by which changes are there, and as what share of them each kind of map has them.
-
-    Of the kinds that must show them.
-    """
+    """Chi-square by which changes are there, and their share in each kind of map."""
     data, signals = [one.data for one in lit], [change[None] for change in changes]
     gain, agreed = 0.0, {}
     for kind, name in enumerate(KINDS):

@@ -193,10 +193,7 @@ def settle_flush(run: Path) -> None:
 
 
 def _whole(folder: Path) -> bool:
-    """Whether the chunks that an interrupted build has left are as it wrote them.
-
-    Those at a URL are not fetched for that: whoever reads them will tell.
-    """
+    """Whether the local chunks that an interrupted build has left are as it wrote them."""
     from pixcal.storage.cube import chunks_whole  # here: the command line does without zarr
 
     places = {folder, cubes_of(folder)}

@@ -181,10 +181,7 @@ def _check_rest(stream: _Stream, end: int) -> None:
 
 
 def _first_image(source: SourceFile, stream: _Stream) -> tuple[Header, Header, int]:
-    """Header of the first image with data, primary header, and number of the former.
-
-    The stream is left where the image's data begin.
-    """
+    """Header of the first image with data, where the stream is left; primary header; its number."""
     primary = header = _read_header(stream, b"SIMPLE")
     if primary is None:
         raise ValueError("not a FITS file (nor TIFF or PNG); remove it, or narrow its glob")

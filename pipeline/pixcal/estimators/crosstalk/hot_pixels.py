@@ -219,11 +219,7 @@ def _unsaturated(evidence: Evidence) -> Mask:
 
 
 def _patches(rest: F64, warm: F64, y: Indices, x: Indices, overlap: float) -> tuple[F64, Mask]:
-    """Surroundings (h, row, column) of hot pixels within `REACH`, and where they can be trusted.
-
-    That is where no other hot pixel is near that has ``overlap`` times the charge. Flags do not
-    matter: what a hot pixel gives makes its neighbours hot as well.
-    """
+    """Surroundings (h, row, column) of hot pixels, and where no other hot pixel spoils them."""
     size = 2 * REACH
     near = _surroundings(rest, y, x, REACH)
     others = np.nan_to_num(_surroundings(warm, y, x, size))
@@ -243,10 +239,7 @@ def _surroundings(values: F64, y: Indices, x: Indices, size: int) -> F64:
 
 
 def _agreed(v: F64, s: F64, q: F64) -> F64:
-    """Sums (6, ...) of `ClassShares`, of values (h, ...) in rising order and charges.
-
-    Of less weight where they disagree by more than chance; errors are infinite of no value.
-    """
+    """Sums (6, ...) of `ClassShares`, of values (h, ...) in rising order and charges."""
     w = s**-2.0
     used, half = w > 0, w.sum(axis=0) / 2
     middle = np.take_along_axis(v, np.argmax(np.cumsum(w, axis=0) >= half, axis=0)[None], 0)

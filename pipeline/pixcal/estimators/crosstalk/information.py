@@ -238,10 +238,7 @@ def _per_unit(couplings: Sequence[Coupling]) -> float:
 
 
 def _third_pixels(couplings: Sequence[Coupling], shape: Place, first: Place) -> dict[Place, F64]:
-    """By step: at the first pixel of a link, product of what both partners get of a third.
-
-    Of one period of the kernel, repeated over the piece: third pixels beyond it count as well.
-    """
+    """By step, at a link's first pixel: product of what both partners get of a third."""
     period = lcm(*(c.every_rows for c in couplings)), lcm(*(c.every_columns for c in couplings))
     given: dict[Place, F64] = {}
     for c in couplings:

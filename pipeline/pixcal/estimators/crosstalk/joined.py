@@ -94,10 +94,7 @@ def _shape(evidence: Evidence) -> Place:
 def _level(
     frames: CouplingFrames, dense: Dense, found: Choice, per_ke: float
 ) -> tuple[Dense, float, float]:
-    """By how much (1/ke-) shares fall with the signal, zero if they may not, and its error.
-
-    First the kernel with that; ``dense`` is the one with ``per_ke``, from which it starts.
-    """
+    """By how much (1/ke-) shares fall with the signal, zero if they may not, and its error."""
     # Shares that rise may be brighter-fatter; those that fall cannot.
     error = np.inf
     for _ in range(LEVEL_STEPS):

@@ -113,10 +113,7 @@ def _of_fringes(found: FringeEvidence, known: Sequence[Coupling], kept: F32) -> 
 
 
 def _without_response(rest: F32, charge: F32) -> F32:
-    """Residuals (t, y, x) less their mean at each level: what a curved response does to all pixels.
-
-    A bend makes more harmonics than pixels are free to have here. Changed in place.
-    """
+    """Residuals (t, y, x) less their mean at each level: a curved response. In place."""
     # Frame by frame: the level indices of all frames would take more memory than the frames.
     step = float(charge.max()) / LEVELS or 1.0
     count, total = np.zeros((2, LEVELS))

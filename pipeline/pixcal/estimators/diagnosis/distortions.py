@@ -235,10 +235,7 @@ def _agreement(fits: Sequence["_SetFit"], rights: Sequence[F64]) -> Agreement:
 
 
 class _SetFit:
-    """One set: its residuals, and what its fit took up of the distortion.
-
-    ``normal`` is the normal matrix of the sizes where there is no distortion.
-    """
+    """One set: its residuals, and what its fit took up of the distortion."""
 
     def __init__(
         self, fringes: FringeEvidence, distortion: Distortion, count: int, margin: int

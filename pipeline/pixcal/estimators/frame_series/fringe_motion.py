@@ -100,10 +100,7 @@ def vector_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
 
 
 def _around(modes: F64, low: float, high: float, beside: int = 0) -> tuple[F64, F64]:
-    """Mean power (k, 2) of the modes in a range of factors on each one's frequency; and how many.
-
-    And of some more on either side.
-    """
+    """Mean power (k, 2) of modes in a range of factors on their frequency; and how many."""
     order = np.arange(1, len(modes) + 1)
     first = np.maximum(np.floor(order * low).astype(int) - beside, 1) - 1
     last = np.minimum(np.ceil(order * high).astype(int) + beside, len(modes))

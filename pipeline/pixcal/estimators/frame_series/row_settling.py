@@ -131,10 +131,7 @@ def beside_own_phase(step: F64, phi: F64) -> F64:
 
 
 def _slope(found: FringeEvidence, step: F64, turn: F64) -> tuple[float, float]:
-    """Change of the share from the first row to the last, and its weight.
-
-    By the fringe vectors, of steps (t,) and of the vectors' parts along y (t,).
-    """
+    """Change of the share from first to last row, by the fringe vectors, and its weight."""
     size, moved = step - step.mean(), turn - turn.mean()
     value = float(size @ moved / (size @ size))
     left = moved - value * size

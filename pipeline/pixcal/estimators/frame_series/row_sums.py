@@ -189,11 +189,7 @@ def _apart_in_time(g: F64, share: float, way: int) -> F64:
 
 
 def _rows(sums: RowSums, way: int, share: F64) -> tuple[F64, F64, F64]:
-    """Rows of the window, and normal matrix and right-hand side of a share in each row.
-
-    Of the shares given (row), the frames' parameters hold the mean already, and the fringe's
-    amplitude in the maps has lost the rest.
-    """
+    """Rows of the window, normal matrix and right-hand side of a share in each row."""
     g = _apart_in_time(sums.found.g, float(share.mean()), way)
     lost = 1 / (1 - (share - share.mean()))
     factors = np.stack([np.ones_like(lost), lost, lost], axis=1)

@@ -218,10 +218,7 @@ def _powers(m: F64) -> F64:
 
 
 def _find_rest(m: F64, logs: F64, covariance: F64) -> F64 | None:
-    """Coefficients (b, c, d)/a of sigma² = a/m + b + c m + d m², or None where a/m will do.
-
-    Fitted to the logarithms, none of them negative.
-    """
+    """Coefficients (b, c, d)/a of sigma² = a/m + b + c m + d m², or None where a/m will do."""
     if len(m) < 3:
         return None
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))

@@ -180,10 +180,7 @@ def _begin(modes: Modes, free: Mask, start: Components | None) -> "_State":
 
 
 class _State:
-    """Likelihood of the modes at given sizes, and its slope.
-
-    Raises numpy's LinAlgError where a covariance is not positive.
-    """
+    """Likelihood of the modes at given sizes, and its slope; LinAlgError if not positive."""
 
     def __init__(self, modes: Modes, size: F64) -> None:
         self.modes, self.size = modes, size

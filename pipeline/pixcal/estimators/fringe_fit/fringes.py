@@ -142,10 +142,7 @@ def _peak(light: F64, nominal: tuple[float, float]) -> F64 | None:
 
 
 def _refined(light: F64, start: F64) -> F64:
-    """Peak (kx, ky), rad/px, of the continuous power spectrum of maps (n, y, x) near a start.
-
-    By Newton's method: derivatives of the spectrum are those of the maps times powers of y and x.
-    """
+    """Peak (kx, ky), rad/px, of the power spectrum of maps (n, y, x), by Newton's method."""
     y, x = grid(light.shape[1:])
     orders, k = np.arange(3)[:, None], start
     for _ in range(MOST_STEPS):

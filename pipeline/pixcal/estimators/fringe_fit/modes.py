@@ -38,10 +38,7 @@ class ModeBasis:
         return (*self.shape.names, *FRINGE_MODES)
 
     def _local(self, planes: list[TilePlane]) -> tuple[F64, F64]:
-        """The modes (tile, mode, local) and the shape's phase (tile, local) in local modes.
-
-        The phase is relative to each tile's plane.
-        """
+        """Modes (tile, mode, local) and phase (tile, local) relative to each tile's plane."""
         centres = np.array([p.centre for p in planes])
         n_poly, n_own = len(POWERS), len(self.shape.names)
         modes = np.zeros((len(planes), len(self.names), N_LOCAL))

@@ -163,11 +163,7 @@ class Scout:
         return good[_scattered(len(good), max(1, MAX_PIXELS // len(self.tiles)))]
 
     def _electrons(self, codes: U16, picked: Pixels) -> F32:
-        """Samples (t, p) in electrons, for first values that know no weights.
-
-        Most samples without weight are saturated: the brightest of the pixel stands for them. A
-        frame that has no other samples is zero.
-        """
+        """Samples (t, p), e-; saturated ones, without weight, count as the pixel's brightest."""
         flat = _taken(codes, picked)
         electrons = self.coding.electrons(flat)
         lost = flat == self.coding.fill
@@ -354,10 +350,7 @@ class Scout:
 
 
 def _like_most(theta: F64, good: Mask) -> Mask:
-    """Those of the pixels (y, x) with about the visibility of the others.
-
-    Others have the wrong bias: the weights of their samples, too, and all frames would feel it.
-    """
+    """Pixels (y, x) with about the visibility of the others: the rest have a wrong bias."""
     visibility = np.hypot(theta[1], theta[2]) / np.where(good, theta[0], 1.0)
     away = np.abs(visibility - np.median(visibility[good])) if good.any() else visibility
     usual = np.median(away[good]) if good.any() else 0.0

@@ -143,10 +143,7 @@ def _maps(fringes: FringeEvidence, evidence: Evidence, in_flats: bool) -> list[_
 
 
 def _gains(maps: Maps, allowed: Mapping[str, Mask]) -> tuple[float, float]:
-    """Chi-square of the wave that is strongest in all maps.
-
-    In light or flats, and in the map that shows it second best.
-    """
+    """Chi-square of the wave that is strongest in light or flats, and in its second-best map."""
     q = _vector(_common({name: _power(own, allowed[name]) for name, own in maps.items()}))
     gains: dict[str, float] = {}
     for own in maps.values():

@@ -141,10 +141,7 @@ def _polar(geometry: Geometry) -> F64:
 def _solve(
     paths: CrestPaths, base: Geometry, origin: F64, nominal: F64, sigma: F64, tolerance: float
 ) -> tuple[OptimizeResult, Geometry, F64]:
-    """Least squares over the phase and the polar parameters (6,) whose prior error is not zero.
-
-    With the solution its geometry, and the derivatives (6, n) of that by the n free parameters.
-    """
+    """Least squares over phase and free polar parameters; solution, geometry, its slopes (6, n)."""
     free, weight, (ry, rx) = sigma > 0, 1 / paths.sigma, paths.reference
     precision, expected = 1 / sigma[free], nominal - origin
     expected[ANGLE] = np.angle(np.exp(1j * expected[ANGLE]))

@@ -157,11 +157,7 @@ def _strip_task(
 
 
 def _write_arrays(folder: Path, paths: CrestPaths, fit: CrestFit) -> dict[str, NDArray[Any]]:
-    """Write the points and figure 17, and return them.
-
-    That is the cost over (D, B) with the others held, over (D, B/D) with the others refitted, and
-    the valley of the latter.
-    """
+    """Write the points and the cost of figure 17 (held, refitted, its valley), and return them."""
     distance, length = fit.geometry.distance, float(np.hypot(*fit.geometry.vector()[3:5]))
     steps, middle = np.linspace(-1, 1, MAP_SIDE), length / distance
     distances = distance * (1 + MAP_REACH * steps)

@@ -105,10 +105,7 @@ def _pairs(
     offset: float,
     neighbours: Sequence[tuple[int, int]],
 ) -> F64:
-    """Mean above an offset and variance (2, pair) of good pixels, ADU, as `reduce` measures them.
-
-    Of pairs of successive frames, made equally bright; outliers are left out.
-    """
+    """Mean above an offset and variance (2, pair), ADU, of pairs of frames, as in `reduce`."""
     samples = np.stack([s.astype(np.float32) for _, s in camera.expose(recording, frames)])
     samples[:, camera.maps.mask != 0] = np.nan
     detector = recording.bench.detector

@@ -112,10 +112,7 @@ def parted(name: str, halves: Sequence[Half]) -> bool:
 
 
 def _unlit_stay_so(flat: F32, good: Mask) -> F32:
-    """Response without what the map has at least: simulations would not mask all unlit pixels.
-
-    Where most pixels are unlit, flats would seem to hold no light, and it is left as it is.
-    """
+    """Response less its minimum, unless most pixels are unlit: so simulations mask unlit ones."""
     unlit = ~good & (flat <= FLAT_FLOOR)
     return np.where(unlit, np.float32(0), flat) if unlit.mean() < _MOST_UNLIT else flat
 
@@ -211,10 +208,7 @@ def excess_scatter(found: Sequence[FringeEvidence], good: Mask) -> float:
 
 
 def _dark_rate(evidence: Sequence[Evidence], halves: Sequence[Half]) -> F32:
-    """Dark signal, e-/s, whose scatter is lessened by what is noise; the simulation adds its own.
-
-    Of negative rates nothing would be left but a higher mean.
-    """
+    """Dark signal, e-/s, its scatter lessened by noise, which the simulation adds itself."""
     rate = _mean([uncoupled(e.dark_rate, np.random.default_rng(0)) for e in evidence])
     own = parted("bias", halves) and parted("dark", halves)
     noise = _rate_variance(evidence[0]) / (len(evidence) if own else 1)

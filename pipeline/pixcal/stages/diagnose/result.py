@@ -283,10 +283,7 @@ class _Description:
         }
 
     def _absolute(self) -> list[Json]:
-        """What differs in units of the bench, with all causes and with each alone; some always.
-
-        Intervals are of one sigma: where a measurement may lie if the simulation is right.
-        """
+        """What differs in units of the bench, with all causes and each alone; 1 sigma intervals."""
         candidates = self.found.candidates
         only = {n: t for n in self.found.accepted if (t := candidates[n].alone) is not None}
         rows = []

@@ -215,10 +215,7 @@ class Search:
         return max(equals, key=lambda n: equals[n])
 
     def _reject_insignificant(self) -> None:
-        """Leave out candidates that the fitted frames do not show beyond what the causes produce.
-
-        Where the data still differ, weak candidates are tried too.
-        """
+        """Leave out candidates that the fitted frames show no more than the causes produce."""
         causes, remaining, sizes = self._causes, self._remaining, self._sizes()
         least = SIGNIFICANT
         if self.comparison.differs(causes.current):
@@ -238,10 +235,7 @@ class Search:
         return {n: c.significance * shares.get(n, 1.0) for n, c in self._remaining.items()}
 
     def _reject_undecided(self) -> None:
-        """Leave out the weakest candidates where all would take more simulations than are left.
-
-        What it takes to accept one more cause and to weigh all at the end is kept for that.
-        """
+        """Leave out the weakest candidates where all would take more simulations than are left."""
         causes, remaining, sizes = self._causes, self._remaining, self._sizes()
         count = len(causes.effects) + 1
         weighed = count * (2 * CONFIRM + SCREEN) + count * (count - 1) // 2 * CONFIRM

@@ -157,10 +157,7 @@ def _kept_or_made(
     signatures: tuple[Signature, ...],
     item: tuple[Effects, int, int],
 ) -> tuple[Curves | str, float]:
-    """A simulation that an interrupted run has left, or a new one, which is left in turn.
-
-    With the processor time (s) that it took when it was made.
-    """
+    """A simulation that an interrupted run left, or a new one; and its processor time, s."""
     effects, seed, number = item
     on = sorted((e.name, to_plain(e)) for e in effects)
     name = digest(on, seed, number, windows[number].part, sorted(k.name for k in signatures))

@@ -124,10 +124,7 @@ def _between(phase: F64) -> F64:
 
 
 def _taken_by_frames(g: F64, light: F64) -> F64:
-    """What each frame's parameters (t, 3) take of a change at each phase (MAP_PHASES) of a fringe.
-
-    By fitting pixels and frames in turn, on pixels of the usual light spread over a fringe.
-    """
+    """What the parameters (t, 3) of frames take of a change at each phase (MAP_PHASES)."""
     psi, usual = usual_fringe(light, 2 * MAP_PHASES)
     weight = 1 / np.maximum(g @ usual, MIN_SIGNAL)
     of_pixels = np.einsum("tp,ti,tj->pij", weight, g, g)

@@ -134,10 +134,7 @@ def _excess(seen: Moments) -> float:
 
 
 def _chosen(stays: Stays, seen: Moments) -> tuple[F64, F64]:
-    """Share (place,) of pixels that stood out enough to be chosen; their mean variance (place,).
-
-    The variance is over that of two levels which are equally frequent.
-    """
+    """Share (place,) of pixels that stood out enough to be chosen; their mean variance (place,)."""
     limit = NOISY * np.sqrt(2 / seen.dof) / max(_excess(seen), 1e-9)
     kept = np.broadcast_to(stays.kept(seen.period_s, PLACES), PLACES.shape)
     shown = states(tuple(kept.tolist()), seen.frames, stays.upper)

@@ -301,10 +301,7 @@ def _by_share(series: LitSeries, amplitudes: F64) -> F64:
 
 
 def _mixed(jumps: F64) -> tuple[float, float, float]:
-    """Likelihood of pixels that are quiet or of some kinds; shares of the last one, and before it.
-
-    ``jumps``: (kind, n) logarithm of each pixel's likelihood, over that of a quiet one.
-    """
+    """Likelihood of pixels, quiet or of kinds (kind, n); shares of the last kind, and before it."""
     every = np.vstack([np.zeros(jumps.shape[1]), jumps])
     log_share = np.full(len(every), -np.log(len(every)))
     for _ in range(_TURNS):

@@ -133,11 +133,7 @@ def moments_of(series: Series, *, hits: bool = False) -> Moments | None:
 
 
 def _particles(noise: F64) -> Mask:
-    """Samples (t, n) far beyond all others of their pixel: noise of two levels has more, or none.
-
-    Beyond those of the pixel itself: without its largest samples the noise of a noisy pixel would
-    have a flat top.
-    """
+    """Samples (t, n) far beyond all others of their pixel, which two levels do not make."""
     square = np.nan_to_num(noise**2)
     largest, n = square.max(axis=0), np.isfinite(noise).sum(axis=0)
     others = (square.sum(axis=0) - largest) / np.maximum(n - 2, 1)
