@@ -365,7 +365,7 @@ class _Drawn:
 def _laws(
     start: CosmicHits, searches: list[_Search], pitch_um: float
 ) -> list[tuple[CosmicHits, float]]:
-    """Length, width and spread of charge of the tracks: the likeliest, then those nearly as likely."""
+    """Length, width and charge spread of tracks: the likeliest law, then nearly as likely ones."""
     if sum(len(s.hits.peaks) for s in searches) < _SHAPED:
         return [(start, 0.0)]
     tried: dict[CosmicHits, float] = {}
