@@ -32,13 +32,7 @@ def effects() -> dict[str, type[Effect]]:
 
 
 def effect_of_file(path: Path) -> type[Effect]:
-    """The effect of a Python file of the user's own.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read or imported, or does not hold just one effect.
-    """
+    """The effect of a Python file of the user's own; InputError if it does not hold just one."""
     if not path.is_file():
         raise InputError(f"{path}: not found; give a Python file that holds an effect")
     spec = importlib.util.spec_from_file_location(f"pixcal_effect_{path.stem}", path)
@@ -57,13 +51,7 @@ def effect_of_file(path: Path) -> type[Effect]:
 
 
 def known_effects(own: Iterable[Path] = ()) -> dict[str, type[Effect]]:
-    """All effects by name, those of the user's own files among them.
-
-    Raises
-    ------
-    InputError
-        If a file holds no effect, or one whose name is taken.
-    """
+    """All effects by name, also of own files; InputError if the name of one is taken."""
     known = dict(effects())
     for file in own:
         effect = effect_of_file(file)
@@ -78,10 +66,7 @@ def parse_effects(
 ) -> tuple[Effect, ...]:
     """Effects from the section ``effects`` of a bench file: name to parameters.
 
-    Raises
-    ------
-    InputError
-        Naming the first name or key that is unknown, or value out of range.
+    Raises InputError for the first name or key that is unknown, or value out of range.
     """
     known = effects() if known is None else known
     found = []

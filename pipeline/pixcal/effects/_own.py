@@ -19,13 +19,7 @@ MAX_AROUND = 4096  # rows around a piece, or frames before one, that an effect m
 
 
 def checked(effect: type[Effect], file: Path) -> type[Effect]:
-    """The class, once it is what an effect is, with steps that name the file when they fail.
-
-    Raises
-    ------
-    InputError
-        Naming the file and what is wrong with its effect.
-    """
+    """The class, its steps naming the file when they fail; InputError if it is no proper effect."""
     for name in (*STEPS, *OTHERS):
         if name in vars(effect):
             setattr(effect, name, _told(vars(effect)[name], file, name in STEPS))

@@ -215,11 +215,7 @@ class Ring:
 
 
 def ring_power(power: F64) -> Ring:
-    """Fit a ring to the cross power (y, x) of two maps from which parabolas were taken.
-
-    That is the real part of ``fft2(a) * conj(fft2(b))`` over pixels squared: its sum is the mean
-    product.
-    """
+    """Fit a ring to the cross power (y, x) of two maps: ``fft2(a) * conj(fft2(b))`` over px²."""
     shape = (power.shape[0], power.shape[1])
     scales, templates = _templates(shape)
     white = np.full(power.size, 1 / power.size)

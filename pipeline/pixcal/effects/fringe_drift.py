@@ -67,13 +67,7 @@ class FringeDrift(Effect):
     along_y: tuple[Track, ...] = quantity((), unit="rad/px", doc="measured slow change of ky")
 
     def vector_change(self, time_s: F64) -> F64:
-        """Change of the fringe vector (t, 2), rad/px, that is not random; from its first frame.
-
-        Parameters
-        ----------
-        time_s : (t,) float64
-            From the first frame of the set.
-        """
+        """Change (t, 2) of the fringe vector, rad/px, that is not random, from the first frame."""
         fade = np.exp(-time_s / self.settle_s) - 1
         return np.asarray(np.outer(time_s / HOUR_S, self.ramp) + np.outer(fade, self.settle))
 

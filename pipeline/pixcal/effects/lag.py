@@ -160,17 +160,9 @@ class Lag(Effect):
         return np.asarray(np.minimum(full, scale * np.float32(self.capacity_e)))
 
     def lost(self, charge: F32) -> tuple[F32, F32]:
-        """Mean net loss of frames, and what comes out with them of what was left of earlier ones.
+        """Mean net loss of frames, and what comes out of earlier ones; both (t, ...), e-.
 
-        Parameters
-        ----------
-        charge : (t, ...) float32
-            e-, in the order of time without gaps; the first one after darkness.
-
-        Returns
-        -------
-        lost, released : (t, ...) float32
-            e-.
+        ``charge``: (t, ...) e-, in the order of time without gaps; the first one after darkness.
         """
         taken = self._left(charge)
         if self.capacity_e:
@@ -199,17 +191,9 @@ class Lag(Effect):
         )
 
     def restored(self, frames: F32) -> F32:
-        """Frames without lag, from those with it.
+        """Frames (t, y, x) without lag, e-; the scatter of the share from pixel to pixel is left.
 
-        Parameters
-        ----------
-        frames : (t, y, x) float32
-            e-, in the order of time without gaps; the first one after darkness.
-
-        Returns
-        -------
-        (t, y, x) float32
-            e-; the scatter of the share from pixel to pixel is left.
+        ``frames``: (t, y, x) e-, in the order of time without gaps; the first one after darkness.
         """
         if not self.bands and not self.capacity_e:
             return self._restored_exactly(frames)

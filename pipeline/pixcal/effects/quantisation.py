@@ -131,14 +131,7 @@ class Quantisation(Effect):
         return Law(self.below, self.any_code)
 
     def thresholds(self, specimen: int, codes: int) -> F64:
-        """Where codes begin, in steps, in the order of `code_cells`; code n near ``n - 1/2``.
-
-        Parameters
-        ----------
-        specimen : int
-            Seed of the detector.
-        codes : int
-        """
+        """Where codes begin, in steps, in the order of `code_cells`; code n near ``n - 1/2``."""
         number = np.arange(codes)
         shift = np.zeros(codes)
         measured = np.array(self.widths)

@@ -73,9 +73,8 @@ def run_on_cluster(
 ) -> None:
     """Do tasks on a cluster, ``at_once`` at a time in one worker process (0: one a thread).
 
-    ``ended`` gets the number and the result of each. Raises InputError if no scheduler answers at
-    the address, or workers lack files or versions; ClusterError if the scheduler is lost, or
-    workers die again and again at the same task.
+    ``ended`` gets the number and result of each. InputError: no scheduler, or workers lack files or
+    versions; ClusterError: the scheduler is lost, or a task kills workers again and again.
     """
     if not items:
         return

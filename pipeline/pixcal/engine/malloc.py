@@ -13,10 +13,8 @@ OF_THE_NANNY = "65536"  # what Dask's nanny gives its workers as MALLOC_TRIM_THR
 def keep_freed_memory() -> None:
     """Let glibc's malloc reuse buffers in a worker of a Dask nanny.
 
-    The nanny sets MALLOC_TRIM_THRESHOLD_, and any such setting stops malloc from adapting itself:
-    each buffer of a chunk comes as fresh pages from the kernel and goes back at once, which
-    multiplies the time of a sweep by 3 to 4. The limits set here are those that
-    malloc would adapt to. What the owner of the worker has chosen stays as it is.
+    The nanny sets MALLOC_TRIM_THRESHOLD_, which stops malloc from adapting: fresh pages for each
+    chunk make a sweep 3 to 4 times slower. The limits here are those that malloc would adapt to.
     """
     if os.environ.get("MALLOC_TRIM_THRESHOLD_") != OF_THE_NANNY:
         return
@@ -24,10 +22,7 @@ def keep_freed_memory() -> None:
 
 
 def keep_arrays() -> None:
-    """Let glibc's malloc reuse the arrays of a simulation for the next, from one heap of all tasks.
-
-    Of its own, malloc asks the kernel for fresh pages for each of them: a fifth of the time.
-    """
+    """Let malloc reuse the arrays of a simulation: fresh pages would take a fifth of the time."""
     _set(mmap=512 << 20, trim=1 << 30)
     _mallopt(_ARENA_MAX, 1)
 

@@ -87,11 +87,7 @@ class Job:
 
 @dataclass(frozen=True)
 class RemoteTask:
-    """A task to be done where it is unpickled.
-
-    Schedulers, and workers that have another pixcal or none, can hold its bytes, as they could not
-    hold a pixcal function.
-    """
+    """A task unpickled where it is done, so that schedulers without pixcal can hold its bytes."""
 
     job: Job
     item: PickledArguments
@@ -111,11 +107,7 @@ _abandoned: set[str] = set()
 
 
 def call(job: Job, item: PickledArguments) -> Any:
-    """Do one task of a job, in the process that was chosen for it.
-
-    Raises InputError if other versions are installed where this runs, or files of the task cannot
-    be seen there.
-    """
+    """Do one task of a job; InputError if versions differ here, or its files are missing."""
     with _counting:
         if job.name in _abandoned:
             raise ClusterError("the run was ended elsewhere")

@@ -32,9 +32,7 @@ class Plan:
 def make_plan(what: str, bytes_per_task: int, shared_bytes: int, runtime: Runtime) -> Plan:
     """Choose the number of workers so that the work fits the memory allowed.
 
-    Fewer than asked for are told on stderr. On a Dask cluster the tasks must fit the memory limits
-    of its workers; ``--memory`` holds for this process alone. Raises PlanError if not even one
-    worker fits; the message holds both numbers.
+    Fewer than asked for are told on stderr. Raises PlanError, with both numbers, if none fits.
     """
     if runtime.remote:
         return _plan_on_cluster(what, bytes_per_task, shared_bytes, runtime)

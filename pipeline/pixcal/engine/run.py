@@ -113,8 +113,7 @@ def run_tasks(
 ) -> list[R]:
     """Apply a function to every item, in parallel, with progress; results in their order.
 
-    It must not depend on that order. ``done`` is called in this process with the number and the
-    result of each item as its task ends, e.g. to note it in a journal.
+    ``done`` is called here with the number and result of each item as its task ends.
     """
     results: dict[int, R] = {}
     times = (TimeElapsedColumn(), "left", TimeRemainingColumn())

@@ -45,10 +45,7 @@ NORMALS = 14
 
 @dataclass(frozen=True)
 class Products:
-    """Sums over frames for each link and pixel (zero where the partner is out of the window).
-
-    In single precision: of sixty links they are over four thousand bytes a pixel.
-    """
+    """Sums over frames for each link and pixel; zero where the partner is out of the window."""
 
     right: F32  # (link, 5, y, x) products of residuals with each of the `TERMS`; charge in 10⁴ e-
     normal: F32  # (link, 14, y, x) of the terms with each other, in the order of `NORMAL`
@@ -65,10 +62,7 @@ class Products:
 def products(
     evidence: Evidence, links: Sequence[Place], known: Sequence[Coupling] = ()
 ) -> Products | None:
-    """Sum the products of neighbours over all frames; None where no frames have light.
-
-    By the couplings that are known the charge collected follows from what is read.
-    """
+    """Sum the products of neighbours over all frames; None where no frames have light."""
     ny, nx = evidence.good.shape
     steps = np.array(links, int).reshape(-1, 2)
     right = np.zeros((len(links), TERMS, ny, nx), np.float32)

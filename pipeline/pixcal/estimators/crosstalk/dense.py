@@ -124,11 +124,8 @@ def frames_of(
 ) -> CouplingFrames | None:
     """What some parts of the frames tell together; None without light and dark signal.
 
-    Parameters
-    ----------
-    parts : of the same pixels, with different frames; each is needed only once
-    steps_in : steps (dy, dx) of the couplings in a window of some rows and columns
-    known : by which the charge collected follows from what is read
+    ``parts``: of the same pixels, each needed once. ``steps_in``: steps (dy, dx) in a window of
+    some rows and columns. ``known``: couplings by which the charge follows from what is read.
     """
     noise: list[Products | None] = []
     first: Evidence | None = None
@@ -235,8 +232,8 @@ class ShareShrinkage:
     ) -> tuple[F64, F64, float]:
         """Shares, their covariance, and the rms of a true pattern.
 
-        From least-squares sums (n, n), (n,) of the shares, and those of the shares and a true
-        pattern of the offsets, as maps tell.
+        From least-squares sums (n, n), (n,) of the shares, and of shares and true pattern in
+        ``maps``.
         """
         n, parts = self.basis.shape
         free = 0 if maps is None else 2 * self.classes

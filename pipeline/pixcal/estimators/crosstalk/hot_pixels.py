@@ -59,11 +59,7 @@ class HotPixels:
     def by_class(
         self, classes: PixelClasses, links: tuple[Place, ...], doubt: float = 0.0
     ) -> "ClassShares":
-        """What the hot pixels of each class show together.
-
-        The second of a pair is ordered by the class of the receiver, which is the first pixel of
-        the link. Each value has an error of ``doubt`` times itself as well.
-        """
+        """What the hot pixels of each class show together; ``doubt``: relative error of each."""
         step = np.array(links)
         y = np.stack([np.broadcast_to(self.y[:, None], (len(self.y), len(step)))] * 2, -1)
         x = np.stack([np.broadcast_to(self.x[:, None], (len(self.x), len(step)))] * 2, -1)
@@ -81,11 +77,7 @@ class HotPixels:
     def level_dependence(
         self, couplings: Sequence[Coupling], links: Sequence[Place], first: Place
     ) -> tuple[float, float]:
-        """Relative change of the shares with the signal of the hot pixels, 1/ke-, and its error.
-
-        Each coupling has its own share; the change is common to all. The error is infinite where
-        none has enough hot pixels.
-        """
+        """Relative change of the shares with the signal, 1/ke-, common to all, and its error."""
         right = weight = 0.0
         for c in couplings:
             step, side = ((c.dy, c.dx), 0) if (c.dy, c.dx) in links else ((-c.dy, -c.dx), 1)
@@ -128,11 +120,7 @@ class ClassShares:
         )
 
     def sums(self) -> tuple[F64, F64]:
-        """Least-squares sums (link, u, u), (link, u) of the shares at small signals.
-
-        What brighter-fatter makes of hot pixels rises with their charge, alike in all of a link; it
-        is free, up to `RISE`.
-        """
+        """Least-squares sums (link, u, u), (link, u) of the shares at small signals."""
         links = len(self.weight)
         parts = (self.weight, self.value, self.charge)
         weight, value, charge = (part.reshape(links, -1) for part in parts)
@@ -147,11 +135,7 @@ class ClassShares:
 def hot_pixels(
     evidence: Evidence, links: tuple[Place, ...], known: Sequence[Coupling] = ()
 ) -> HotPixels | None:
-    """Find hot pixels and what their neighbours show; None where no dark signal was measured.
-
-    By the couplings that are known a receiver is freed of what other hot pixels give, and need not
-    be left out.
-    """
+    """Find hot pixels and what their neighbours show; None where no dark signal was measured."""
     exposures = [s.exptime_s for s in evidence.of_kind("dark") if np.isfinite(s.exptime_s)]
     if not exposures or not np.any(evidence.dark_rate):
         return None

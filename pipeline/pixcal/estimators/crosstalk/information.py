@@ -130,11 +130,7 @@ def _backed(value: F64, normal: F64, right: F64) -> Mask:
 
 
 def _shares(right: F64, normal: F64, read: float) -> tuple[F64, F64]:
-    """Sums of the shares alone (link, u, u), the constant and brighter-fatter having been freed.
-
-    ``right, normal``: (link, term, class) float64 as in `Products`. ``read``: variance without
-    light, which the constant may well reach.
-    """
+    """Sums of the shares alone (link, u, u), with the constant and brighter-fatter free."""
     links, _, count = right.shape
     free = range(2, TERMS)
 
@@ -161,10 +157,8 @@ def to_first_order(
 ) -> Products:
     """Products from which shares follow to first order, from those that are measured.
 
-    A pixel keeps less than all of its charge, so that ``k (1 - outflow)`` is measured; a third
-    pixel that gives to both partners adds the product of its shares; shares that change with the
-    charge, all alike, add to the square of it; and all are measured in the shot noise of a pixel.
-    ``first`` are the first row and column of the arrays in the window.
+    A pixel keeps only a part of its charge; third pixels give to both partners; shares may change
+    with the charge; and all are measured in the shot noise of a pixel.
     """
     shape = (found.right.shape[-2], found.right.shape[-1])
     right = found.right / np.float32(found.shot)
@@ -196,11 +190,9 @@ def to_first_order(
 def level_dependence(
     found: Products, couplings: Sequence[Coupling], links: Sequence[Place]
 ) -> tuple[float, float]:
-    """Relative change of the shares with the source's charge, 1/ke-, and its error.
+    """Relative change of the shares with the source's charge, 1/ke-, beside theirs, and its error.
 
-    Beside what the couplings have already. From covariance that rises with the square of the charge
-    otherwise than the variance does: a bent response makes less of both alike. ``found``: as
-    `to_first_order` gives it.
+    From covariance that rises with the square of the charge otherwise than the variance does.
     """
     sizes = {(c.dy, c.dx): 0.0 for c in couplings}
     lost = got = 0.0

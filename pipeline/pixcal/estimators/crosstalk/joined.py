@@ -42,9 +42,8 @@ class Kernel:
 def measure(evidence: Evidence) -> Kernel | None:
     """Couplings of an acquisition; None where it has neither light nor dark signal to tell.
 
-    Those that stand out say whether there are any, and of what period; then all within two pixels
-    are measured together, and those that are there are told. Raises InputError if so many stand out
-    that it is no kernel.
+    What stands out gives the period; then all within two pixels are measured together. Raises
+    InputError if so many stand out that it is no kernel.
     """
     stands_out = _standing_out(evidence)
     if stands_out is None:

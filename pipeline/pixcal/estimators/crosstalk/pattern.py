@@ -82,11 +82,7 @@ def pattern_information(
 
 
 def visibility_pattern(evidence: Evidence) -> Callable[[PixelClasses], float]:
-    """How well a period describes the visibility of the pixels.
-
-    Gives the fall in chi-square, of all sets together, if each class of a period has its own mean
-    of the logarithm of the visibility.
-    """
+    """Fall in chi-square if each class of a period has its own mean of log visibility."""
     good = good_in_all(evidence)
     sets = list(evidence.fringes.values())
     if good.sum() < MIN_PIXELS:
@@ -172,10 +168,7 @@ def _offsets(found: Sequence[_Pattern], gram: F64) -> tuple[F64, F64]:
 
 
 def good_in_all(evidence: Evidence) -> Mask:
-    """Pixels that every fringe set has an offset of; none without sets.
-
-    Those at the border of the part are left out: what they get from beyond it is not known.
-    """
+    """Pixels, except at the border, that every fringe set has an offset of; none without sets."""
     sets = evidence.fringes.values()
     good: Mask = np.zeros(evidence.good.shape, bool)
     rows, columns = good.shape
@@ -193,11 +186,7 @@ def log_visibility(theta: F64, good: Mask) -> F64:
 
 
 def smooth_modes(sets: Sequence[FringeEvidence], good: Mask) -> F64:
-    """Orthonormal (mode, pixel): what is smooth, and the fringes that free intensities leave.
-
-    The fringes of all sets together: what is taken off one map but not off another would leave true
-    displacements in their difference.
-    """
+    """Orthonormal (mode, pixel): what is smooth, and the fringes left by free light."""
     shape = (good.shape[0], good.shape[1])
     y, x = grid(shape)
     modes = [polynomial_basis(shape, DEGREE)[good.ravel()].T]
@@ -235,10 +224,7 @@ def _slope_at(
 def response_slopes(
     k: tuple[float, float], couplings: Sequence[Coupling], classes: PixelClasses
 ) -> C128:
-    """Derivative (n, class) of the log of what couplings multiply the fringe k (rad/px) by.
-
-    The couplings are of the period of the classes.
-    """
+    """Derivative (n, class) of the log of what couplings multiply a fringe k (rad/px) by."""
     reach = max(max(abs(c.dy), abs(c.dx)) for c in couplings)
     rows, columns = (period * -(-reach // period) for period in (classes.rows, classes.columns))
     shape = (2 * rows + classes.rows, 2 * columns + classes.columns)

@@ -143,15 +143,7 @@ def _model(theta: F64, g: F64, dk: F64) -> F32:
 
 
 def _noise(rest: F32, charge: F32, read: F32, kept: F32, of_time: F32, of_place: F32) -> Residuals:
-    """Residuals in units of their noise, without what is common to pixels and to frames.
-
-    Parameters
-    ----------
-    rest, charge : (t, y, x) float32
-    read, kept : (y, x) float32 variance without light; variance of the shot noise over the charge
-    of_time, of_place : (k, t) float32 functions of time that a pixel is free to have, and of place
-        that a frame is
-    """
+    """Residuals in units of their noise, without what is common to pixels and to frames."""
     shot = charge * kept
     variance = shot + read
     weight = np.where(rest**2 < CLIP**2 * variance, 1 / variance, np.float32(0))

@@ -74,13 +74,10 @@ class Choice:
 
 
 def choose(measured: MeasuredLinks, pattern: Callable[[PixelClasses], float]) -> Choice:
-    """Take what stands out.
+    """Take the links that stand out, then the shortest period that serves them and the maps.
 
-    First the links that do, at any period; then the one period that serves all of them and the maps
-    best, the shortest that is good enough. ``pattern``: fall in chi-square of the maps where pixels
-    of each class of a period have a visibility of their own
-    (`pixcal.estimators.crosstalk.pattern.visibility_pattern`). Raises InputError if so many of them
-    are far apart that it is no kernel.
+    ``pattern``: fall in chi-square of the maps by classes (`visibility_pattern`). Raises InputError
+    if so many are far apart that it is no kernel.
     """
     looks = len(measured.links) * sum(3 * n * m for n, m in periods(measured.shape))
     critical = _critical(looks)

@@ -18,11 +18,9 @@ SMOOTH = 2  # degree of what the lamp does beside the steps
 
 
 def relative_gain(flat: F64, noise: F64, good: Mask) -> F64:
-    """Gain (y, x) of every pixel's amplifier over that of the whole detector.
+    """Gain (y, x) of every pixel's amplifier over the mean; exactly 1 where no boundary was found.
 
-    Its mean is 1; exactly 1 where no boundary was found. ``flat``: (y, x) relative response as
-    flats show it, counted with one gain. ``noise``: (y, x) mean square of samples about their mean
-    over what shot and read noise give by that gain.
+    ``flat``: (y, x) relative response. ``noise``: (y, x) mean square of samples over that expected.
     """
     log_gain = np.zeros(flat.shape)
     used = good & (flat > 0) & (noise > 0)

@@ -133,16 +133,10 @@ def noisy(
 ) -> Mask:
     """Noise without light far above the read noise, telegraph noise included.
 
-    Three signs: a standard deviation ``factor`` times the usual one; a smaller excess with the flat
-    top of noise that has two levels; more samples out of the limits than particles make.
-
-    Parameters
-    ----------
-    variance, dof : (y, x) temporal variance (ADU²) and its degrees of freedom
-    expected : (y, x) variance of a usual pixel with the same dark signal (ADU²)
-    kurtosis : (y, x) excess kurtosis; NaN when unknown
-    outliers : (y, x) samples out of the limits
-    factor : of the standard deviation
+    A standard deviation ``factor`` times the usual one; a smaller excess with a flat top; or more
+    samples out of the limits than particles make.
+    variance, dof, expected : (y, x) temporal variance (ADU²), its freedom, and a usual pixel's
+    kurtosis, outliers : (y, x) excess kurtosis (NaN: unknown) and samples out of the limits
     """
     ratio = variance / expected
     dofs, which = np.unique(dof, return_inverse=True)
@@ -157,13 +151,7 @@ def noisy(
 
 
 def variance_nearby(variance: F64, dof: F64, usual: float) -> F64:
-    """Variance of a usual pixel about each, ``usual`` or more: amplifiers differ in noise.
-
-    Parameters
-    ----------
-    variance, dof : (y, x) temporal variance (ADU²) and degrees of freedom, from a border of blocks
-    usual : that of a usual pixel of the detector (ADU²)
-    """
+    """Variance (ADU²) of a usual pixel about each, ``usual`` or more: amplifiers differ."""
     known = dof > 0
     if not known.any():
         return np.full(variance.shape, usual)
@@ -173,16 +161,10 @@ def variance_nearby(variance: F64, dof: F64, usual: float) -> F64:
 
 
 def noisy_factor(least: float, variance: F64, dof: int, quantum: float) -> float:
-    """Factor of the usual standard deviation that makes a pixel noisy, where pixels differ.
+    """Factor, ``least`` or more, of the usual standard deviation that makes a pixel noisy.
 
-    Those of a log-normal population (sCMOS) are no defects as far as it reaches.
-
-    Parameters
-    ----------
-    least : the factor at least
-    variance : temporal variance of pixels without light (ADU²)
-    dof : its degrees of freedom; few do not tell how pixels differ
-    quantum : step of the samples (ADU): noise below it depends on the place between two codes
+    A log-normal population (sCMOS) has no defects as far as it reaches. ``variance``: of pixels
+    without light (ADU²), with ``dof``. ``quantum``: step of the samples (ADU).
     """
     known = variance[variance > 0]
     if dof < _SPREAD_DOF or not known.size or np.median(known) < quantum**2:
@@ -194,12 +176,9 @@ def noisy_factor(least: float, variance: F64, dof: int, quantum: float) -> float
 def nonlinear(rungs: Sequence[Rung], levels: F64, limit: float) -> Mask:
     """Signal that does not follow that of the other pixels over a ladder of flats.
 
-    The pixel's share of the median level of the rungs (of the same tile, so that the lamp's own
-    drift drops out) is constant for a good pixel on a linear detector. Where the response of all
-    pixels is curved, brighter pixels are further along the curve: what pixels of one brightness
-    have in common is the detector's response, and no defect. ``rungs``: any number; with fewer than
-    three for a pixel it is not flagged. ``levels``: (rung,) of the tile, as `step_levels` gives
-    them. ``limit``: largest relative change of the share.
+    Held against pixels of the same brightness: a response that all share is no defect. ``rungs``:
+    any number; with fewer than three none is flagged. ``levels``: (rung,) of `step_levels`.
+    ``limit``: largest relative change of the pixel's share of the level.
     """
     shape = rungs[0].signal.shape
     if len(rungs) < MIN_RUNGS:

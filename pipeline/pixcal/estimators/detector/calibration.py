@@ -108,10 +108,7 @@ def step_levels(rungs: Sequence[Rung]) -> F64:
 def relative_response(rungs: Sequence[Rung], levels: F64) -> tuple[F64, F64]:
     """Signal (y, x) of flats over that of the tile, and its error; NaN where no step can be used.
 
-    All charge over all light: the weights that photon noise asks for. The light is that of the
-    ``levels`` (rung,) of `step_levels`, since a lamp may change between exposures; one that is NaN
-    is not used. The lamp's illumination stays in the response; it changes the mean intensity of a
-    pixel, never its offset.
+    All charge over all light ``levels`` (rung,) of `step_levels`: the weights of photon noise.
     """
     charge = variance = light = np.zeros(rungs[0].signal.shape)
     for rung, level in zip(rungs, levels, strict=True):
@@ -128,15 +125,8 @@ def unsaturated(
 ) -> tuple[Sequence[Rung], F64]:
     """Flats without the signal of full pixels, which becomes NaN, and their levels.
 
-    A full well has no photon noise. It may be full far below the highest code, and read noise then
-    spreads the samples: no code piles up. Such samples would flatten the response and outweigh all
-    others by their small variance.
-
-    Parameters
-    ----------
-    rungs : of the same pixels, in any order
-    levels : (rung,) as `step_levels` gives them
-    dark_variance : of a usual sample without light (ADU²): the dimmest levels may show little else
+    A full well, maybe far below the highest code, has no photon noise and would outweigh the rest.
+    ``levels``: (rung,) of `step_levels`. ``dark_variance``: of a usual sample without light (ADU²).
     """
     seen = lit(np.fmax.reduce([rung.signal for rung in rungs]))
     full, least, most = np.zeros(len(rungs), np.bool_), np.inf, 0.0

@@ -76,11 +76,7 @@ def histogram(frames: Iterable[NDArray[np.generic]], good: Mask) -> F64 | None:
 
 
 def step_of(counts: F64) -> tuple[float, float]:
-    """Step of the converter in codes of the file, from the codes that never come; and its error.
-
-    A step is the same all over the range: gaps that are not at multiples of one are missing codes
-    of a converter of step 1.
-    """
+    """Step of the converter in codes of the file, by the codes that never come; and its error."""
     there = np.flatnonzero(counts)
     if len(there) < FEWEST_CODES:
         return 1.0, 1.0
@@ -197,17 +193,9 @@ def level_errors(bits: F64, codes: int) -> F64:
 
 
 def code_cells(bits: F64, law: Law, codes: int) -> tuple[F64, I64]:
-    """Where each code begins, and the codes in this order.
+    """Where each code begins, and the codes in this order; those never reached are left out.
 
-    A code whose level is right begins half a code below it. One that begins after a higher one is
-    never reached.
-
-    Parameters
-    ----------
-    bits : ndarray of float64, shape (n,)
-        By how much (codes) the weight of each bit is off, lowest bit first.
-    law : Law
-    codes : int
+    ``bits``: (n,) by how much (codes) the weight of each bit is off, lowest bit first.
     """
     level = np.arange(codes) + level_errors(bits, codes)
     order = np.argsort(level, kind="stable") if law.any_code else np.arange(codes)
@@ -232,10 +220,7 @@ class CodeWidths:
         return float(self.kernel @ np.cos(2 * np.pi * frequency * at))
 
     def scatter(self) -> tuple[float, float, float]:
-        """Variance of the true widths, its error, and its significance.
-
-        Of thresholds that are displaced independently: neighbouring widths are related by -1/2.
-        """
+        """Variance of the widths by independent thresholds, its error, and its significance."""
         square = float(self.kernel @ self.kernel)
         more = (square - float(self.kernel[1:] @ self.kernel[:-1])) / square
         there = ~self.gap[self.number]
@@ -279,12 +264,10 @@ class CodeWidths:
         return np.diff(ends, prepend=0) - 1
 
     def _measured(self, displaced: bool, few: bool) -> tuple[F64, float]:
-        """Widths of all codes, less one, and how unlikely such are.
+        """Widths of all codes, less one, and how unlikely such are (-2 log marginal likelihood).
 
-        By thresholds that are ``displaced``, or by codes that are wide or narrow. Where these are
-        ``few``, each has a variance of its own, which is as large as it is found to be (Tipping
-        2001, sparse Bayesian learning, without the posterior variances). How unlikely: minus twice
-        the logarithm of the marginal likelihood.
+        By thresholds that are ``displaced``, or by codes that are wide or narrow; ``few`` of these
+        have a variance each (Tipping 2001, sparse Bayesian learning, without posterior variances).
         """
         top = int(self.number[-1]) + 1
         half = len(self.kernel) // 2
@@ -401,11 +384,7 @@ class CodeWidths:
         return bits, covariance
 
     def _far(self, law: Law) -> F64:
-        """Wrong bits by trying how far apart the levels are where each of them turns over.
-
-        From the highest bit down. As far apart as all higher ones are then too, which stay where
-        they were against each other. Only those count that turn over within the codes at hand.
-        """
+        """Wrong bits, from the highest down, by how far apart levels are where each turns over."""
         bits, place = np.zeros(self._bits), np.arange(self._bits)
         turning = np.isin(2**place, (self.number & -self.number)[1:])
         for reach, step in _TRIED:
@@ -501,14 +480,9 @@ class CodeWidths:
 def code_widths(
     counts: F64, noise: float, first: float = 0.0, last: float = np.inf
 ) -> CodeWidths | None:
-    """Widths from the counts of a converter's codes; None where too few came up.
+    """Widths from the counts (n,) of a converter's codes; None where too few came up.
 
-    Parameters
-    ----------
-    counts : (n,)
-    noise : least noise of a sample, in codes
-    first : code from which the noise is at least that
-    last : code at which samples saturate
+    ``noise``: least noise of a sample, codes, from code ``first`` on; at ``last`` samples saturate.
     """
     half = int(np.clip(noise / 2, _MIN_HALF, _MAX_HALF))
     if noise < MIN_NOISE or len(counts) < 2 * _CALM:

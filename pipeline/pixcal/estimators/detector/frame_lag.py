@@ -100,15 +100,10 @@ def common_lag(
     numbers: Sequence[Indices],
     undone: Callable[[float, float, F32], tuple[F32, F64]],
 ) -> CommonLag | None:
-    """Lag by the contrast of frames against the step of the phase since those before.
+    """Lag by the contrast of frames (t, 3) against the phase step; None: no evidence.
 
-    Returns None where the frames do not tell.
-
-    Parameters
-    ----------
-    frames : (t, 3) (B, A cos phi, A sin phi) of the frames of each fringe set
-    numbers : (t,) of these frames in their set
-    undone : frames without a lag of a share and a decay, and the shares that come out later
+    ``numbers``: (t,) of the frames in their set. ``undone``: frames without a lag of a share and a
+    decay, and the shares that come out later.
     """
     found = CommonLag(0.0, 0.0, 0.0, 0.0, 0.0)
     for _ in range(CONTRAST_ROUNDS):
@@ -182,11 +177,10 @@ class LagOfFlats:
 
 
 def lag_of_flats(evidence: Evidence) -> LagOfFlats | None:
-    """Share by which the first frame of each series of flats is fainter than the rest.
+    """Share by which the first frame of each series of flats is fainter than the rest, or None.
 
-    It lacks a share of its own level, and has one of the frame before, unless the detector was
-    cleared in between: the levels tell which. An offset of first frames is taken from series
-    without light, a lamp that warms up from the later frames. None where the levels do not tell.
+    It lacks a share of its own level, and has one of the frame before unless the detector was
+    cleared: the levels tell which.
     """
     found = [(s, f) for s in evidence.stacks if (f := _first_frame(s, evidence)) is not None]
     if len(found) <= 2:

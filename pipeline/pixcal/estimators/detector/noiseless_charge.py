@@ -14,13 +14,10 @@ _CLIP = 25.0  # squares of residuals, over their variance, that are left to part
 def missing_noise(
     evidence: Evidence, added: Callable[[FringeEvidence, F32], F32]
 ) -> tuple[float, float]:
-    """Part of the shot noise of an added charge that the residuals lack, with its error.
+    """Part of the shot noise of ``added`` charge (t, y, x), e-, that residuals lack; its error.
 
-    Zero where every added electron came by its own chance, one where none did. Squared residuals
-    are fitted by weighted least squares with the expected variance, a constant and the added
-    charge. So a gain or a read noise that is off does not pass for it: only the frames before tell
-    how much was added to samples of the same level. ``added``: charge (t, y, x), e-, added to a
-    fringe set of some signal (t, y, x), e- before the flat.
+    Squared residuals are fitted with the expected variance, a constant and the added charge, so a
+    wrong gain or read noise does not pass for it.
     """
     flat = evidence.flat.astype(np.float32)
 
@@ -32,11 +29,7 @@ def missing_noise(
 
 
 def noiseless_level(evidence: Evidence, fringes: FringeEvidence) -> tuple[float, float]:
-    """Constant part (e-, before the flat) of a signal that has no shot noise: an offset; its error.
-
-    Squared residuals are fitted with the expected variance, times a gain, less a constant. The read
-    noise is that of the bias frames.
-    """
+    """Constant part (e-, before the flat) of a signal without shot noise: an offset; its error."""
     return _last_of(evidence, [fringes], lambda _, v: [v, -np.ones_like(v)])
 
 

@@ -66,12 +66,7 @@ class Uneven:
 
 
 def seen_share(fringes: FringeEvidence, share: float, rms: float) -> float:
-    """Share that the contrast of frames shows where the shares of pixels differ.
-
-    Pixels with a larger share have shallower troughs. Samples there have more noise, and a model
-    of weaker fringes, so these pixels count for less. From the normal equations of a frame, with
-    three shares of the same mean and rms, over all phases.
-    """
+    """Share that the contrast of frames shows where pixels with a larger one count for less."""
     mean, cosine, sine = fringes.theta[:, fringes.good]
     frames = fringes.free[:, 0].mean()
     contrast = np.hypot(*fringes.free[:, 1:3].T).mean() / frames
@@ -89,11 +84,7 @@ def seen_share(fringes: FringeEvidence, share: float, rms: float) -> float:
 
 
 def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
-    """Mean square deviation of the pixels' shares from their mean, and its error.
-
-    From the frame before, less what the frames after give: they have no part in the frame, but as
-    much of everything else.
-    """
+    """Mean square deviation of the pixels' shares from the mean, and its error."""
     if len(fringes.g) < MIN_FRAMES + CONTROLS:
         return None
     before = _squares_of_shares(fringes, Freedom(fringes, HARMONICS), (1,))[0]

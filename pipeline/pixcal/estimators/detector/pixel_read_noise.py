@@ -35,11 +35,7 @@ class PixelNoise:
     def of(
         cls, stacks: Sequence[F32], good: Mask, rounding: float = 0.0, noisy: Mask | None = None
     ) -> "PixelNoise | None":
-        """From frames (t, y, x) without light, ADU; None of fewer than `FEWEST` frames.
-
-        Of masked pixels those are drawn that are ``noisy``, and clearly so: others of their true
-        noise were not masked, by chance.
-        """
+        """From frames (t, y, x) without light, ADU, and ``noisy`` pixels; None below `FEWEST`."""
         stacks = [s for s in stacks if len(s) >= 2]
         freedom = sum(len(s) - 1 for s in stacks)
         if freedom + len(stacks) < FEWEST or good.sum() < FEWEST:

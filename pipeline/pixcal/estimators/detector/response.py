@@ -42,21 +42,11 @@ def fit_response(
     shifts: F64,
     known_shift: tuple[float, float] | None = None,
 ) -> tuple[F64, F64]:
-    """Coefficients of the response and the shift of the boundaries, from all fringe sets.
+    """Coefficients c_1, c_2, ... and the shift by an electron (px); their covariance.
 
-    Parameters
-    ----------
-    level_e : electrons for which u is one
-    powers : terms of the relative response 1 + c_1 u + c_2 u² + ...
+    level_e, powers : terms of the relative response 1 + c_1 u + c_2 u² + ..., u = 1 at this level
     shifts : `pixcal.kernels.boundaries.boundary_shifts`, of size one
-    known_shift : shift by an electron (px) and its variance as they are known from the noise of
-        neighbours
-
-    Returns
-    -------
-    sizes : (powers + 1,) float64
-        c_1, c_2, ...; the shift by an electron, px.
-    covariance : (powers + 1, powers + 1) float64
+    known_shift : the shift and its variance as the noise of neighbours has it
     """
     prior = None
     if known_shift is not None:
@@ -97,21 +87,12 @@ def departure(level: F32, knots_e: F64, change_e: F64) -> F32:
 def fit_curve(
     evidence: Evidence, response: Callable[[F32], F32], knots_e: F64
 ) -> tuple[F64, F64, Agreement]:
-    """What the signal departs from a response at some levels, from all fringe sets.
+    """Departure (n - 1,) of the signal from a response at all knots but the first, e-.
 
-    Parameters
-    ----------
+    With covariance and the sets' agreement. Fringes tell neither an offset nor a factor of it.
+
     response : signal (t, y, x) of a charge of that shape, e-
     knots_e : (n,) levels, rising, e-, the first zero, where there is no departure
-
-    Returns
-    -------
-    change_e : (n - 1,) float64
-        At the other knots, e-. Fringes tell neither an offset nor a factor: the departure has
-        none, from the third knot on.
-    covariance : (n - 1, n - 1) float64
-    agreement : Agreement
-        Of the sets, on the whole curve.
     """
     unit = LOOSE * knots_e[-1] * np.eye(len(knots_e))[1:-1]
 
@@ -158,11 +139,8 @@ def boundaries_alone(
 ) -> Boundaries:
     """Boundaries that explain the harmonics by themselves, with the falloff that does it best.
 
-    Parameters
-    ----------
-    otherwise_px : falloff where the harmonics do not tell it; one of `FALLOFFS_PX`
-    by_axis : boundaries between rows may move by another shift than those between columns: fringes
-        across each tell of it
+    ``otherwise_px``: falloff (of `FALLOFFS_PX`) where harmonics do not tell. ``by_axis``:
+    boundaries between rows may move by another shift than those between columns.
     """
     sums = _sums_by_axis(evidence)
     if len(sums) < 2 or not by_axis:
@@ -228,11 +206,9 @@ class Beside:
 def boundaries_beside(
     evidence: Evidence, falloff_px: float, known: tuple[float, float] | None = None
 ) -> Beside:
-    """Boundaries of a given falloff, with a response that is free.
+    """Boundaries of a falloff (of `FALLOFFS_PX`), with a response that is free.
 
-    One fringe period tells little of them but how boundaries along x and y differ, which no
-    response brings about. ``falloff_px``: one of `FALLOFFS_PX`. ``known``: mean shift by an
-    electron (px) and its variance, as the noise of neighbours has it.
+    ``known``: mean shift by an electron (px) and its variance, as the noise of neighbours has it.
     """
     sums = _sums_by_axis(evidence)
     normal, right = _joint(sums, POWERS + FALLOFFS_PX.index(falloff_px))
@@ -266,10 +242,7 @@ def _joint(sums: Sequence[tuple[F64, F64]], at: int) -> tuple[F64, F64]:
 def _alone(
     sums: Sequence[tuple[F64, F64]], at: int
 ) -> tuple[float, float, float, float, float, float]:
-    """Shift, its variance, the chi-square it explains, and that of a curved response beside it.
-
-    Then the shift along y over that along x, and its error, of two sums.
-    """
+    """Shift, variance, chi-square explained, and that of a bent response; then the axes' ratio."""
     information = np.array([normal[at, at] for normal, _ in sums])
     rights = np.array([right[at] for _, right in sums])
     sizes = rights / information
@@ -283,10 +256,7 @@ def _alone(
 
 
 def _best_falloff(found: F64, otherwise_px: float, of_any: float) -> Boundaries:
-    """By a parabola about the best; ``found`` is what `_alone` tells of each of `_FINE_PX`.
-
-    ``of_any``: chi-square that boundaries of any shape explain.
-    """
+    """By a parabola about the best; ``of_any``: chi-square of boundaries of any shape."""
     best = int(np.clip(np.argmax(found[:, 2]), _BESIDE, len(found) - 1 - _BESIDE))
     near = np.array([best - _BESIDE, best, best + _BESIDE])
     at = np.log(_FINE_PX[near] / _FINE_PX[best])

@@ -58,22 +58,15 @@ class FittedLoss:
 
 
 class LossFit:
-    """Fringe frames of an acquisition, ready to be held against losses of charge.
-
-    ``level_e``: full scale of the bands of the response, e-.
-    """
+    """Fringe frames, to be held against losses of charge; ``level_e``: full scale, e-."""
 
     def __init__(self, evidence: Evidence, level_e: float) -> None:
         self._sets = [_Set(evidence, fringes, level_e) for fringes in evidence.fringes.values()]
 
     def fit(self, lost: Loss, start: Sequence[float] | F64, rounds: int) -> FittedLoss:
-        """Gauss-Newton steps of the parameters of a loss.
+        """Gauss-Newton steps, at most ``rounds``, of parameters (p,), none of them zero, of a loss.
 
-        Parameters
-        ----------
-        lost : charge (t, n), e-, that frames lose, from the parameters and the charge of the frames
-        start : (p,) parameters, none of them zero: derivatives are taken by a share of each
-        rounds : steps at most
+        ``lost``: charge (t, n), e-, that frames lose, from the parameters and their own charge.
         """
         value = np.array(start, float)
         rests = self._rests(lost, value)
@@ -103,12 +96,10 @@ class LossFit:
     def by_level(
         self, few: "LossFit", banded: Loss, trapped: Loss, share: float, full: float
     ) -> tuple[FittedLoss | None, FittedLoss | None]:
-        """Shares of bands of the level, and traps that fill up, if they explain more.
+        """Shares of bands of the level, or traps that fill up; None for what explains no more.
 
-        Returns None where the share is the same in all bands; where traps explain no more.
-        ``few``: the same of fewer pixels, on which traps are searched.
-        ``banded, trapped``: as of `fit`: from a share of each band; from these, what traps keep and
-        what they hold. ``share, full``: that stays on the mean, and of full scale, e-.
+        ``few``: fewer pixels to search traps on. ``banded, trapped``: as of `fit`. ``share, full``:
+        what stays on the mean, and of full scale, e-.
         """
         even = np.full(len(BANDS), share)
         self.weigh(banded, even)
@@ -184,17 +175,7 @@ class _Rest:
 
 
 class _Set:
-    """One fringe set.
-
-    Attributes
-    ----------
-    level : (t, n) float32
-        Charge of the good pixels, e-.
-    contrast_error : float
-        Of a frame's contrast, relative.
-    known : (t,) bool
-        Frames whose past is known.
-    """
+    """One fringe set."""
 
     def __init__(self, evidence: Evidence, fringes: FringeEvidence, level_e: float) -> None:
         # Pixels differ in the share that stays: what a level adds to it must not be told by that.

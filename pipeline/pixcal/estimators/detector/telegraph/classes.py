@@ -87,10 +87,7 @@ class Stays:
 
 @lru_cache(maxsize=64)
 def states(keeps: tuple[float, ...], count: int, upper: float) -> F64:
-    """States (frame, pixel), -1 or 1, less their mean; pixels keep them by turns so well.
-
-    ``upper``: share of the time that they are 1.
-    """
+    """States (frame, pixel), -1 or 1, less their mean; ``upper``: share of the time at 1."""
     rng = np.random.default_rng(0)
     keep = np.resize(keeps, _DRAWN)
     anew, up = rng.random((count, _DRAWN)) >= keep, rng.random((count, _DRAWN)) < upper
@@ -103,17 +100,9 @@ def states(keeps: tuple[float, ...], count: int, upper: float) -> F64:
 
 @lru_cache(maxsize=64)
 def _levels(keeps: tuple[float, ...], count: int, upper: float) -> tuple[F64, F64]:
-    """What a pixel of an amplitude shows in a number of frames, by its stays.
+    """Chances (level, class) that a class shows another's variance; products (lag, level, class).
 
-    One that stays long shows more or less of its two levels, or only one: it looks as if it had
-    another amplitude.
-
-    Returns
-    -------
-    chances : (level, class) float64
-        That a pixel of a class has the variance that those of another have on average.
-    products : (lag, level, class) float64
-        That chance, times the products of frames apart it then has over its full variance.
+    A pixel that stays long shows more or less of its two levels, or one: another amplitude.
     """
     shown = states(keeps, count, upper)
     seen = (shown**2).sum(axis=0) / (count - 1)
@@ -158,10 +147,7 @@ def of_own_noise(
 
 
 def joined(pixels: Indices, parts: Sequence[Moments], unit: float, stays: Stays) -> F64:
-    """Logarithms (pixel, class) of the likelihood ratios of all series together.
-
-    A pixel has the same noise of its own in all of them.
-    """
+    """Logarithms (pixel, class) of the likelihood ratios of all series together."""
     total = np.full((len(pixels), len(AMPLITUDES)), -np.inf)
     every = np.full(len(pixels), -np.inf)
     for noise, share in own_noises(parts):

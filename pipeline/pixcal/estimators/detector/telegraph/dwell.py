@@ -45,9 +45,8 @@ def find_stays(
 ) -> tuple[Stays, float] | None:
     """Stays of the pixels, and the error (s) of their mean; None where the frames do not tell.
 
-    ``upper``: share of the time that they are in the upper level. ``seen``: of the frames by which
-    the pixels were chosen. Pixels that stayed in one level there were not chosen, and this is
-    allowed for.
+    ``upper``: share of the time in the upper level. ``seen``: the frames by which the pixels were
+    chosen, in which those that stayed in one level are missing.
     """
     lit = [s for s in lit if s.charge.shape[1] >= FEWEST_PIXELS and s.period_s > 0]
     products = [_products(s) for s in lit]

@@ -86,11 +86,7 @@ def find_telegraph(
 ) -> Telegraph | None:
     """Telegraph noise from one or several series of the same pixels; None without samples.
 
-    Parameters
-    ----------
-    series
-    lit : gives the frames of fringes of some pixels, which tell how long they stay
-    noisy : pixels that are noisy in these
+    ``lit``: gives the frames of fringes of some pixels, which tell how long they stay.
     """
     parts = [m for s in series if (m := moments_of(s)) is not None]
     if not parts:
@@ -219,10 +215,7 @@ def _of_stays(parts: Sequence[Moments], decades: float, upper: float) -> _Found:
 def find_upper(lit: Sequence[LitSeries], noise: float) -> float:
     """Share of the time in the upper level that all pixels have in common; 0.5 unless it is clear.
 
-    Parameters
-    ----------
-    lit : frames of fringes; a pixel counts in each set by itself, as one may lack it
-    noise : of dark frames, e-
+    ``lit``: frames of fringes, each set by itself. ``noise``: of dark frames, e-.
     """
     used = [s for s in lit if s.charge.shape[1] >= FEWEST_PIXELS]
     if not used:
@@ -247,15 +240,10 @@ def find_upper(lit: Sequence[LitSeries], noise: float) -> float:
 
 
 def own_levels(series: Sequence[LitSeries], noise: float) -> OwnLevels:
-    """Levels of the pixels that have two, by all frames together.
+    """Levels of the pixels that have two, by all frames together, lit or not.
 
-    In each series a pixel may be in its upper level for another share of the time, or in one level
-    all along. The share is that of the series of most frames.
-
-    Parameters
-    ----------
-    series : frames without light, and of fringes
-    noise : of frames without light, e-
+    The share of time may differ from series to series; that of the longest is given. ``noise``: of
+    frames without light, e-.
     """
     pixels = np.unique(np.concatenate([s.pixel for s in series]))
     likely = np.zeros((len(OWN_AMPLITUDES), len(pixels)))

@@ -84,10 +84,7 @@ class Moments:
 
 
 def moments_of(series: Series, *, hits: bool = False) -> Moments | None:
-    """Moments of the noise of each pixel; None where there are too few frames.
-
-    ``hits``: whether samples far beyond all others of their pixel count.
-    """
+    """Moments of the noise of each pixel, or None; ``hits``: whether particles count."""
     x = series.noise - np.nanmedian(series.noise, axis=0)
     above, below = (np.count_nonzero(way * x > _OUTLIER, axis=0) for way in (1, -1))
     if not hits:
@@ -142,11 +139,7 @@ def _particles(noise: F64) -> Mask:
 
 
 def thinned(parts: Sequence[Moments]) -> list[Moments]:
-    """All pixels that are noisy in any series, and of the others as many as `QUIET` by chance.
-
-    Each of these stands for several in sums over the pixels, which stay right on average (Horvitz
-    and Thompson 1952, JASA 47, 663).
-    """
+    """All pixels noisy in any series, and `QUIET` of the others, each standing for several."""
     pixels = np.unique(np.concatenate([m.pixel for m in parts]))
     noisy = np.unique(np.concatenate([m.pixel[m.excess > 0] for m in parts]))
     quiet = np.setdiff1d(pixels, noisy, assume_unique=True)
