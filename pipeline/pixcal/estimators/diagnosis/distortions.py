@@ -94,23 +94,11 @@ class TwoWay:
 class Freedom(TwoWay):
     """The directions in which a fit of a fringe set is free.
 
-    Of the frames (B, A cos phi, A sin phi) and the fringe vector; of the pixels the three maps and,
-    where asked, as much again for each higher harmonic of the phase.
-
-    Parameters
-    ----------
-    harmonics : highest harmonic of the phase that a pixel is free to have
-    before : whether it is free to have a share of the frame before
-    margin : pixels along the edges that are left out
-
-    Attributes
-    ----------
-    good : (y, x) bool
-        The n pixels that are used.
-    of_time : (k, t) float32
-        Orthonormal.
-    of_place : (7, n) float32
-        The maps, and their slopes along x and y.
+    Of the frames (B, A cos phi, A sin phi) and the fringe vector; of the pixels the three maps, and
+    as much again for each higher of the ``harmonics`` of the phase and, with ``before``, a share of
+    the frame before. ``margin``: pixels along the edges that are left out. ``good``: (y, x) the n
+    pixels used; ``of_time``: (k, t) orthonormal; ``of_place``: (7, n) the maps, and their slopes
+    along x and y.
     """
 
     def __init__(
@@ -235,7 +223,7 @@ def _agreement(fits: Sequence["_SetFit"], rights: Sequence[F64]) -> Agreement:
 
 
 class _SetFit:
-    """One set: its residuals, and what its fit took up of the distortion."""
+    """One set: residuals, what the fit took up, and the normal matrix without distortion."""
 
     def __init__(
         self, fringes: FringeEvidence, distortion: Distortion, count: int, margin: int

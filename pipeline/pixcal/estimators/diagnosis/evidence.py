@@ -157,10 +157,7 @@ class Evidence:
     _found: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def once(self, name: str, *given: Any, make: Callable[[], T]) -> T:
-        """What follows from this evidence and what is given (hashable), made when first asked for.
-
-        For little things that several estimates need.
-        """
+        """What follows from this evidence and hashable arguments, made when first asked for."""
         if (name, *given) not in self._found:
             self._found[name, *given] = make()
         return cast(T, self._found[name, *given])
@@ -279,10 +276,7 @@ def free_frames(
 
 
 def central_crop(evidence: Evidence, samples: int = MAX_SAMPLES) -> Evidence:
-    """Central pixels of a window; of very long sets also the first frames only.
-
-    For estimates that cost much for each sample.
-    """
+    """Central pixels of a window, and of very long sets the first frames, for costly estimates."""
     ny, nx = evidence.good.shape
     longest = max((len(f.g) for f in evidence.fringes.values()), default=1)
     shrink = min(1.0, float(np.sqrt(samples / (longest * ny * nx))))

@@ -73,9 +73,7 @@ def _motion_of(evidence: Evidence) -> Motion | None:
 def vector_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
     """Of every set: name, times (t,), slow and fast change (t, 2) of the fringe vector, rad/px.
 
-    Walk modes, each smaller than it was seen by the share of noise in those of about its
-    frequency: a walk has many of them, a ramp few. What is fast keeps its power, what is slow is
-    as near to the truth as can be (Wiener).
+    Walk modes, each lessened by its share of noise (Wiener); what is fast keeps its power.
     """
     found = []
     for fringes in evidence.fringes.values():
@@ -131,9 +129,8 @@ def colour_of(series: FrameSeries) -> F64:
 def find_hops(series: FrameSeries) -> tuple[Hop, ...]:
     """Jumps of the wavelength: along the fringe vector, and sharp among what else moves it.
 
-    The difference of the means before and after is held against its own scatter along the run, so
-    that neither noise, jitter nor drift is taken for a hop. The narrowest difference that shows a
-    hop places it.
+    Means before and after are held against their own scatter along the run; the narrowest
+    difference that shows a hop places it.
     """
     k, along = np.array(series.k), colour_of(series)
     across = series.values @ np.array([-k[1], k[0]]) / (k @ k)

@@ -57,14 +57,9 @@ class _Series:
 def find_hopping(
     values: Sequence[F64], times_s: Sequence[F64], slopes: Sequence[float], size: float, rate: float
 ) -> Hopping:
-    """Hops of a common size and rate in several series.
+    """Hops of a common ``size`` and ``rate`` (1/s) in several series ``values`` (t,).
 
-    Parameters
-    ----------
-    values : (t,) float64
-    times_s : (t,) float64
-    slopes : of the bases, 1/s; to begin with, like the others
-    size, rate : 1/s
+    ``slopes``: of the bases, 1/s; to begin with, like size and rate.
     """
     series = zip(values, times_s, slopes, strict=True)
     every = [_begun(*one, size, rate) for one in series]
@@ -154,11 +149,11 @@ def _settled(s: _Series, size: float) -> _Series:
 
 @kernel()
 def likely_states(odds: F64, change: F64) -> tuple[F64, float, float]:
-    """Chance of the second state, expected number of changes, and gain in log-likelihood.
+    """Chance of the second state, expected changes, and gain in log-likelihood.
 
-    Forward and backward through a series (Rabiner 1989, Proc. IEEE 77, 257). ``odds`` (t,) are of
-    each frame by itself, the log-likelihood of the second state less that of the first; ``change``
-    (t - 1,) is the chance of a change from each frame to the next.
+    Forward and backward through a series (Rabiner 1989, Proc. IEEE 77, 257). ``odds``: (t,)
+    log-likelihood of the second state less the first. ``change``: (t - 1,) chance of a change to
+    the next frame.
     """
     n = len(odds)
     ahead, second = np.empty(n), np.empty(n)

@@ -71,10 +71,7 @@ class FrameLight:
 
 
 def light_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
-    """Of every set: name, times (t,), and changes (t,) of intensity and contrast of its frames.
-
-    Relative, and smaller than they were seen by the share of their scatter that is noise.
-    """
+    """Of every set: name, times (t,), relative intensity and contrast (t,), lessened by noise."""
     found = []
     for f in evidence.fringes.values():
         series = light_series(f)
@@ -95,10 +92,7 @@ def _levels(found: FringeEvidence) -> tuple[F64, F64]:
 
 
 def ambient_shares(evidence: Evidence) -> list[tuple[float, float]]:
-    """Share of each set's mean light that does not follow the laser, and its error.
-
-    A change x of the laser's power changes the mean by (1 - share) x and the contrast by share x.
-    """
+    """Share of each set's mean light that does not follow the laser, and its error."""
     found = dict.fromkeys(evidence.fringes, (0.0, 1.0))
     for name, _, level, contrast in light_courses(evidence):
         square = float(level @ level)
@@ -113,10 +107,8 @@ def ambient_shares(evidence: Evidence) -> list[tuple[float, float]]:
 def separate_powers(evidence: Evidence) -> float:
     """Relative rms change of the contrast where the powers of two fibres change separately.
 
-    With power shares ``(1 + d) / 2`` and ``(1 - d) / 2`` the contrast goes with ``sqrt(1 - d²)``. A
-    change x of d moves it by ``-d x``, and x is about as large as the relative change of the sum. A
-    contrast that changes by up to `IMBALANCE` of the intensity is therefore no effect of its own.
-    Zero where it changes by more or less, or no more than by noise.
+    With power shares ``(1 ± d) / 2`` the contrast goes with ``sqrt(1 - d²)``; a change x of d moves
+    it by ``-d x``. Up to `IMBALANCE` of the intensity it is no effect of its own; zero otherwise.
     """
     of_level = of_contrast = chance = 0.0
     for f in evidence.fringes.values():

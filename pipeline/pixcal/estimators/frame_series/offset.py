@@ -65,11 +65,7 @@ def dark_offsets(stack: Stack, good: Mask, gain: float, read_noise: float) -> Of
 
 
 def fringe_offsets(found: FringeEvidence, flat: F64) -> OffsetSeries | None:
-    """Of fringes, whose samples were divided by the flat: what B, A and phi do not take up.
-
-    An offset is ``1 / flat`` times the same in all pixels, the light ``iota``: where the light is
-    even, they differ by the flat's own pattern alone, and the noise is large.
-    """
+    """Of fringes, divided by the flat: offsets ``1 / flat``, as far as B, A and phi leave them."""
     masks = _quarters(found.good)
     if len(found.g) < FEWEST or masks is None:
         return None
@@ -87,11 +83,7 @@ def fringe_offsets(found: FringeEvidence, flat: F64) -> OffsetSeries | None:
 
 
 def offset_modes(every: Sequence[OffsetSeries], shapes: Sequence[F64]) -> Modes:
-    """All series for `estimate_components`; offsets white and walking (e-², e-²/s) come first.
-
-    The coefficients of known changes (t, q) of the offset of each series, common to all, come
-    first.
-    """
+    """All series for `estimate_components`: known changes (t, q) first, then offsets."""
     widths = [s.nuisance.shape[1] for s in every]
     q = shapes[0].shape[1]
     values, designs, parts, least = [], [], [], np.full(2, -np.inf)
@@ -180,10 +172,7 @@ def _diagonals(values: F64) -> F64:
 
 
 def fringe_courses(light: FrameLight) -> tuple[list[Course], float]:
-    """Slow offsets of every set: the part of (B, log A/B) that moves the first and not A.
-
-    Then what is left of it from frame to frame, e- rms over all sets.
-    """
+    """Slow offsets of every set, of what moves B and not A; then what is left, e- rms."""
     light = replace(light, dark=())
     drifts, every = ("offset_walk", "offset_smooth"), (*LIGHT_PARTS, "offset_smooth")
     found, jitter = [], []

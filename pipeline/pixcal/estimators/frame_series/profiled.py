@@ -46,11 +46,9 @@ def best_shape(
     start: Components | None = None,
     halvings: int = HALVINGS,
 ) -> Profiled:
-    """The best of some values (n,), in equal steps of the logarithm, and between them.
+    """The best of values (n,), in equal steps of the logarithm, and between them.
 
-    Likelihoods of a steady one, of known shapes, are compared without restriction; known shapes are
-    tried at first at the sizes of the start. The likelihood needs fewer ``halvings`` of the steps
-    than the value.
+    Likelihoods of a ``steady`` one, of known shapes, are compared without restriction.
     """
 
     def high(found: Components) -> float:

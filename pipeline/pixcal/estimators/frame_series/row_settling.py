@@ -120,11 +120,7 @@ def _fit(sets: Sequence[RowSums], way: int, origin: float | None) -> tuple[float
 
 
 def beside_own_phase(step: F64, phi: F64) -> F64:
-    """Steps (t,) without what goes with the frames' own phases.
-
-    Pixels that shrink as they fill shift the phase of rows by harmonics of the frame's own phase,
-    and a step to or from that phase correlates with them.
-    """
+    """Steps (t,) without what goes with harmonics of the frames' own phases."""
     turns = np.outer(phi, np.arange(OWN_ORDERS + 1))
     own = np.hstack([np.cos(turns), np.sin(turns[:, 1:])])
     return np.asarray(step - own @ np.linalg.lstsq(own, step, rcond=1e-9)[0])

@@ -31,26 +31,13 @@ def enough_frames(found: FringeEvidence) -> bool:
 
 @dataclass(frozen=True)
 class RowSums:
-    """Of the frames of a set that have one before and one after.
-
-    Attributes
-    ----------
-    found : FringeEvidence
-    inside : (t,) int
-        Places of the frames in it.
-    rows : (y,) float64
-        Of the window.
-    right : (t, y, 3) float64
-        Weighted products of the maps with the residuals.
-    normal : (t, y, 3, 3) float64
-        Of the maps with each other.
-    """
+    """Of the frames of a set that have one before and one after."""
 
     found: FringeEvidence
-    inside: Indices
-    rows: F64
-    right: F64
-    normal: F64
+    inside: Indices  # (t,) places of these frames in it
+    rows: F64  # (y,) of the window
+    right: F64  # (t, y, 3) weighted products of the maps with the residuals
+    normal: F64  # (t, y, 3, 3) of the maps with each other
 
     @classmethod
     def of(cls, found: FringeEvidence) -> "RowSums":
@@ -92,10 +79,8 @@ class RowSums:
     def share(self, other: F64, factors: F64 | None = None) -> tuple[F64, F64]:
         """Normal matrix (y, y) and right-hand side (y,) of the share of a light in each row.
 
-        What the pixels take up of it, which is linear in the frames' own light, and what the
-        frames' own parameters do, is taken off. ``other``: (t, 3) float64 parameters of the light
-        in the frames inside, as in `FringeEvidence.g`. ``factors``: (y, 3) float64 of these
-        parameters in each row.
+        Less what pixels and frames take up of it. ``other``: (t, 3) the light's parameters in the
+        frames inside. ``factors``: (y, 3) of these in each row.
         """
         g = self.found.g[self.inside]
         own = (other - g @ (np.linalg.pinv(g) @ other))[:, None]

@@ -76,10 +76,7 @@ class FrameSeries:
 
 
 def motion_series(found: FringeEvidence, *, every: bool = False) -> FrameSeries | None:
-    """Change of the fringe vector (x, y), rad/px; None where too few frames tell.
-
-    Of ``every`` frame, also where it is not known what the frames before and after leave in it.
-    """
+    """Change (x, y) of the fringe vector, rad/px; ``every``: also of frames without neighbours."""
     slopes = np.eye(5)[3:]
     return _series(
         found,
@@ -163,8 +160,8 @@ def _series(
 def without(values: F64, shapes: F64, basis: WalkModes) -> F64:
     """Series (t, c) without shapes (t, p) and mean, by weighted least squares of their modes.
 
-    A mode's weight is the inverse of the power around it, so that drifts and lines are not taken
-    for the shapes; what noise and jitter lose to the shapes is given back to each mode.
+    A mode's weight is the inverse of the power around it: drifts and lines are no shapes. What
+    noise loses to the shapes is given back to each mode.
     """
     modes, design = basis.of(values), basis.of(shapes)
     rest = np.empty_like(modes)
@@ -183,13 +180,7 @@ def without(values: F64, shapes: F64, basis: WalkModes) -> F64:
 
 
 def _follows_phase(phase: F64, inside: Indices, basis: WalkModes) -> F64:
-    """Shapes (n, p) of what is no noise but goes with the phases (t,), of the n frames inside.
-
-    What a bent response, the window's edges and the maps' gauge leave goes with the frame's own
-    phase and its harmonics, up to the one at which the samples of a fringe meet again; what other
-    frames leave in it (lag, rolling shutter) with the steps from and to them, and with both. The
-    likeliest come first. A scan so slow that such a shape is a drift does not count.
-    """
+    """Shapes (n, p) of n frames inside that go with the phases (t,) and steps; likeliest first."""
     own = phase[inside]
     steps = phase[inside - 1] - own, phase[inside + 1] - own
     angles = [own, 2 * own, *steps, 3 * own, 4 * own]
@@ -210,11 +201,9 @@ def assemble(
 ) -> Modes:
     """Series of all sets, with their noise, for `estimate_components`.
 
-    Parameters
-    ----------
-    parts : of a series, the covariance (m, t - 1, 2, 2) of its modes for unit sizes; the sizes are
-        common to all sets and come first in the result, three of the noise of each set after them
-    known : of a series, shapes (t, 2, q) whose coefficients are common to all sets; they come first
+    ``parts``: of a series, covariance (m, t - 1, 2, 2) of its modes for unit sizes, common to all
+    sets; three of each set's noise follow. ``known``: shapes (t, 2, q), whose coefficients come
+    first.
     """
     shared = [np.asarray(parts(s)) for s in every]
     shapes = [np.zeros((len(s), 2, 0)) if known is None else known(s) for s in every]

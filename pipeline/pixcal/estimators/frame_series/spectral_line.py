@@ -40,10 +40,9 @@ def find_line(
     level: Callable[[FrameSeries], F64],
     channels: Sequence[int] = (0, 1),
 ) -> Line | None:
-    """The strongest line; None where the runs are too short for one.
+    """The strongest line of some ``channels``; None where the runs are too short for one.
 
-    ``level``: of a series, the variance (t - 1, 2) of its modes without a line. ``channels``: that
-    may hold the line.
+    ``level``: of a series, the variance (t - 1, 2) of its modes without a line.
     """
     lengths = [(np.ptp(s.frame) + 1) * s.step_s for s in every]
     top = min(0.5 / s.step_s for s in every)

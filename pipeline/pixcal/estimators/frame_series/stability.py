@@ -59,14 +59,10 @@ def _draws(present: bytes, lengths: tuple[int, ...]) -> F32:
 def white_population(
     present: Mask, lengths: Sequence[int], noise: NDArray[np.floating] | None = None
 ) -> White:
-    """Simulate pixels with white noise.
+    """Simulate pixels with white noise, at averaging ``lengths`` in batches.
 
-    Parameters
-    ----------
-    present : (batch,) bool, false in gaps
-    lengths : averaging lengths in batches that leave at least one difference
-    noise : (n,) noise levels that occur, equally often (quantiles over the window); without it all
-        pixels are alike and the covariance is that of a single pixel instead of a median
+    ``present``: (batch,) false in gaps. ``noise``: (n,) levels, equally often; without it the
+    covariance is that of a single pixel instead of a median.
     """
     draws = _draws(np.asarray(present, dtype=bool).tobytes(), tuple(lengths))
     pixels = draws.shape[1]
@@ -88,11 +84,9 @@ def white_population(
 
 
 def _median_covariance(logs: F64, n_levels: int) -> F64:
-    """Covariance of the medians of the rows, times the number of columns.
+    """Covariance of the medians of rows, about the ``n_levels`` noise levels, times the columns.
 
-    The median's influence function is sign(x - median) / (2 f), f the density at the median. The
-    columns repeat ``n_levels`` noise levels; which levels a window has is no matter of chance, so
-    that the scatter counts from the mean of each level.
+    The median's influence function is sign(x - median) / (2 f), f the density at the median.
     """
     near = (0.46, 0.5, 0.54)
     below, median, above = np.quantile(logs, near, axis=1)
@@ -108,21 +102,11 @@ def _median_covariance(logs: F64, n_levels: int) -> F64:
 def shared_noise(grams: Sequence[F64], pixels: int) -> F64:
     """One over the number of pixels that are independent of each other, for each length.
 
-    Returns (length,): 1 / ``pixels`` where nothing is shared, 1 where all pixels move as one.
-
-    Parameters
-    ----------
-    grams : (difference, difference) for each length, sums over pixels of the products of
-        `disjoint_differences`, each pixel in units of its own noise; rows of zeros for differences
-        that are missing
-    pixels : how many pixels were summed
-
-    Notes
-    -----
-    Differences that are independent in time have a mean squared correlation, over pixels, of
-    sum_pq rho_pq² / N², just the inverse of the effective number of pixels of a mean of squares.
-    Only an excess over 1/N beyond chance (three sigma) counts. What averaging uncovers at one
-    length stays for longer ones, where fewer differences, or one only, are left to see it.
+    ``grams``: (difference, difference) for each length, sums over pixels of products of
+    `disjoint_differences` over each pixel's noise. Differences independent in time have a mean
+    squared correlation sum_pq rho_pq² / N², the inverse of the effective number; only an excess
+    over 1/N beyond three sigma counts, and stays for longer lengths, where fewer differences are
+    left to show it.
     """
     excess = 1.0
     shares = []
@@ -167,20 +151,13 @@ def fit_curve(
 ) -> AllanCurve:
     """Unbias a window's medians, and find slope and knee.
 
-    Parameters
-    ----------
     lengths : averaging lengths, batches
-    median, spread : (length,) median over pixels of the estimates (px), and half of the central 68
-        % of their logarithm
+    median, spread : (length,) median of the estimates (px), and half the central 68 % of their log
     pixels : number of pixels; a single one keeps its plain estimate, as `allantools` gives it
-    shared : (length,) from `shared_noise`
-    white : simulated for the same gaps, lengths and noise levels
+    shared, white : of `shared_noise`; simulated for the same gaps, lengths and noise levels
 
-    Notes
-    -----
-    The covariance of the log medians is the simulated one over the effective number of pixels
-    (plus that of the simulation itself), scaled up where the pixels scatter more than white noise
-    does. The slope is the generalised least-squares line through it.
+    The slope is the generalised least-squares line: the simulated covariance over the effective
+    number of pixels, scaled up where pixels scatter more than white noise does.
     """
     m = np.array(lengths, dtype=float)
     wider = np.maximum(1.0, spread / white.spread) if pixels > 20 else np.ones(len(m))

@@ -29,10 +29,7 @@ NEAR = 2.0  # growth from which the average information makes the steps
 
 
 def trace_products(weight: F64, parts: F64) -> F64:
-    """Sum over modes of tr(W D_i W D_j), (m, m), of weights (n, c, c) and parts (c, c, m, n).
-
-    Element by element of the few channels, over all modes at once.
-    """
+    """Sum over modes of tr(W D_i W D_j), (m, m), of weights (n, c, c) and parts (c, c, m, n)."""
     own, each = np.ascontiguousarray(weight.transpose(1, 2, 0)), range(len(parts))
     products = [[sum(own[a, k] * parts[k, b] for k in each) for b in each] for a in each]
     return np.asarray(sum(products[a][b] @ products[b][a].T for a in each for b in each))
@@ -108,11 +105,7 @@ class Components:
         return float(np.sqrt(value)), float(np.sqrt(value + self.above(part)) - np.sqrt(value))
 
     def shape_covariance(self, uncertain: Sequence[int]) -> F64:
-        """Covariance (p, p) of ``beta``, some sizes being no better known than they are.
-
-        Two thirds of that at the sizes found and a third of that at their upper limits: so shapes
-        beside a walk scatter, and those without one (by simulation).
-        """
+        """Covariance (p, p) of ``beta``: by simulation, a third at the limits of the sizes."""
         sizes = np.maximum(self.size, 0.0)
         for part in uncertain:
             sizes[part] += self.above(part)
@@ -125,11 +118,7 @@ def estimate_components(
     start: Components | None = None,
     steps: int = MAX_STEPS,
 ) -> Components:
-    """Sizes of the parts by restricted maximum likelihood.
-
-    Parts that are ``absent`` are held at zero. After no steps the sizes are those of the start, and
-    only the known shapes are fitted.
-    """
+    """Sizes of the parts by restricted maximum likelihood; ``absent`` ones are held at zero."""
     free = np.ones(len(modes.parts), bool)
     free[list(absent)] = False
     state = _begin(modes, free, start)
@@ -221,10 +210,9 @@ class _State:
 
 
 def _swept(covariance: F64) -> tuple[F64, float]:
-    """Inverses (n, c, c) of covariances, and the sum of the logarithms of their determinants.
+    """Inverses (n, c, c) of covariances, and the summed logarithms of their determinants.
 
-    By the sweep operator (Goodnight 1979, American Statistician 33, 149) over all modes at once:
-    matrices as small as these take longer one by one.
+    By the sweep operator over all modes at once (Goodnight 1979, American Statistician 33, 149).
     """
     own, log_determinant = np.ascontiguousarray(covariance.transpose(1, 2, 0)), 0.0
     for k in range(len(own)):
@@ -248,18 +236,12 @@ def _log_determinant(matrix: F64) -> float:
 
 
 def signed_sigmas(growth: float, size: float) -> float:
-    """Standard deviations by which one part is there; negative where its size is below zero.
-
-    From the growth of the log-likelihood when the part is let in.
-    """
+    """Standard deviations by which a part is there, by the growth of the log-likelihood."""
     return float(np.copysign(np.sqrt(max(2 * growth, 0.0)), size))
 
 
 def log_chance(growth: float, pairs: int = 1) -> float:
-    """Logarithm of the chance of such a growth of the log-likelihood by ``2 * pairs`` parameters.
-
-    Also of a power, in units of its mean, summed over as many ``pairs`` of cosine and sine.
-    """
+    """Logarithm of the chance of such a growth of log-likelihood by ``2 * pairs`` parameters."""
     # Tail of chi-square with an even number of degrees of freedom: a finite sum.
     x = max(growth, 0.0)
     terms = np.cumprod(np.concatenate([[1.0], x / np.arange(1, pairs)]))
@@ -267,10 +249,7 @@ def log_chance(growth: float, pairs: int = 1) -> float:
 
 
 def joint_log_chance(full: Components, less: Components, sizes: F64) -> float:
-    """Logarithm of the chance of two parts that are not there coming out as they did.
-
-    From fits with and without them, and their sizes (2,) in the former.
-    """
+    """Logarithm of the chance of two absent parts of these sizes (2,) coming out as they did."""
     growth = full.likelihood - less.likelihood
     # One time in four both come out below nothing.
     if np.any(sizes > 0):

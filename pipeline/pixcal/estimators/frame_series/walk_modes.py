@@ -18,18 +18,10 @@ SHORTEST = 0.1  # step in time, of the median one, that shorter ones count as
 
 @dataclass(frozen=True, eq=False)
 class WalkModes:
-    """Modes of series of t frames.
+    """Modes of series of t frames."""
 
-    Attributes
-    ----------
-    vectors : (t - 1, t) float64
-        Orthonormal, slowest first.
-    walk : (t - 1,) float64
-        Variance of the modes of a random walk with unit variance a second, s.
-    """
-
-    vectors: F64
-    walk: F64
+    vectors: F64  # (t - 1, t) orthonormal, slowest first
+    walk: F64  # (t - 1,) variance, s, of the modes of a random walk of unit variance a second
 
     def of(self, series: F64) -> F64:
         """Modes (t - 1, ...) of series (t, ...)."""

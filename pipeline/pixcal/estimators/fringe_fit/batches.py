@@ -30,11 +30,9 @@ class FrameBatches:
 
 
 def plan_batches(time_s: F64, frames: int | None = None) -> FrameBatches:
-    """Divide a run into batches, by the time (t,) of its frames.
+    """Divide a run into batches of equal time, by the time (t,) of its frames, gaps included.
 
-    Frames fall into slots of the median period, so that a pause of the camera shows as slots
-    without frames, and every batch spans the same time. By default it has 500 frames, or what
-    leaves some 24 batches of a shorter run.
+    By default of 500 frames, or what leaves some 24 batches of a shorter run.
     """
     n = len(time_s)
     length = frames or max(MIN_FRAMES, min(DEFAULT_FRAMES, n // WANTED))

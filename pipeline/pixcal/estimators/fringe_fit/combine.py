@@ -20,17 +20,10 @@ def combine_sets(
 ) -> tuple[F64, F64, F64]:
     """Solve ``delta[s] = axes[s] . (delta_x, delta_y)`` at every pixel, weighted by 1 / sigma².
 
-    Parameters
-    ----------
-    axes : unit vector (x, y) of each set's fringe axis
-    delta, sigma : (s, ...) float64 projections and their 1-sigma errors, px; a set that is NaN at a
-        pixel does not count there
-
-    Returns
-    -------
-    (2, ...) float64 delta_x and delta_y, px; NaN where the sets left do not give both
-    (2, ...) float64 their errors, px
-    (...) float64 disagreement of the sets, for ``sets - 2`` degrees of freedom (0 with two)
+    ``axes``: unit vector (x, y) of each set's fringe axis. ``delta, sigma``: (s, ...) projections
+    and errors, px; NaN does not count. Returns delta_x and delta_y (2, ...), px, NaN where sets
+    left do not give both; their errors; disagreement (...) for ``sets - 2`` degrees of freedom (0
+    with two).
     """
     a = np.asarray(axes, float).reshape(len(delta), 2, *([1] * (delta.ndim - 1)))
     good = np.isfinite(delta) & np.isfinite(sigma) & (sigma > 0)
@@ -61,10 +54,7 @@ def combine_parallel(
 
 
 def weighted_mean(values: F64, sigma: F64) -> tuple[F64, F64, F64]:
-    """Mean of maps (n, ...) weighted by 1 / sigma², its error, and the disagreement (chi-square).
-
-    NaN do not count; the mean is NaN where there is no value.
-    """
+    """Mean of maps (n, ...) weighted by 1 / sigma², NaN left out; its error, and chi-square."""
     good = np.isfinite(values) & np.isfinite(sigma) & (sigma > 0)
     w = np.where(good, 1 / np.where(good, sigma, 1.0) ** 2, 0.0)
     d = np.where(good, values, 0.0)

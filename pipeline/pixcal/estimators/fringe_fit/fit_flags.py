@@ -29,14 +29,10 @@ def fit_flags(
 ) -> U8:
     """Flags of pixels: those of the reduction, and NO_DATA and BAD_FIT of the fit.
 
-    Parameters
-    ----------
-    mask : (y, x) uint8 flags of the reduction
-    iota, alpha, sigma, chi2, count : (y, x) float32 maps of the sweep: mean and amplitude (e-),
-        error of the phase (rad), reduced chi-square, samples
+    iota, alpha, sigma, chi2, count : (y, x) of the sweep: mean and amplitude (e-), error of
+        the phase (rad), reduced chi-square, samples
     noise : usual reduced chi-square: where the noise model is off by a factor, all pixels are
-    excess : relative scatter of reduced chi-squares beyond chance, of an effect that all pixels
-        have to some degree and that makes none of them a defect
+    excess : relative scatter of reduced chi-squares beyond chance, which is no defect
     chi2_limit : reduced chi-square, over ``noise``, above which a pixel does not fit
     """
     flags = mask.copy()
@@ -60,10 +56,7 @@ def usual_chi2(values: NDArray[np.floating], freedom: int) -> float:
 
 
 def excess_scatter(values: NDArray[np.floating], freedom: int) -> float:
-    """Relative scatter of reduced chi-squares beyond that of pure noise.
-
-    From their median to one standard deviation above it: defects are further up, and fewer.
-    """
+    """Relative scatter of reduced chi-squares beyond noise, by one deviation above the median."""
     if not len(values):
         return 0.0
     usual, high = np.quantile(values, ndtr([0.0, 1.0]))

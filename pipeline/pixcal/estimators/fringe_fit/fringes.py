@@ -76,14 +76,11 @@ def grid(shape: tuple[int, ...]) -> tuple[F64, F64]:
 
 
 def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> tuple[float, float]:
-    """Fringe vector (kx, ky), rad/px, of a tile, from maps with fringes of any amplitude and phase.
+    """Fringe vector (kx, ky), rad/px, of a tile, from maps (n, y, x) over their mean light.
 
-    The highest peak of the summed power spectra, refined on the continuous spectrum; its sign is
-    that of the nominal vector. Raises InputError if no peak stands out: the frames hold no fringes,
-    or fewer than `MIN_FRINGES`; if fringes are nominally narrower than `SHORTEST_PX`, or lie across
-    the nominal ones. ``maps``: (n, y, x) float64 maps without their mean light (ratios to the mean
-    map). ``good``: (y, x) bool pixels to use. ``nominal``: fringe vector of the bench's nominal
-    geometry, rad/px.
+    The highest peak of the summed power spectra, with the sign of the ``nominal`` vector. Raises
+    InputError if no peak stands out, or fringes are fewer than `MIN_FRINGES`, narrower than
+    `SHORTEST_PX`, or lie across the nominal ones.
     """
     if max(map(abs, nominal)) * SHORTEST_PX > 2 * np.pi:
         raise InputError(
@@ -195,9 +192,7 @@ def smooth_phasor(
 ) -> SmoothPhasor:
     """Smooth version of a noisy phasor map alpha exp(i psi) / iota (y, x), from its good pixels.
 
-    The fringe vector k (rad/px) is first corrected by the mean phase step from pixel to pixel, then
-    a complex polynomial, of a lower degree for tiles of few pixels, is fitted to the map turned
-    back by it, leaving outliers out.
+    A complex polynomial about the corrected fringe vector k (rad/px), outliers left out.
     """
     shape, (kx, ky) = phasor.shape, k
     turned = np.where(good, phasor, 0) * plane_wave(shape, (-kx, -ky))

@@ -25,9 +25,8 @@ def fringe_modes(psi: F64, ratio: F64) -> list[F64]:
 def gauge_matrix(tiles: list[tuple[F64, Mask, C128]]) -> F64:
     """Change Q (3, 3) of theta that takes the fringe-frequency modes out of the phase maps.
 
-    The mended parameters are ``Q @ theta``, the mended frames ``g @ inv(Q)``. ``tiles``: (theta,
-    good, smooth) for each tile: theta (3, y, x), the pixels to use (y, x), and the smooth phasor
-    alpha exp(i psi) / iota (y, x) about which the modes are taken.
+    The mended parameters are ``Q @ theta``, the frames ``g @ inv(Q)``. ``tiles``: theta (3, y, x),
+    good pixels, and the smooth phasor about which the modes are taken, of each tile.
     """
     rows, rights, light_rows, light_rights = [], [], [], []
     for theta, good, smooth in tiles:

@@ -38,12 +38,8 @@ def tile_plane(
 ) -> TilePlane:
     """Plane through a tile's phases (through a thousand of them, when there are more).
 
-    Parameters
-    ----------
-    phase, sigma, ratio : (y, x) float32 phase relative to the carrier and its error, rad; iota /
-        alpha
-    slope : of the phase along x and y, rad/px, so near that no turn is missed over the tile
-    centre : of the tile, (y, x) in pixels of the window
+    phase, sigma, ratio : (y, x) relative to the carrier and its error, rad; iota / alpha
+    slope, centre : of the phase along x and y, rad/px, to within a turn; (y, x) of the tile, px
     """
     picked = np.flatnonzero(good)
     if not len(picked):
@@ -70,11 +66,9 @@ def tile_plane(
 
 
 def unwrap(planes: Sequence[TilePlane], grid_shape: tuple[int, int]) -> list[TilePlane]:
-    """Add whole turns to planes, row by row, so that neighbouring tiles agree where they meet.
+    """Add whole turns to planes, outwards from the middle, so that neighbouring tiles agree.
 
-    Outwards from the tile nearest to the middle, each is joined to a neighbour by their planes,
-    followed from both sides. Tiles that no neighbour joins (a band without good pixels lies
-    between) are joined to the nearest tile across the gap.
+    Tiles that no neighbour joins are joined to the nearest tile across the gap.
     """
     rows, columns = grid_shape
     table = np.array(planes, dtype=object).reshape(rows, columns)

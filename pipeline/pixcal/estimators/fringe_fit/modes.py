@@ -75,9 +75,7 @@ class ModeBasis:
     def removed(self, planes: list[TilePlane], coefficients: F64) -> F64:
         """What to take off each tile's phases, in its local modes: (tile, local, 1 + batch).
 
-        By the coefficients (mode, 1 + batch) of the run's phases relative to the shape, and of the
-        batches' relative to the run's. The first column is relative to the tile's plane and holds
-        the shape as well.
+        By coefficients (mode, 1 + batch): of the run relative to the shape, of batches to the run.
         """
         removed = np.empty((len(planes), N_LOCAL, coefficients.shape[1]))
         for first in range(0, len(planes), TILES_AT_ONCE):
@@ -88,11 +86,10 @@ class ModeBasis:
         return removed
 
     def solve(self, normal: F64, right: F64, spread: float) -> F64:
-        """Coefficients (mode, n) of maps from their sums, with what the shape knows beforehand.
+        """Coefficients (mode, n) of maps from their sums, with the shape's prior of the first map.
 
-        The first map is the whole run's; the prior's offset acts on it alone, the others are
-        differences from it. ``spread`` is the variance of the map over that of its noise: true
-        offsets act as noise here.
+        ``spread``: variance of the map over that of its noise, since true offsets act as noise
+        here.
         """
         precision = self._precision(spread)
         offset = np.zeros(len(precision))

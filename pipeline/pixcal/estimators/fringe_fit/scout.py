@@ -62,14 +62,9 @@ def in_turn(function: Callable[[int], Any], numbers: Sequence[int]) -> list[Any]
 
 @dataclass
 class Scout:
-    """Frame parameters from a few tiles.
+    """Frame parameters at ``reference`` (y, x) from a few tiles, the first for the fringe vector.
 
-    Parameters
-    ----------
-    tiles : the first is the one whose fringe vector is sought
-    nominal : nominal fringe vector (kx, ky), rad/px
-    reference : point (y, x) at which the frame parameters hold
-    each : does what is to be done for every tile: as `in_turn`, or several at a time
+    ``nominal``: fringe vector (kx, ky), rad/px. ``each``: runs a function for every tile.
     """
 
     tiles: Sequence[Tile]
@@ -87,10 +82,10 @@ class Scout:
     theta: list[F64] = field(default_factory=list)  # (3, y, x) of each tile
 
     def prime(self, codes: Sequence[U16]) -> FrameParameters:
-        """Learn the pixels of the tiles from frames spread over the run; parameters of these.
+        """Learn the pixels of the tiles from frames (t, y, x) spread over the run; parameters.
 
-        ``codes``: (t, y, x) the same frames for each tile. Raises InputError if there are too few
-        frames or good pixels, no fringes, or the phase does not change.
+        Raises InputError: too few frames or good pixels, no fringes, or a phase that does not
+        change.
         """
         n_frames = codes[0].shape[0]
         if n_frames < MIN_FRAMES:
@@ -114,10 +109,7 @@ class Scout:
         return frames
 
     def solve(self, codes: Sequence[U16], start: FrameParameters | None = None) -> FrameParameters:
-        """Parameters of further frames (t, y, x), the same for each tile whose pixels are known.
-
-        By default they start from an unweighted fit.
-        """
+        """Parameters of further frames (t, y, x), the same for each tile whose pixels are known."""
         samples = self._samples(codes)
         frames = self._unweighted(samples) if start is None else start
         # Weights come from the step before: where the phase is linear one is enough.

@@ -13,10 +13,7 @@ from pixcal.model.arrays import F64
 
 @dataclass(frozen=True)
 class Polynomial(FringeShape):
-    """Carrier plus a polynomial of `DEGREE`: the yardstick by which other shapes are judged.
-
-    It has no physics and is no model of the fringes.
-    """
+    """Carrier plus a polynomial of `DEGREE`, without physics, by which other shapes are judged."""
 
     coefficients: tuple[float, ...]
     k: tuple[float, float]

@@ -53,15 +53,10 @@ def sweep_tile(
     prime: int,
     bound_pixels: int = BOUND_PIXELS,
 ) -> TileMaps:
-    """Fit a tile, taking its samples block after block.
+    """Fit a tile, taking its blocks (t, y, x) of stored codes one after the other.
 
-    Parameters
-    ----------
-    blocks : (t, y, x) stored codes in the order of time; together as many frames as ``frames``
-        holds. The first ``prime`` frames are held until the start model is made from them.
-    k : carrier (kx, ky), rad/px
-    prime : from `frames_to_prime`
-    bound_pixels : pixels for which to work out the Cramér-Rao bound
+    ``k``: carrier (kx, ky), rad/px. ``prime``: first frames held until the start model is made
+    (`frames_to_prime`). ``bound_pixels``: pixels of which the Cramér-Rao bound is worked out.
     """
     held: list[U16] = []
     sums: PixelSums | None = None
@@ -122,10 +117,9 @@ def _relative(batches: F32, turn: F32) -> F32:
 
 
 def phase_bound(tile: Tile, theta: F64, frames: FrameParameters, number: int = BOUND_PIXELS) -> F64:
-    """Cramér-Rao bound of the phase (rad) for some pixels of a tile.
+    """Cramér-Rao bound of the phase (rad) for some pixels of a tile, frames being known.
 
-    For known frame parameters and Gaussian noise of the variance that the pixel's own fitted model
-    gives, without the approximations of the sweep's weights (physics note, section 3).
+    For Gaussian noise of the pixel's own fitted variance (physics note, section 3).
     """
     usable = tile.good & np.isfinite(theta).all(axis=0)
     where = np.flatnonzero(usable)

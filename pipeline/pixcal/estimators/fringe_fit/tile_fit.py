@@ -58,17 +58,9 @@ class Tile:
 class PixelSums:
     """Sums that grow block by block about a start model, of the run and of batches of its frames.
 
-    Parameters
-    ----------
-    frames : of all blocks together
-    model : (3, y, x) float32 start model
-    ranges : first frame and the one after the last of each batch; empty for a gap
-    variance : (read, shot) instead of the tile's own
-
-    Attributes
-    ----------
-    turn, sigma : (batch, y, x) float32
-        Phases of the batches relative to the start model and their errors, rad; NaN in gaps.
+    ``model``: (3, y, x) start. ``ranges``: first and end frame of each batch. ``variance``: (read,
+    shot) instead of the tile's own. ``turn, sigma``: (batch, y, x) phases relative to the start
+    model and their errors, rad; NaN in gaps.
     """
 
     def __init__(
@@ -145,10 +137,7 @@ def accumulate(
     theta: F32,
     variance: tuple[F32, F32] | None = None,
 ) -> F64:
-    """Sums (N_SUMS, y, x) of a tile over blocks of codes (t, y, x) that follow one another.
-
-    Together they have as many frames as ``frames`` holds; the others as of `PixelSums`.
-    """
+    """Sums (N_SUMS, y, x) of a tile over all blocks of codes (t, y, x), in the order of time."""
     sums = PixelSums(tile, coding, frames, theta, variance=variance)
     for block in blocks:
         sums.add(block)
@@ -163,13 +152,10 @@ def start_model(
     k: tuple[float, float],
     start: F64 | None = None,
 ) -> tuple[F32, SmoothPhasor]:
-    """Smooth model (3, y, x) of a tile, for weights that do not know the pixel's own noise.
+    """Smooth model (3, y, x) of a tile, for weights without the pixel's own noise; its phasor.
 
-    The phase and the visibility are smooth over the tile; the level is the pixel's own, known to a
-    part in a thousand, and only scales all the weights of that pixel together. With it the smooth
-    alpha exp(i psi) / iota. ``tile, blocks, coding, frames``: as in `accumulate`. ``k``: fringe
-    vector near the tile, rad/px. ``start``: (3, y, x) float64 the pixels as they are known; else
-    from an unweighted fit.
+    Phase and visibility are smooth over the tile; the level is the pixel's own. ``k``: near fringe
+    vector, rad/px. ``start``: (3, y, x) pixels if known; else from an unweighted fit.
     """
     theta = _unweighted_pixels(tile, blocks, coding, frames) if start is None else start
     iota = theta[0]

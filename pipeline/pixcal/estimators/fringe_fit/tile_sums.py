@@ -39,10 +39,7 @@ def _nodes() -> tuple[F64, F64, F64]:
 
 
 def expand(function: Callable[[F64, F64], F64], centres: F64) -> F64:
-    """Coefficients (tile, ..., term) of functions about the centres (tile, 2) of tiles, (y, x) px.
-
-    A function takes coordinates y and x (n,), px, and gives values (..., n).
-    """
+    """Coefficients (tile, ..., term) of functions of (y, x) px about tile centres (tile, 2)."""
     y, x, fit = _nodes()
     at_y = (centres[:, :1] + SCALE_PX * y).ravel()
     at_x = (centres[:, 1:] + SCALE_PX * x).ravel()
@@ -125,12 +122,8 @@ def sum_row(
 ) -> F64:
     """The sums of one tile, as a row of `TileSums.of_rows`.
 
-    Parameters
-    ----------
-    phase, sigma : (y, x) float32 phases relative to the carrier and their errors, rad
-    batches : (batch, y, x) float32 phases of the batches relative to the whole run's, rad; NaN in
-        gaps
-    plane : smooth phase of the tile
+    ``phase, sigma``: (y, x) relative to the carrier and error, rad. ``batches``: (batch, y, x)
+    relative to the whole run, rad; NaN in gaps. ``plane``: smooth phase of the tile.
     """
     modes = local_modes(carrier, plane, phase.shape)
     usable = (good & np.isfinite(phase)).ravel()

@@ -21,11 +21,7 @@ def phase_change(before: F64, after: F64) -> F64:
 
 
 def straight_modes(theta: F64, k: tuple[float, float]) -> F64:
-    """Modes (7, y, x) that a fit of straight fringes with free intensities takes off.
-
-    1, x, y, and the fringes of theta (3, y, x) at the fringe frequency k (rad/px) and twice it
-    (physics note, section 2).
-    """
+    """Modes (7, y, x) of straight fringes with free light: 1, x, y, fringes at k and 2 k."""
     shape = theta.shape[1:]
     y, x = np.broadcast_arrays(*grid(shape))
     carrier = k[0] * x + k[1] * y
@@ -38,8 +34,7 @@ def straight_modes(theta: F64, k: tuple[float, float]) -> F64:
 def phase_sums(modes: F64, delta: F64, sigma: F64, change: F64, k: float) -> tuple[F64, F64]:
     """Least-squares sums (mode, mode), (mode, 1) of a piece's phases after a change (y, x), rad.
 
-    Of modes (mode, y, x) in offsets and their errors (y, x), px, NaN where masked; k is the length
-    of the fringe vector, rad/px.
+    ``modes``: (mode, y, x) in offsets ``delta`` and errors, px, NaN masked; ``k``: rad/px.
     """
     good = np.isfinite(delta) & np.isfinite(change) & (sigma > 0)
     good_modes = modes[:, good]
@@ -48,10 +43,7 @@ def phase_sums(modes: F64, delta: F64, sigma: F64, change: F64, k: float) -> tup
 
 
 def offsets(modes: F64, coefficients: F64, delta: F64, change: F64, k: float) -> F64:
-    """Offset (y, x) along the fringe axis after a change of the phase, px; modes taken off.
-
-    Parameters as in `phase_sums`; ``coefficients`` (mode, 1) are of `solve_modes`.
-    """
+    """Offset (y, x) along the fringe axis after a change of the phase, px; modes taken off."""
     return np.asarray(delta + (change - np.tensordot(coefficients[:, 0], modes, 1)) / k)
 
 

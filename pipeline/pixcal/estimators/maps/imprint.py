@@ -21,12 +21,7 @@ def usual_fringe(theta: F64, count: int) -> tuple[F64, F64]:
 
 
 def imprint(theta: F64, g: F64, change: F64, read_noise_e: float) -> F64:
-    """Change (3, y, x) of the maps, e-, for a change of the frames' parameters.
-
-    Of maps (iota, alpha sin psi, alpha cos psi) (3, y, x), e-, of pixels that have a usual light;
-    ``g`` and ``change`` (t, 3) are intensity, and amplitude times cosine and sine of the phase, of
-    each frame as fitted, and by how much they differ for the pixels.
-    """
+    """Change (3, y, x) of maps, e-, for a change (t, 3) of the frames' parameters ``g``."""
     psi, usual = usual_fringe(theta, PHASES)
     taken = _taken(g, change, _weight(g @ usual, read_noise_e))
     at = np.arctan2(theta[1], theta[2])

@@ -36,10 +36,7 @@ class MapPart:
     def of(
         cls, signals: F64, data: F64, free: F64, good: Mask, field: Indices | None = None
     ) -> "MapPart":
-        """Data (y, x), signals (n, y, x), without outliers or free terms (m, y, x).
-
-        Nor the mean of each ``field`` (y, x) of the foundry's stitching, where these are told.
-        """
+        """Data (y, x) and signals (n, y, x) without outliers, free terms and field means."""
         at = np.flatnonzero(good)
         terms, values = _taken(free, at), data.ravel()[at]
         for _ in range(2):
@@ -116,10 +113,7 @@ def fitted_values(parts: Sequence[MapPart]) -> tuple[F64, F64, F64]:
 
 
 def phase_map(fringes: FringeEvidence) -> F64:
-    """Phase (y, x) of a set less the plane of its fringe vector, about its mean, rad; NaN masked.
-
-    In ±pi: the bending of the fringes across the part must stay below half a fringe.
-    """
+    """Phase (y, x) of a set less its fringe vector's plane, about its mean, ±pi rad; NaN masked."""
     y, x = grid(fringes.good.shape)
     kx, ky = fringes.k
     phasor = (fringes.theta[2] + 1j * fringes.theta[1]) * np.exp(-1j * (kx * x + ky * y))

@@ -101,9 +101,8 @@ Maps = Mapping[str, Sequence[_Map]]  # of each set, by its name
 def find_waves(evidence: Evidence, most: int = MOST) -> Waves | None:
     """The strongest waves in the maps of all sets, so many of each; None without enough pixels.
 
-    The chance is that of the best of all waves that the window can tell apart; those near the
-    harmonics of a set's own fringes, near no wave at all, and of rows or columns that repeat are
-    left out.
+    The chance is that of the best of all waves told apart; those near harmonics of a set's fringes,
+    near no wave at all, and of repeating rows or columns are left out.
     """
     sets = [f for f in evidence.fringes.values() if np.count_nonzero(f.good) > _MIN_PIXELS]
     if not sets:

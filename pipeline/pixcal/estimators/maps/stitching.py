@@ -33,13 +33,8 @@ Lines = tuple[tuple[int, ...], tuple[int, ...]]  # first row, and first column, 
 def fields(maps: Sequence[F64], free: Sequence[F64]) -> Indices:
     """Number (y, x) of the field in which each pixel lies; zeros where no steps show.
 
-    Parameters
-    ----------
-    maps : sequence of ndarray (y, x)
-        Maps of the same pixels, each with steps of its own along the same lines, and independent
-        white noise; NaN where there is none.
-    free : sequence of ndarray (term, y, x)
-        What smooth patterns each map may have, the constant left out.
+    ``maps``: (y, x) each, with white noise and steps along the same lines; NaN where there is none.
+    ``free``: (term, y, x) smooth patterns each map may have, the constant left out.
     """
     shape = maps[0].shape
     lines: Lines = ((), ())
@@ -144,10 +139,7 @@ class FieldFit:
         )
 
     def gains(self, begin: Indices, first: int, places: Indices, last: int) -> F64:
-        """Chi-square (place,) of a line before each of some columns between two lines.
-
-        With a step of its own in each of the rows of fields that ``begin``.
-        """
+        """Chi-square (place,) of a line, with a step in each row of fields, before some columns."""
         inside = slice(first, last)
         sums = np.add.reduceat(self.columns[:, :, inside], begin, axis=1).cumsum(axis=2)
         count = np.add.reduceat(self.good[:, inside], begin, axis=0, dtype=float).cumsum(axis=1)

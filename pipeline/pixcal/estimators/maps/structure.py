@@ -30,11 +30,7 @@ def clipped(values: F64) -> F64:
 
 
 def without_outliers(values: F64) -> F64:
-    """A map about its median, pixels left out (NaN) that differ from those around them.
-
-    By six robust standard deviations of such differences: a smooth pattern, however strong, neither
-    hides a defective pixel nor is taken for one.
-    """
+    """A map about its median, NaN where a pixel is 6 robust sigmas off those around it."""
     rest = values - np.nanmedian(values)
     around = median_around(np.where(np.isfinite(rest), rest, 0.0), AROUND)
     return np.where(np.isfinite(clipped(rest - around)), rest, np.nan)
@@ -51,10 +47,7 @@ def legendre(shape: tuple[int, ...], degree: int) -> F64:
 
 
 def fit_terms(values: F64, terms: F64) -> F64:
-    """Least-squares coefficients (term,) of maps (term, y, x) in a map with NaN.
-
-    Where it is NaN, they may be so too.
-    """
+    """Least-squares coefficients (term,) of maps (term, y, x) in a map with NaN."""
     good = np.isfinite(values)
     # Zeros, not copies without the pixels that are left out: those take longer than all the rest.
     design = terms.reshape(len(terms), -1)
@@ -101,11 +94,7 @@ CELLS = (8, 16)
 
 
 def redness(values: F64) -> float:
-    """Scatter of cell means of a map over that of white noise; NaN are masked.
-
-    The most that cells of several sizes show: what is alike over blocks of the foundry's stitching
-    does not average down as single pixels do.
-    """
+    """Scatter of cell means of a map over that of white noise, the most of several sizes."""
     ny, nx = values.shape
     good = np.isfinite(values)
     filled = np.where(good, values, 0)
@@ -154,10 +143,7 @@ def _red_lines(values: F64) -> list[float]:
 
 @lru_cache(maxsize=4)
 def bench_patterns(shape: tuple[int, ...]) -> F64:
-    """What the bench or the readout may do to any map (term, y, x): bending, repeating lines.
-
-    Bending first, the constant left out.
-    """
+    """What bench or readout may do to any map (term, y, x): bending, then repeating lines."""
     lines = []
     for axis in (0, 1):
         place = np.expand_dims(np.arange(shape[axis]), 1 - axis)
@@ -172,8 +158,7 @@ def bench_patterns(shape: tuple[int, ...]) -> F64:
 def stitched_fields(maps: Sequence[F64], fringes: Sequence[F64]) -> Indices:
     """Fields (y, x) of the foundry's stitching in offsets or phases (y, x), NaN where masked.
 
-    Beside what the bench or the readout may do, and fringes (term, y, x) of each map. Zeros where
-    what is left within the fields is no white noise, for then the lines may be part of a pattern.
+    Beside bench patterns and fringes (term, y, x); zeros where the rest is no white noise.
     """
     patterns = bench_patterns(maps[0].shape)
     bends = len(legendre(maps[0].shape, DEGREE)) - 1
@@ -191,10 +176,9 @@ def stitched_fields(maps: Sequence[F64], fringes: Sequence[F64]) -> Indices:
 
 
 def true_offsets(delta: F64, sigma: F64, psi: F64) -> OffsetModel:
-    """Part a map of offsets with their errors (y, x), px, NaN where there is none; psi in rad.
+    """Part a map of offsets and errors (y, x), px, NaN where there is none; psi in rad.
 
-    What is ``kept`` is shrunk by the share of its scatter that is noise; zero where there is none.
-    Steps between the fields of the foundry's stitching are kept as they are.
+    What is ``kept`` is shrunk by its share of noise; steps between stitched fields stay.
     """
     patterns = bench_patterns(delta.shape)
     fringes = np.stack([np.cos(psi), np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)])

@@ -79,10 +79,7 @@ class FringeShape(ABC):
         return kx / k, ky / k
 
     def facts(self, covariance: F64) -> dict[str, Any]:
-        """Parameters with 1-sigma errors in natural units, for ``fit.json``.
-
-        From the covariance (mode, mode) of the coefficients.
-        """
+        """Parameters with 1-sigma errors (from (mode, mode)) in natural units, for ``fit.json``."""
         return {}
 
 
