@@ -54,10 +54,9 @@ class Star:
         return 2 * self.half + 1
 
     def expected(self, place: F64, offsets: F64) -> F64:
-        """Mean electrons (n, side, side) in the windows.
+        """Mean electrons (n, side, side) of stars at places (n, 2), px from the middle.
 
-        Of stars at places (n, 2), (x, y) from the middle of the window's middle pixel, px, with
-        offsets (n, 2, side, side) of the pixels, px.
+        ``offsets``: (n, 2, side, side) of the pixels, px.
         """
         return np.asarray(self.electrons * self._at(place, offsets)[0] + self.background)
 
@@ -96,21 +95,17 @@ class Star:
         return np.asarray(np.einsum("iyx,jyx,yx->ij", jacobian, jacobian, weight))
 
     def bound(self, place: F64 | None = None) -> F64:
-        """Cramér-Rao bound of the centroid (x, y), px, with N and B fitted.
-
-        For a star so far (x, y) from the middle of its pixel, px; by default the rms over a pixel.
-        """
+        """Cramér-Rao bound of the centroid (x, y), px, N and B fitted; else rms over a pixel."""
         if place is not None:
             return np.asarray(np.sqrt(np.diag(np.linalg.inv(self.information(place)))[:2]))
         places = np.indices((4, 4)).reshape(2, -1).T / 4 - 0.375
         return np.asarray(np.sqrt(np.mean([self.bound(p) ** 2 for p in places], axis=0)))
 
     def weights(self, place: F64, good: Mask | None = None) -> F64:
-        """Error of the fitted centroid (x, y) per displacement (x, y) of each pixel.
+        """Error of the centroid (x, y) per displacement of each pixel (2, 2, side, side).
 
-        The fit does not know of them; one common to all moves the centroid by its opposite. (2, 2,
-        side, side), for a star so far (x, y) from the middle of its pixel, px, fitted with all or
-        the good pixels.
+        For a star at ``place`` (x, y), px from the middle of its pixel, fitted with all or the good
+        pixels, which the fit takes to be in place.
         """
         jacobian, weight, slopes = self._of_pixels(place, good)
         covariance = np.linalg.inv(np.einsum("iyx,jyx,yx->ij", jacobian, jacobian, weight))
@@ -212,10 +207,7 @@ def correct_centroids(
 
 
 def correction_map(offsets: NDArray[np.floating], star: Star | None) -> F32:
-    """Correction (2, y, x) of the centroid of a star centred on each pixel, or of the pixels.
-
-    Offsets (2, y, x) along x and y are in px; NaN, where unknown, counts as 0.
-    """
+    """Correction (2, y, x) of a star's, or a pixel's, centroid; offsets (2, y, x), px, NaN as 0."""
     known = np.nan_to_num(offsets.astype(np.float32))
     if star is None:
         return known

@@ -131,10 +131,7 @@ class Acquisition:
 
 
 def load_acquisition(path: Path) -> Acquisition:
-    """Read an acquisition description.
-
-    ``path``: the directory, or the YAML file itself.
-    """
+    """Read an acquisition description: a directory, or the YAML file itself."""
     file = path / "acquisition.yaml" if path.is_dir() else path
     if not file.exists():
         raise InputError(f"{file}: not found; an acquisition is a directory with acquisition.yaml")

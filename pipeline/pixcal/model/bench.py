@@ -21,10 +21,7 @@ MAX_DURATION_S = 1e10
 
 @dataclass(frozen=True)
 class SimulatedDetector:
-    """The chip, the window of it that is read, and its truth maps.
-
-    The maps belong to the chip: the same ``seed`` and chip give the same pixels in every window.
-    """
+    """The chip, the window of it that is read, and its truth maps, which ``seed`` and chip fix."""
 
     shape: tuple[int, int] = quantity(
         unit="px", low=1, high=65536, doc="window that is read out: [rows, columns]"

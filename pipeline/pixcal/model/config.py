@@ -133,10 +133,7 @@ def to_plain(config: Any) -> Any:
 
 
 def result_options(config: Any, kind: type | None = None) -> dict[str, Any]:
-    """Plain data of the options that a result depends on.
-
-    ``kind``: a dataclass that the configuration inherits from, to look at its options alone.
-    """
+    """Plain data of the options that a result depends on, of all or those of a parent ``kind``."""
     return {
         f.name: to_plain(getattr(config, f.name))
         for f in dataclasses.fields(kind or config)

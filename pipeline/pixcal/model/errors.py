@@ -13,19 +13,9 @@ class InputError(PixcalError):
 
 
 class DamagedError(InputError):
-    """Something that pixcal wrote is missing or altered; the message names it.
+    """Something that pixcal wrote is missing or altered, and what ``message`` says of ``path``.
 
-    Parameters
-    ----------
-    message : str
-        What is damaged, and how.
-    path : Path or str
-        The file or folder.
-
-    Attributes
-    ----------
-    advice : str
-        How to repair it; code that knows the run gives the exact command.
+    ``advice`` is how to repair it; code that knows the run gives the exact command.
     """
 
     def __init__(self, message: str, path: object = "") -> None:

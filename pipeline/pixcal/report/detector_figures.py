@@ -18,11 +18,8 @@ AXES = ("rows", "columns"), ("y", "x"), (BLUE, RED)  # of profiles, their coordi
 def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
     """Variance against level, and both over the straight line of gain and read noise.
 
-    Parameters
-    ----------
-    curve : ``level`` (ADU), ``variance`` and ``error`` (ADU²) of the points; ``gain`` (e-/ADU) and
-        ``read_variance`` (ADU²) of the line
-    saturation : level (ADU) where the detector saturates
+    ``curve``: ``level`` (ADU), ``variance`` and ``error`` (ADU²) of the points; ``gain`` (e-/ADU)
+    and ``read_variance`` (ADU²) of the line. ``saturation``: level (ADU).
     """
     level, variance, error = (np.array(curve[k]) for k in ("level", "variance", "error"))
     shown = (level > 0) & (variance > 0)

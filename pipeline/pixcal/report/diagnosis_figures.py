@@ -134,11 +134,7 @@ def _room(names: Sequence[str]) -> float:
 
 
 def curves_figure(curves: Sequence[Mapping[str, Any]], *, with_effects: bool = True) -> Figure:
-    """Statistics side by side: above the values, below their deviations from the simulations.
-
-    Of up to three entries of ``curves.json``. Where no effect was found, the curve with effects is
-    the nominal one and is not drawn.
-    """
+    """Statistics side by side (up to three): above the values, below their deviations."""
     named = [places(c) for c in curves if _is_named(c)]
     # room for the longest of the names that are written upwards, inches
     turned = max(

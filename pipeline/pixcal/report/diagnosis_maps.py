@@ -47,8 +47,8 @@ def panels(
 ) -> list[DeviationMap]:
     """Maps with a notable deviation, the largest first.
 
-    By the windows in ``places`` of ``diagnosis.json`` (none for a small detector), else by the
-    cells of those ``curves`` that have them. ``shape`` is the detector's window (y, x).
+    By the windows in ``places`` of ``diagnosis.json`` (none for a small detector), else by cells of
+    ``curves``. ``shape``: (y, x) of the detector's window.
     """
     maps = _of_windows(places) if places else _of_cells(shape, curves)
     maps = [panel for panel in maps if panel.largest > ASIDE]

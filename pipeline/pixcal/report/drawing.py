@@ -108,17 +108,11 @@ def axes_grid(
     between: float = 0.75,
     **drawing: Any,
 ) -> tuple[Figure, NDArray[Any]]:
-    """A figure and its grid of axes at fixed places: a computed layout takes half of the drawing.
+    """A figure and its grid of axes (rows, columns) at fixed places.
 
-    Returns the figure and its axes (rows, columns).
-
-    Parameters
-    ----------
-    size : width and height, inches
-    rows, columns : of the grid
-    left, right, bottom, top, beside, between : margins, and gaps of columns and of rows, inches;
-        labels have to fit
-    **drawing : for ``Figure.subplots``
+    A computed layout would take half of the drawing. ``size``: width and height; the margins, and
+    the gaps ``beside`` and ``between``, have to fit labels; all in inches. ``drawing``: for
+    ``Figure.subplots``.
     """
     figure, (width, height) = Figure(figsize=size, dpi=DPI), size
     # Gaps are shares of the mean width and height of the axes.

@@ -97,10 +97,7 @@ _BAR = _image(np.arange(LEVELS, dtype=np.uint8)[:, None], BAR_COLOURS)
 
 
 def map_panel(title: str, label: str, summary: MapSummary, factor: float = 1.0) -> Panel:
-    """A map whose colours span its values.
-
-    ``factor`` takes values to the unit of ``label``, which names quantity and unit.
-    """
+    """A map whose colours span its values; ``factor`` takes them to the unit of ``label``."""
     image = summary.image * factor
     scale = span_scale(image)
     title = ", ".join(filter(None, (title, block_note(summary))))

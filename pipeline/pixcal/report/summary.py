@@ -106,10 +106,7 @@ def block_side(shape: tuple[int, ...], most: int = SHOWN_PIXELS) -> int:
 
 
 def block_mean(values: NDArray[Any], side: int) -> F32:
-    """Means of side × side pixels, NaN left out; blocks at the far edges may be smaller.
-
-    Of values (y, x): (ceil(y / side), ceil(x / side)) float32, NaN where a block has none.
-    """
+    """Means (float32) of side × side pixels, smaller at the far edges, of finite values (y, x)."""
     total, count = _block_sums(values, np.isfinite(values), side)
     return _ratio(total, count).astype(np.float32)
 
@@ -219,11 +216,10 @@ class Spectrum:
 
 
 def spectrum(delta: Source, sigma: Source) -> Spectrum | None:
-    """Mean power spectrum of windows spread over a map; None where no pixel is good.
+    """Mean power spectrum of windows spread over a map (px, NaN masked); None without good pixels.
 
     Each window is tapered (sine squared) and masked pixels count as zero, both of which the
-    normalisation takes into account; spectra of independent errors stay flat. ``delta, sigma``: map
-    and 1-sigma errors (px); NaN where masked.
+    normalisation takes into account; spectra of independent errors stay flat.
     """
     my, mx = (min(SEGMENT, n) for n in delta.shape)
     taper = _taper(my)[:, None] * _taper(mx)[None, :]

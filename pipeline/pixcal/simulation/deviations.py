@@ -112,10 +112,7 @@ class SetDeviations(_Deviations):
 
     @cached_property
     def frames(self) -> Deviation:
-        """Parameters (4, t) of the frames and their noise.
-
-        The noise is that of the samples, or more where successive frames show it.
-        """
+        """Parameters (4, t) of the frames; their noise by samples or, if larger, by steps."""
         series = self._series(self.found.free)
         steps = np.diff(series, axis=1)
         spread = (1.4826 * np.median(np.abs(steps), axis=1, keepdims=True)) ** 2 / 2
@@ -347,10 +344,7 @@ def pair_variance(frames: int, good: Mask) -> F64:
 def taken_by_fit(place: F32, covariance: F64, of_time: F32, good: Mask) -> F64:
     """What the freedom of frames and pixels leaves of `pair_sums` of independent samples.
 
-    Parameters
-    ----------
-    place : (j, n) functions of place that a frame is free to have, over the noise of the n good
-        pixels
+    place : (j, n) functions of place that a frame is free to have, over the noise of good pixels
     covariance : (j, j) of their shares in a frame: mean over the frames
     of_time : (k, t) orthonormal functions of time that a pixel is free to have
     """

@@ -28,13 +28,7 @@ K = TypeVar("K", tuple[int, int], tuple[int, str])
 
 
 class Camera:
-    """Some rows of a bench, with its effects.
-
-    Parameters
-    ----------
-    rows : first row of the window and the one after the last; any rows give the same samples
-    noise : False: no shot noise and no read noise
-    """
+    """Some rows (first, one after the last) of a bench and its effects; any give the same."""
 
     def __init__(
         self, bench: Bench, rows: Rows, effects: Sequence[ForwardModel] = (), *, noise: bool = True
@@ -50,10 +44,7 @@ class Camera:
             self.maps = effect.detector(self.maps, bench, self.rows)
 
     def expose(self, recording: Recording, frames: Iterable[int]) -> Iterator[tuple[int, U16]]:
-        """Frames of these numbers as the camera reads them: the number and samples, uint16 (y, x).
-
-        ADU; the array is used again.
-        """
+        """Frames of these numbers as the camera reads them: number and samples, ADU (reused)."""
         chain = _Chain(self, recording)
         for frame in frames:
             yield frame, chain.samples(frame)[self._kept]
@@ -75,11 +66,7 @@ class Camera:
 
 
 class _Latest(dict[K, F32]):
-    """Arrays of the last few frames, by a key that begins with the frame.
-
-    Of the earliest frame goes first, whenever it was put in: an exposure that begins within a
-    recording puts in the frames before it in falling order.
-    """
+    """Arrays of the last few frames, by a key that begins with the frame; earliest go first."""
 
     def __init__(self, most: int) -> None:
         super().__init__()

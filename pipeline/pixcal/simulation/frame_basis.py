@@ -105,10 +105,10 @@ class FrameBasis:
         *,
         by_set: bool = False,
     ) -> Components:
-        """Sizes of strengths: the random ones come first in ``size``, the steady ones in ``beta``.
+        """Sizes of strengths, random ones first in ``size``, steady ones in ``beta``.
 
-        Shape parameters are by the field of the strength; the rest is as of `estimate_components`.
-        With ``by_set`` there follow in ``beta`` the departures of each later set from the first.
+        Shape parameters are by the field of the strength. With ``by_set`` there follow in ``beta``
+        the departures of each later set from the first.
         """
         own = [(s.steady, self.own(s, shapes.get(s.field))) for s in strengths]
         parts = [*(v for steady, v in own if not steady), *self._nuisances.values()]

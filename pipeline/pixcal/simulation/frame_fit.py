@@ -54,10 +54,7 @@ class FrameFit:
 def fit_frames(
     kind: type[ForwardModel], evidence: Evidence, leave: Sequence[str] = ()
 ) -> FrameFit | None:
-    """Parameters of a model of whole frames; None where the series show nothing of it.
-
-    Strengths to ``leave`` are not looked at.
-    """
+    """Parameters of a model of whole frames, but strengths to ``leave``; None without evidence."""
     found = _taken(kind, evidence, leave)
     if found is None:
         return None

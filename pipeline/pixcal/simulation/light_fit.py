@@ -88,10 +88,7 @@ class LightFit:
 
 
 def fit_light(starts: Sequence[LightStart], evidence: Evidence, degree: int) -> LightFit | None:
-    """The best of some starts, those of fewer numbers first; None without enough pixels.
-
-    Surfaces up to a degree are left to the beams.
-    """
+    """The best of some starts, those of fewer numbers first; None without enough pixels."""
     lit = evidence.once("light of the pixels", make=lambda: _lit(evidence))
     best: LightFit | None = None
     for start in starts if lit else ():

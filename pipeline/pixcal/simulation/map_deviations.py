@@ -41,8 +41,7 @@ def weighed(maps: F64) -> Deviation:
 def common_precision(maps: F64) -> F64:
     """Inverse covariance (m, m) of the noise of maps (m, y, x) of the same pixels.
 
-    Maps share the noise of flats, bias and each other's light. The covariance is that of the steps
-    between neighbours, of both axes; steps beyond `WILD_STEP` robust deviations count for nothing.
+    By the steps between neighbours along both axes, without those beyond `WILD_STEP` deviations.
     """
     steps = np.concatenate([np.diff(maps, axis=a).reshape(len(maps), -1) for a in (1, 2)], axis=1)
     steps = steps[:, np.isfinite(steps).all(axis=0)]
@@ -55,10 +54,7 @@ def common_precision(maps: F64) -> F64:
 
 
 def is_smooth(maps: F64, weight: F64) -> bool:
-    """Whether maps (m, y, x) change from pixel to pixel by less than they do at large.
-
-    Of others, the noise of the maps that were measured may decide.
-    """
+    """Whether maps (m, y, x) change from pixel to pixel by less than they do at large."""
     around = np.stack([median_filter(own, AROUND, mode="reflect") for own in maps])
     rough, whole = (float((weight * v**2).sum()) for v in (maps - around, maps))
     return rough <= ALONE**2 * whole

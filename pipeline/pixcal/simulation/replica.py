@@ -94,15 +94,10 @@ class Replica:
         seed: int = 0,
         most: int | None = None,
     ) -> F32:
-        """Samples (t, y, x) before they are rounded, ADU.
+        """Samples (t, y, x) before they are rounded, ADU, of a fringe set (name) or stack (number).
 
-        Parameters
-        ----------
-        of : name of a fringe set, or number of a stack
-        models : what acts on them; refused where a model and the bench do not go together
-        noise : with shot and read noise
-        seed : of all that is random
-        most : frames
+        ``models`` act on them, refused where one and the bench do not go together; ``most``:
+        frames.
         """
         detector = replace(self._bench.detector, seed=seed)
         bench = replace(self._bench, seed=seed, detector=detector)
@@ -239,12 +234,8 @@ def plain_bench(
 ) -> Bench:
     """What effects ask a bench for, where its pixels and light come from an acquisition.
 
-    Parameters
-    ----------
-    evidence : tells bias, laser and distance
-    detector : the rest of the detector; its bias is not used
-    times_s : exposure time and period
-    sets : name, baseline (mm), frames and brightest fringe (e-) of each fringe set
+    ``times_s``: exposure time and period. ``sets``: name, baseline (mm), frames and brightest
+    fringe (e-) of each fringe set. The bias is that of the evidence.
     """
     exposure, period = times_s
     bias = float(np.clip(np.median(evidence.bias), 0, detector.top_adu - 1))

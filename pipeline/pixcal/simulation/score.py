@@ -56,10 +56,9 @@ class Scored:
 
 
 def score(kind: type[ForwardModel], evidence: Evidence) -> Scored | None:
-    """Parameters of an effect, and how far it is from nothing.
+    """Parameters of an effect, and its significance; None where it changes nothing in these frames.
 
-    None where the effect changes nothing that these frames show; NotImplementedError if none of its
-    strengths is a number.
+    Raises NotImplementedError if none of its strengths is a number.
     """
     start = kind()
     names = tuple(key for key in numbers(start) if field_of(key) in kind.strengths)

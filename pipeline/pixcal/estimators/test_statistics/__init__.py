@@ -83,8 +83,8 @@ def family(
 ) -> Callable[[Callable[[Any, Any], Curve | None]], tuple[Statistic, ...]]:
     """Mark a function of a word and data as a statistic for each of some words.
 
-    Name, texts and options are as of `statistic`; ``{0}`` in them is the word, ``{1}`` and so on
-    are those beside it in ``members``. An option may be a mapping by the word.
+    Texts and options are as of `statistic`; ``{0}`` in them is the word, ``{1}`` ... those beside
+    it in ``members``. An option may be a mapping by the word.
     """
 
     def filled(text: Any, words: tuple[str, ...]) -> Any:

@@ -91,11 +91,10 @@ def expect_with(
     error: float = 0.0,
     beside: Expectation | None = None,
 ) -> Expectation:
-    """What a bench with effects lets expect.
+    """What a bench with effects lets expect, from simulations with the reference's first seeds.
 
-    The simulations have the first seeds of the reference, in the same order: what differs is due to
-    effects. ``error``: relative, of the strength of what is new on top of ``beside``, by default
-    the nominal bench.
+    ``error``: relative, of the strength of what is new on top of ``beside`` (default: the nominal
+    bench).
     """
     nominal = expect_nominal(reference)
     scaled_ones = [reference.on_scale(s) for s in simulated]
@@ -156,9 +155,8 @@ def _variance(values: F64, floor: float) -> F64:
 def independent_values(values: F64, floor: float = 0.0) -> float:
     """As how many independent values those of a curve are, when the least likely one is looked at.
 
-    Each of the simulations (simulation, n) is held against the others. Of n independent values the
-    least chance u has -log(1 - u) distributed as an exponential with the mean 1 / n, whose
-    likelihood gives n. The standard deviation is at least ``floor``.
+    Each simulation (simulation, n) is held against the others; of n values the least chance u has
+    -log(1 - u) distributed exponentially with mean 1 / n, whose likelihood gives n.
     """
     count, n = values.shape
     if n == 1 or count < 3:

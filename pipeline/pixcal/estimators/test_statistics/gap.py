@@ -131,11 +131,7 @@ class Gap:
 def remaining(
     before: Mapping[Key, Difference], after: Mapping[Key, Difference], where: set[Key]
 ) -> Gap:
-    """The gap that is left of what differed before.
-
-    Every curve that differed (``where``) counts by the square of its significance; of it, the share
-    of its excess that is left. What differs only after counts in full.
-    """
+    """The gap left: what differed (``where``) by squares of significance, new curves in full."""
     weights = {k: sigmas_of(before[k].log_chance) ** 2 for k in where}
     whole = sum(weights.values())
     left = {

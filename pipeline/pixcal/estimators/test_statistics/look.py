@@ -121,10 +121,7 @@ class Look:
 
     @cached_property
     def maps(self) -> dict[str, F64]:
-        """Offset (px), contrast and light (relative), (y, x) about zero; NaN in bad pixels.
-
-        And NaN along the edges: what pixels there share with those beyond no simulation knows.
-        """
+        """Offset (px), relative contrast and light (y, x), about zero; NaN if bad or at an edge."""
         theta, good = self.found.theta, np.zeros_like(self.good)
         inside = (slice(EDGE, -EDGE), slice(EDGE, -EDGE))
         good[inside] = self.good[inside]
@@ -155,10 +152,7 @@ class Look:
 
     @cached_property
     def maps_beside_fringes(self) -> dict[str, F64]:
-        """The flat maps without residual fringes, which have a statistic of their own.
-
-        With four phases, errors of the phases leave fringes whose power varies widely.
-        """
+        """The flat maps without residual fringes, whose power errors of four phases vary widely."""
         return {
             name: values - np.tensordot(fit_terms(values, self.fringe_terms), self.fringe_terms, 1)
             for name, values in self.flat_maps.items()
@@ -171,10 +165,7 @@ class Look:
 
     @cached_property
     def frames(self) -> dict[str, F64]:
-        """Per frame (t,): relative intensity and contrast, and changes of the fringe vector.
-
-        These are phases from edge to edge, along and across the vector, rad.
-        """
+        """Per frame (t,): relative intensity and contrast; turns along and across, rad."""
         b, a_cos, a_sin, dkx, dky = self.found.free.T
         contrast = np.hypot(a_cos, a_sin) / b
         ny, nx = self.good.shape
@@ -204,10 +195,7 @@ SPARSE = 7  # one of so many pixels tells the range of the levels
 def neighbour_sums(
     values: F32, good: Mask, steps: Sequence[tuple[int, int]], every: int = 1
 ) -> tuple[F64, F64]:
-    """Products of samples (t, y, x) with those of neighbours, where both pixels are good.
-
-    Their sums (step, y) by the row of the first pixel, and of how many pairs.
-    """
+    """Sums (step, y) of products of samples (t, y, x) with good neighbours, and how many."""
     pairs, count = _pairs(good, steps)
     sums = neighbour_products(values, pairs, np.array(steps), every)
     return sums, count * len(range(0, len(values), every))
@@ -246,10 +234,7 @@ def by_cell(values: F64, good: Mask) -> F64 | None:
 
 
 def pattern_sizes(noise: F32, good: Mask) -> F64:
-    """Sizes (t, pattern) of smooth patterns in frames (t, y, x), less their means over the frames.
-
-    Of white noise of unit variance they are independent, of unit variance.
-    """
+    """Sizes (t, pattern) of smooth patterns in frames (t, y, x), independent for white noise."""
     terms = legendre(good.shape, PATTERN_DEGREE) * good
     # The first is the level.
     patterns = np.linalg.qr(terms.reshape(len(terms), -1).T)[0][:, 1:].astype(np.float32)

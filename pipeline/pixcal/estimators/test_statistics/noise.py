@@ -182,10 +182,7 @@ def pixel_peakedness(look: Look) -> Curve:
     sets=False,
 )
 def read_noise(evidence: Evidence) -> Curve | None:
-    """Quantiles over the pixels of their variance over the read noise's.
-
-    Of masked pixels only those count that jump between levels: white noise is why they are masked.
-    """
+    """Quantiles over the pixels, masked ones if they jump, of variance over the read noise's."""
     stacks = [s for s in evidence.of_kind("bias") if len(s.adu) >= 8]
     if not stacks or evidence.amplifier_noise < COARSE * evidence.gain * evidence.step_adu:
         return None
@@ -210,11 +207,7 @@ def jumping(frames: F32) -> Mask:
 
 
 def ranges_about(values: F64, quantiles: Sequence[float]) -> F64:
-    """Mean of the values around each quantile q, over ranks within min(q, 1 - q) / 2 of it.
-
-    The sample variance of a few whole numbers takes few values: its quantiles are the same in many
-    simulations, and then jump.
-    """
+    """Mean around each quantile q, over ranks within min(q, 1 - q) / 2: few whole numbers jump."""
     ordered, found = np.sort(values), []
     for q in quantiles:
         apart = min(q, 1 - q) / 2

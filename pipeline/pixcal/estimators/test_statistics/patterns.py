@@ -23,8 +23,8 @@ FLOOR = 0.7  # standard deviation of a significance, by chance, at least
 def highest_ordinate(noise: F32, good: Mask) -> Curve:
     """Highest ordinate of the mean periodogram of frames (t, y, x), beside rows and columns.
 
-    Noise is in units of its standard deviation and zero in bad pixels. White noise has ordinates of
-    mean 1; a tone of the amplitude A adds N A² / 4, N being the number of good pixels.
+    Noise is over its standard deviation, zero in bad pixels: mean 1 if white; a tone of amplitude A
+    adds N A² / 4, of N good pixels.
     """
     power = np.zeros((noise.shape[1], noise.shape[2] // 2 + 1))
     for frames in np.array_split(noise, -(-len(noise) // AT_ONCE)):
@@ -41,8 +41,7 @@ def highest_ordinate(noise: F32, good: Mask) -> Curve:
 def tone_sigmas(noise: F32, good: Mask) -> Curve:
     """Significance of the highest ordinate, which of white noise is a standard normal.
 
-    The largest of many has a long tail, which no scale of powers makes normal. An ordinate's own
-    distribution is that of Wilson and Hilferty (1931), of two degrees of freedom a frame.
+    An ordinate has Wilson and Hilferty's distribution (1931), of two degrees of freedom a frame.
     """
     highest = highest_ordinate(noise, good)
     ninth = 1 / (9 * len(noise))
@@ -52,10 +51,7 @@ def tone_sigmas(noise: F32, good: Mask) -> Curve:
 
 
 def strongest(sizes: F64) -> float:
-    """Largest singular value of sizes (n, pattern) of patterns.
-
-    An amplitude, not a power: its scatter is nearly normal, and the same for many values and few.
-    """
+    """Largest singular value of sizes (n, pattern): an amplitude, of nearly normal scatter."""
     return float(np.linalg.svd(sizes, compute_uv=False)[0])
 
 

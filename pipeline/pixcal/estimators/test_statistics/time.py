@@ -51,10 +51,7 @@ def power_of(series: F64) -> Curve:
 
 @of_time("signal carried over from other frames", "share of the signal", x="frames before")
 def frames_before(look: Look) -> Curve:
-    """Share of another frame's fringes in the residuals.
-
-    By pixels: the coefficient of the other frame's model, after what the pixel's own fit absorbs.
-    """
+    """Share of another frame's fringes in the residuals, after what the pixels' own fits absorb."""
     g, theta = look.found.g, look.theta
     noise = np.sqrt(look.variance)[:, None]
     basis = np.linalg.qr(g)[0]
