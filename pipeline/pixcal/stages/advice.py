@@ -28,10 +28,7 @@ class Advice:
 
 
 def advice(run_dir: Path) -> Advice:
-    """What the fit, the diagnosis and the correction of a run say together.
-
-    Without a diagnosis there are sentences on the fitted maps only, without a fit the causes alone.
-    """
+    """What fit, diagnosis and correction of a run say together, as far as they were made."""
     fit = _artefact(run_dir, "fit", "fit.json") or {"outputs": [], "sets": {}}
     diagnosis = _artefact(run_dir, "diagnose", "diagnosis.json")
     correction = _correction(run_dir)

@@ -23,10 +23,9 @@ from pixcal.storage.star_files import column, distortion, read_table, write_dist
 
 
 def read_offsets(run_dir: Path) -> tuple[F32, F32]:
-    """Offsets of the pixels along x and y, and their errors, (2, y, x), px; NaN where unknown.
+    """Offsets along x and y, corrected ones if any, and errors, (2, y, x), px; NaN if unknown.
 
-    Corrected ones where there are any. With a single fringe axis they are those along it; those
-    across it are taken as zero.
+    With a single fringe axis, those across it are taken as zero.
     """
     maps = {name: read_map(path)[:2] for name, path in maps_to_use(run_dir).items()}
     if not maps:

@@ -33,10 +33,9 @@ def run(
     step: Step = lambda _name, _folder: nullcontext(),
     note: Callable[[str], object] = lambda _text: None,
 ) -> Done:
-    """Run all steps; a diagnosis or correction that is impossible is not an error.
+    """Run all steps, each in the context that ``step`` gives.
 
-    Each step runs inside the context that ``step`` gives; ``note`` is told, in a sentence, what was
-    not possible.
+    ``note`` is told which diagnosis or correction was not possible; that is no error.
     """
     of_fit = fit.Config(model=config.model)
     with flushed_last(out):

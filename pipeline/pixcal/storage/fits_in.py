@@ -281,11 +281,7 @@ def _coding(header: Header, prefix: str) -> SampleFormat:
 
 
 def _check_gzip_length(file: FrameFile, handle: io.FileIO) -> None:
-    """Hold the length in the last four bytes against the header; decompress where in doubt.
-
-    Those bytes are the uncompressed length modulo 2^32 (RFC 1952), and anything at all in a file
-    that was cut. Files of several members, or with later extensions, may be whole all the same.
-    """
+    """Hold a gzip file's length modulo 2^32 (RFC 1952) against the header; if in doubt, unpack."""
     handle.seek(-4, io.SEEK_END)
     length = int.from_bytes(handle.read(4), "little")
     needed = file.offset + file.data_bytes

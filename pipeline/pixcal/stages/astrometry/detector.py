@@ -199,10 +199,7 @@ def open_components(run_dir: Path, fit: dict[str, Any], truth: Path | None) -> l
 def free_from_modes(
     components: Sequence[Component], modes: DegenerateModes, runtime: Runtime
 ) -> tuple[list[Component], dict[str, dict[str, float]]]:
-    """Fit the modes to truth minus maps, and remove them from the truth.
-
-    For each component the rms (px) of the removed ``smooth`` and ``fringe`` modes comes with it.
-    """
+    """Fit the modes to truth minus maps, and remove them; rms (px) of ``smooth``, ``fringe``."""
     ny, nx = modes.shape
     # An odd step: bands must not keep pace with fringes.
     step = (ny * nx // ENOUGH) | 1

@@ -55,10 +55,9 @@ def tile_side(shape: tuple[int, int]) -> tuple[int, int]:
 
 
 def error_maps(folder: Path, detector: PixelPositions, star: Star, runtime: Runtime) -> ErrorMaps:
-    """Write the error at every place, and sum it up.
+    """Write the error at every place as arrays (y, x), px, and sum it up.
 
-    Writes arrays (y, x), float32, px: ``perfect_<component>`` and ``measured_<component>``; NaN at
-    places that do not count.
+    ``perfect_<component>`` and ``measured_<component>`` are NaN at places that do not count.
     """
     ny, nx = detector.shape
     side, block = tile_side(detector.shape)

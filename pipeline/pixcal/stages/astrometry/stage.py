@@ -184,11 +184,7 @@ def _star(
 
 
 def planned(shape: tuple[int, int], modes: int, side: int, config: Config) -> tuple[int, int]:
-    """Bytes of a task and of what this process holds.
-
-    Of a detector of shape (y, x), freed from so many ``modes`` of the truth (0 without one), for
-    stars in windows of ``side`` px.
-    """
+    """Bytes of a task and of this process: detector (y, x), stars in windows of ``side`` px."""
     per_pixel = _BYTES_PER_PIXEL + _BYTES_PER_PIXEL_AND_MODE * modes
     reach = min(int(2 * config.dither_px) + 1, max(shape)) + side
     task = max(

@@ -88,8 +88,7 @@ class Observation:
 def observe(detector: PixelPositions, plan: Observation, runtime: Runtime) -> F64:
     """Observe and fit stars all over the detector: errors (star, position, kind, component), px.
 
-    They are along the components' axes; NaN at places that are not used, and where a fit has
-    failed.
+    NaN at places that are not used, and where a fit has failed.
     """
     batches = [range(n, min(n + BATCH, plan.stars)) for n in range(0, plan.stars, BATCH)]
     core = core_weights(plan.star, detector.axes)

@@ -51,8 +51,8 @@ class Row(NamedTuple):
 def compare(perfect: F64, measured: F64, noise: F64, rng: np.random.Generator) -> GridComparison:
     """Root mean squares of errors (star, position), px, NaN where there are none.
 
-    ``noise`` are errors whose mean square ``perfect`` holds twice without having it on a real
-    detector: the maps' own. It is zero where the detector is the truth.
+    ``noise``: of the maps, whose mean square ``perfect`` holds twice; zero where they are the
+    truth.
     """
     columns = (perfect**2, measured**2, noise**2)
     good = np.isfinite(perfect) & np.isfinite(measured)
@@ -91,8 +91,7 @@ def axis_facts(
 ) -> dict[str, Any]:
     """Results along one axis, of errors (star, position, kind) of `stars.observe`, px.
 
-    ``bound`` is the Cramér-Rao bound of one position, px; ``drawn`` says whether the detector is
-    the maps plus random errors of size SIGMA.
+    ``bound``: Cramér-Rao bound of one position, px. ``drawn``: the detector is maps plus errors.
     """
     kinds = dict(zip(KINDS, np.moveaxis(errors, -1, 0), strict=True))
 

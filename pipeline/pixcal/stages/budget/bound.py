@@ -31,10 +31,7 @@ class FrameSpread:
 
     @classmethod
     def normal(cls, level_rms: float, contrast_rms: float, visibility: float) -> "FrameSpread":
-        """Normal changes of light and contrast, relative, clipped as `pixcal.kernels.scene` does.
-
-        No frame has more contrast than 1, ``visibility`` being the mean of equal beams.
-        """
+        """Normal changes of light and contrast, relative, clipped as `scene` does at contrast 1."""
         x, u = np.polynomial.hermite_e.hermegauss(NODES if level_rms else 1)
         y, v = np.polynomial.hermite_e.hermegauss(NODES if contrast_rms else 1)
         level = np.repeat(np.maximum(1 + level_rms * x, 0), len(y))
@@ -53,10 +50,9 @@ STEADY = FrameSpread(np.ones(1), np.ones(1), np.ones(1))
 def phase_information(
     iota: ArrayLike, alpha: ArrayLike, variance: float, spread: FrameSpread = STEADY
 ) -> F64:
-    """Information of one frame on a pixel's phase, 1/rad², at any phases that are uniform.
+    """Information of one frame on a pixel's phase, 1/rad², at uniform phases, over the spread.
 
-    Of mean and amplitude ``iota``, ``alpha`` (e-, at B = A = 1) and the ``variance`` (e-²) of a
-    sample without light, averaged over the frames' spread.
+    ``iota``, ``alpha``: e-, at B = A = 1. ``variance``: e-², of a sample without light.
     """
     total = np.asarray(iota, float)[..., None] * spread.level + variance
     swing = np.asarray(alpha, float)[..., None] * spread.amplitude
@@ -68,10 +64,7 @@ def phase_information(
 def unweighted_variance(
     iota: ArrayLike, alpha: ArrayLike, variance: float, spread: FrameSpread = STEADY
 ) -> F64:
-    """Variance (rad²) that one frame gives where all samples have the same weight.
-
-    Parameters as `phase_information`. At full contrast without read noise twice the bound's.
-    """
+    """Variance (rad²) of one frame with equal weights: twice the bound's at full contrast."""
     square = spread.amplitude**2
     noise = np.asarray(iota, float)[..., None] * spread.level + variance
     power = np.asarray(alpha, float) ** 2 * spread.mean(square) ** 2
@@ -79,11 +72,9 @@ def unweighted_variance(
 
 
 def sampling_loss(iota: float, alpha: float, variance: float, phases: F64) -> tuple[float, float]:
-    """Frames needed with given phases, over those with uniform ones: median and worst fringe phase.
+    """Frames needed with given phases (t,), over uniform ones: at the median and worst phase.
 
-    A few phases (t,) rad, taken again and again, leave some pixels with less than others, and make
-    iota, alpha and phase mix; infinite where they do not determine the three. Other parameters as
-    `phase_information`.
+    Few phases favour some pixels and mix iota, alpha and phase: infinite where they are not told.
     """
     psi = 2 * np.pi * np.arange(TURN) / TURN
     information = np.zeros((TURN, 3, 3))
@@ -104,8 +95,7 @@ def sampling_loss(iota: float, alpha: float, variance: float, phases: F64) -> tu
 class WeightErrors:
     """Cost of wrong weights: relative increase in frames per squared error.
 
-    Weights ``(1 + e(u)) / variance`` raise the variance of the estimate by the variance of e over
-    the phases, each phase counting with its information (second order; the first vanishes).
+    Weights ``(1 + e(u)) / variance`` add the variance of e over the phases, by their information.
     """
 
     # for each e-² of a constant error of a sample's variance: a wrong bias or read noise

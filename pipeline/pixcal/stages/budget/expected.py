@@ -143,10 +143,9 @@ class SetBound:
         return float(np.median(variance)), float(variance.max()) * self.loss[1] / self.loss[0]
 
     def shares(self) -> dict[str, float]:
-        """Photon-limited variance, and the factors that increase it.
+        """Variance (px²) by ``photons`` alone, of one frame, and the factors that increase it.
 
-        ``photons`` is the variance (px²) of one frame of a pixel in the brightest light, at full
-        contrast, without other noise; each factor is for what its name says, given those before.
+        Each factor is for what its name says, given those before.
         """
         peak = float((self.iota + self.alpha).max())
         bright = np.array([peak / 2])
@@ -191,10 +190,7 @@ class JoinedBound:
         return ("delta_x", "delta_y") if both else ("delta_fringe",)
 
     def variance(self, frames: Shares, *, worst: bool = False) -> F64:
-        """Variance of each component (component, pixel), px², with so many frames of each set.
-
-        Shares of one frame will do; with ``worst`` at the least favourable fringe phases.
-        """
+        """Variance (component, pixel), px², with so many frames, or shares of one, of each set."""
         xx, xy, yy = np.zeros((3, len(self.sets[0].iota)))
         for n, s in zip(frames, self.sets, strict=True):
             weight = n * s.information / (s.loss[1] / s.loss[0] if worst else 1.0)
@@ -287,7 +283,6 @@ def flat_error(bench: Bench) -> float | None:
 def flats_needed(errors: WeightErrors, level: float, variance: float) -> int:
     """Flats of a level (e-) whose noise costs less than `NEGLIGIBLE` of the fringe frames.
 
-    A flat's error scales iota and alpha alike and leaves their phase, and its error, as they are;
-    only weights that come from neighbouring pixels take notice.
+    A flat's error leaves the phase: only weights from neighbouring pixels take notice.
     """
     return max(1, ceil(errors.scale * (level + variance) / level**2 / NEGLIGIBLE))

@@ -166,11 +166,7 @@ class PairSums:
 def read_sums(
     pair: Pair, runtime: Runtime, keep: tuple[Projection, float] | None = None
 ) -> PairSums:
-    """Read both sides once.
-
-    With ``keep`` pixels are left out whose difference, without these modes, is larger than so many
-    errors.
-    """
+    """Read both sides once, without pixels that differ, but for modes, by more than ``keep``."""
     task = partial(_sums_task, pair, keep)
     results = run_tasks(task, pair.tiles(), runtime, label=f"sums {pair.name}")
     groupings, *pieces = zip(*results, strict=True)

@@ -209,10 +209,9 @@ def _warnings(sides: Sequence[Side], components: dict[str, Vector]) -> list[str]
 def describe(
     pair: Pair, sums: PairSums, pixels: Pixels, limit: float, accuracy: float
 ) -> tuple[dict[str, Any], ComponentView]:
-    """Results and figure of one component, its sums without the outlying pixels.
+    """Results and figure of one component, its sums without pixels off by ``limit`` sigma.
 
-    Those are off by more than ``limit`` sigma; ``accuracy`` is the relative error of SIGMA to
-    tolerate.
+    ``accuracy``: relative error of SIGMA to tolerate.
     """
     known, (ny, nx) = int(pixels.pulls.sum()), pair.window
     profiles = {name: sums.differences(s) for name, s in sums.profiles.items()}

@@ -93,10 +93,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
 
 def attempt(run_dir: Path, config: Config, runtime: Runtime) -> str | None:
-    """As `run`, but what makes a correction impossible is returned, not raised.
-
-    Corrected maps of another fit are removed then.
-    """
+    """As `run`, but what makes a correction impossible is returned, and stale maps are removed."""
     try:
         run(run_dir, config, runtime)
     except (InputError, ArithmeticError, LookupError, MemoryError, ValueError) as error:

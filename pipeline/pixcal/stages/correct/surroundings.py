@@ -27,9 +27,8 @@ SIGNS = ((0, 0), (0, 1), (1, 0), (1, 1))
 def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, phase: F64) -> list[FringeMaps]:
     """The maps with unknown pixels perturbed by their errors, in the patterns of `SIGNS`.
 
-    Pixels (y, x) that are ``unknown`` may have any light from none to twice that around them; those
-    ``beyond`` the window have known light, and unknown offsets that scatter as a ``phase`` (y, x)
-    does from pixel to pixel, rad.
+    ``unknown``: of any light up to twice that around them; ``beyond``: the window, of unknown
+    offsets that scatter as a ``phase`` (y, x), rad, does.
     """
     apart = np.abs(np.diff(phase, axis=1))
     apart = apart[np.isfinite(apart)]
@@ -77,10 +76,9 @@ def _misfit(swept: Swept, side: int, is_open: bool) -> float:
 
 
 def border_misfit(theta: F64, k: tuple[float, float], good: Mask) -> float:
-    """Chi-square of the first line of pixels against an extrapolation of the next ones.
+    """Chi-square of the first line of a strip (3, line, pixel) against the next ones' trend.
 
-    Of maps (3, line, pixel) of the strip along a side, the line at the border first; ``k`` is along
-    the lines and from line to line, rad/px.
+    ``k``: along the lines and from line to line, rad/px.
     """
     lines, pixels = good.shape
     y, x = np.arange(lines)[:, None], np.arange(pixels)

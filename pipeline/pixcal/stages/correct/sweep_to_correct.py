@@ -120,11 +120,7 @@ def usable(theta: F64, mask: U8) -> Mask:
 
 
 def maps_of(swept: Swept, part: Part) -> tuple[FringeMaps, Mask, Mask]:
-    """Fitted maps of a part; unknown pixels are interpolated.
-
-    With them, (y, x), pixels that have an offset, and those whose light is known, flagged ones
-    included.
-    """
+    """Maps of a part, unknown pixels interpolated; pixels with an offset, and of known light."""
     there = swept.within(part)
     theta = fitted_theta(swept.folder, there, swept.carrier.reference)
     mask = ArrayReader(swept.folder / "mask").read(*there)
@@ -186,15 +182,10 @@ def corrected(maps: FringeMaps, effects: Sequence[Effect]) -> tuple[FringeMaps, 
 
 @dataclass
 class RestoredSet(ReducedSet):
-    """A set as `ReducedSet`, its samples freed of effects as they are read.
+    """A set as `ReducedSet`, its samples freed of ``effects``, in order, as they are read.
 
-    Parameters
-    ----------
-    folder : ``RUN/reduce/reduced.zarr/<set name>``
-    effects : in the order in which they are undone
-    calibration : ``calibration.zarr``: samples were divided by its flat, after its dark signal was
-        taken off
-    exptime_s : (t,) float32, of each frame
+    ``folder``: ``RUN/reduce/reduced.zarr/<set name>``. ``calibration``: whose flat and dark samples
+    have without. ``exptime_s``: (t,).
     """
 
     effects: tuple[Effect, ...]

@@ -87,9 +87,8 @@ def parameter_variance(
 ) -> list[F64]:
     """Variance of the phase (y, x), rad², from the errors of each effect's parameters.
 
-    If their covariance and `Effect.phase_slopes` are known, all parameters are taken together.
-    Otherwise they are moved one by one and their squared changes added. Modes that the fit removes
-    are subtracted tile by tile: ``inside`` is the tile within maps that include its surroundings.
+    All together where covariance and `Effect.phase_slopes` are known, else one by one; less the
+    modes that the fit removes, of the tile ``inside`` the maps.
     """
     variances = []
     for treatment in swept.treatments:

@@ -177,18 +177,10 @@ def _solve(
 def cost_map(
     paths: CrestPaths, fit: CrestFit, distance: F64, second: F64, *, ratio: bool, refit: bool
 ) -> F64:
-    """Cost of equation 7 over distance and baseline, or over distance and their ratio (figure 17).
+    """Cost (d, s) of equation 7 over distance and B (mm) or, with ``ratio``, B / D: figure 17.
 
-    Returns (d, s): sum of ``(residual / sigma)²``, priors of the parameters fitted again included.
-
-    Parameters
-    ----------
-    fit : the minimum, whose errors, outliers and priors are taken over; priors of distance and
-        length do not count: the map shows what the points say of these
-    distance, second : (d,), (s,) mm; of B in mm or, with ``ratio``, of B / D, where B is the length
-        in the detector's plane
-    refit : whether centre, direction and tilt of the baseline are fitted again at each place, as
-        the phase always is; else they are those of the minimum
+    The minimum ``fit`` gives errors, outliers and priors, but those of distance and length.
+    ``refit``: centre, direction and tilt too are fitted again at each place, as the phase is.
     """
     few = _thinned(paths, fit)
     lengths = np.multiply.outer(distance if ratio else np.ones_like(distance), second)
@@ -244,10 +236,7 @@ def falls_then_rises(cost: F64) -> bool:
 def agreement(
     paths: CrestPaths, fit: CrestFit, facts: Mapping[str, Any] | None
 ) -> tuple[dict[str, Any] | None, str]:
-    """Differences to the geometry in a set's part of ``fit.json``, or why there are none.
-
-    Parameter by parameter (mm), and of the phases that both predict over the frame (px).
-    """
+    """Differences to the geometry of a set in ``fit.json`` (mm, and phases, px), or why none."""
     if facts is None:
         return None, "RUN/fit is not there yet"
     if facts["model"] != "hyperbolic":

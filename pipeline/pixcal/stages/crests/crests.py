@@ -116,14 +116,9 @@ def find_crests(
 ) -> CrestPaths:
     """Crests and valleys, from frames that are read one by one.
 
+    ``accumulate``: makes the sums of a frame; called twice more for the first. ``frame``: (y, x)
+    size. ``k``: near its centre, rad/px. ``segment``: pixels along the fringes that share a point.
     Raises InputError if there are too few fringes, or too few windows show them.
-
-    Parameters
-    ----------
-    accumulate : makes the sums of a frame; called once for each, and twice more for the first
-    frame : (y, x) size
-    k : fringe vector (kx, ky) near the frame's centre, rad/px
-    segment : pixels along the fringes that share a point; an eighth of the frame, 8 to 128
     """
     carrier, windows = CrestCarrier.straight(k, frame), Windows.lay(frame, k, segment)
     for _ in range(SETTLING):

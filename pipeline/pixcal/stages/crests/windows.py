@@ -129,9 +129,9 @@ def tile_sums(
     windows: Windows,
     carrier: CrestCarrier,
 ) -> tuple[tuple[int, int], F64]:
-    """Sums (across, along, N_SUMS) of the windows that a tile touches, and the first one's numbers.
+    """Sums (across, along, N_SUMS) of the windows a tile touches, and the first one's numbers.
 
-    Of electrons (y, x) and the samples to use, from pixel ``start`` (y, x) of the frame on.
+    ``signal, good``: e- and samples to use (y, x), from pixel ``start`` (y, x) of the frame on.
     """
     y, x = ((at, at + n) for at, n in zip(start, signal.shape, strict=True))
     (i0, i1), (j0, j1) = windows.touched(y, x)
@@ -161,11 +161,10 @@ def _add(
     frame: F64,
     sums: F64,
 ) -> None:
-    """Add the samples of a tile to ``sums``, whose [0, 0] is the window numbered ``first``.
+    """Add a tile's samples to ``sums``, whose [0, 0] is window ``first``.
 
-    ``layout`` holds the direction cosines (x, y) across the fringes, first edge and size of the
-    windows across and along, px; ``polynomials``, of phase and light, are ``c[i, j] Y^i X^j`` of
-    ``X = (x - frame[0]) / frame[2]``, ``Y = (y - frame[1]) / frame[2]``.
+    ``layout``: direction cosines (x, y), first edge and size of windows across and along, px.
+    ``polynomials`` of phase and light: ``c[i, j] Y^i X^j`` of pixels about ``frame``.
     """
     ux, uy, edge_u, edge_v, width, length = layout
     carrier, light = polynomials
@@ -207,11 +206,9 @@ def _add(
 
 
 def solve_windows(sums: F64) -> tuple[F64, F64, F64]:
-    """Phase of each window from its sums (window, N_SUMS), its error and its light.
+    """Phase, error (infinite if unknown) and light of each window, from sums (window, N_SUMS).
 
-    The phase is delta in ``cos(P + delta)`` at the window's centre, rad, in ±pi; the error is from
-    the scatter about the model, rad, infinite where nothing can be said; the light is the mean at
-    the centre, in units of the illumination.
+    Delta in ``cos(P + delta)`` at the centre, ±pi rad; error by the scatter about the model, rad.
     """
     count = sums[:, -1]
     phase, background = np.zeros(len(sums)), np.zeros(len(sums))

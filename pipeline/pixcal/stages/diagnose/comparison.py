@@ -59,11 +59,7 @@ def shrinkage(data: Mapping[Key, F64], nominal: Trial, other: Trial, where: set[
 
 
 def gap_interval(data: Mapping[Key, F64], shrunk: Shrinkage, other: Trial) -> tuple[float, float]:
-    """Interval (5 to 95 %) of the gap that some effects leave.
-
-    From expectations shifted by their own scatter, of all curves: what opens where there was no gap
-    counts too.
-    """
+    """Interval (5 to 95 %) of the gap that effects leave in all curves, by their scatter."""
     total = shrunk.gap.total
     if not shrunk.where:
         return min(0.0, total), total
@@ -111,10 +107,9 @@ class Comparison:
         significance: float = np.inf,
         beside: Trial | None = None,
     ) -> Trial:
-        """A bench with some effects, from the curves of its simulations.
+        """A bench with effects, from the curves of its simulations.
 
-        The strength of the effect that is added to those of ``beside`` has a relative error of one
-        over its ``significance``, sigma.
+        What is added to ``beside`` has a strength known to one over its ``significance``, sigma.
         """
         error = 1 / max(significance, 1.0)
         start = None if beside is None else beside.expected
@@ -135,11 +130,7 @@ class Comparison:
         return with_it.log_likelihood - without.log_likelihood
 
     def gain_where_differing(self, start: Trial, trial: Trial, own: Key) -> float:
-        """Rise of the log-likelihood by the test statistics that differ from ``start``.
-
-        ``own`` is the significance of the effect that is added: one statistic, not the worst of
-        all.
-        """
+        """Rise of the log-likelihood by what differs from ``start``; ``own``: its significance."""
         gains = likelier(self.data, start.expected, trial.expected)
         differences = compare(self.data, start.expected)
         where = flagged(differences)
@@ -173,10 +164,7 @@ class Comparison:
         return left > STAYS * sizes[top]
 
     def replay_fits_better(self, replay: Trial, law: Trial) -> bool:
-        """Whether a replay is likelier than the law, or leaves less of the gap.
-
-        A law that leaves single frames to chance allows for more, and may be as likely for that.
-        """
+        """Whether a replay is likelier than the law, or leaves less of the gap."""
         if replay.log_likelihood > law.log_likelihood:
             return True
         where = self.gap_of(replay, law)

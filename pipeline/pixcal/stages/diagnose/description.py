@@ -88,10 +88,7 @@ def recordings_of(
     evidence: Sequence[Evidence],
     halves: Sequence[Half],
 ) -> tuple[list[Recording], list[tuple[str, Indices]], dict[int, F64]]:
-    """Recordings, where their frames are, and the light of the frames of flats by their number.
-
-    In electrons for unit response; NaN in frames that are not looked at.
-    """
+    """Recordings, where their frames are, and light of each flat: e- for unit response, or NaN."""
     start = _start(tables)
     listed = {f"fringes/{s.name}": n for n, s in enumerate(acquisition.frames.fringes)}
     recordings, places, light = [], [], {}

@@ -85,10 +85,7 @@ class FlatLight:
     def levels(
         self, recordings: Sequence[Recording], before: IntensityBeforeEffects
     ) -> dict[int, float]:
-        """Electrons of the flats, by number, before some effects acted.
-
-        Of one lamp they lie on a line over exposure time; a level of another is as measured.
-        """
+        """Electrons of the flats, by number, before effects; of one lamp, linear in time."""
         flats = [r for r in recordings if r.kind == "flat" and r.electrons > 0]
         if not flats:
             return {}

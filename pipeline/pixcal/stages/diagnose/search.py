@@ -235,7 +235,7 @@ class Search:
         return {n: c.significance * shares.get(n, 1.0) for n, c in self._remaining.items()}
 
     def _reject_undecided(self) -> None:
-        """Leave out the weakest candidates where all would take more simulations than are left."""
+        """Leave out the weakest where all would take more simulations than are left at the end."""
         causes, remaining, sizes = self._causes, self._remaining, self._sizes()
         count = len(causes.effects) + 1
         weighed = count * (2 * CONFIRM + SCREEN) + count * (count - 1) // 2 * CONFIRM
@@ -260,9 +260,9 @@ class Search:
     def _tried(self) -> tuple[Additions, Additions]:
         """Each candidate added to the causes: its likeliest variant by law, and its replay.
 
-        A replay of single frames may imitate what another effect does by its law, so it is kept
-        apart. One simulation of every variant shows which are promising; the others are simulated
-        further if none of these gains enough, and else wait for the next round.
+        A replay may imitate what another effect does by its law, so it is kept apart. One
+        simulation each shows which variants are promising; others wait if one of these gains
+        enough.
         """
         causes, remaining = self._causes, self._remaining
         options = [
@@ -301,11 +301,7 @@ class Search:
         *,
         drop: bool = True,
     ) -> list[Addition]:
-        """Variants added to the causes; log-likelihoods allow for other laws of these.
-
-        Candidates none of whose variants can be simulated are no longer among the remaining, if
-        they are to ``drop``.
-        """
+        """Variants added to the causes, by log-likelihoods; ``drop`` those not simulated."""
         causes, candidates = self._causes, self._candidates
         beside = self._start(causes.bench, simulations)
         start = self.comparison.allowing_for_laws(beside, causes.current)
@@ -402,11 +398,7 @@ class Search:
     def _needless(
         self, effects: Mapping[str, Effect], current: Trial
     ) -> tuple[str, str, Trial] | None:
-        """A cause that others make needless as they were measured, whatever their laws.
-
-        With the one that does, and the bench without the cause. Only causes of the same step of the
-        light's way and of the same domains can stand in for each other so.
-        """
+        """A cause made needless by another of the same step and domains; the bench without it."""
         candidates = self._candidates
         for name in sorted(effects, key=lambda n: candidates[n].significance):
             own = effects[name]

@@ -142,11 +142,10 @@ def _start(
 
 
 def _choose(model: str, tiles: TileSums, start: Start) -> tuple[SetFit, str]:
-    """Fit the shape asked for; ``auto`` takes hyperbolic fringes where the map asks for them.
+    """Fit the shape asked for; ``auto``: hyperbolic fringes where the map asks for them.
 
-    True offsets have structure of their own at large scales (stitches), which any richer shape
-    takes for curvature. How much, a polynomial tells: what it finds beyond the hyperbolic shape is
-    what curvature of no cause amounts to here.
+    True structure at large scales passes for curvature: as much as a polynomial finds beyond the
+    hyperbolic shape is of no cause.
     """
     shapes = fringe_models()
     if model != "auto":
