@@ -14,9 +14,13 @@ from blind_examination.cases import effects_of
 from blind_examination.draw import Truth
 from pixcal.effects import effects
 from pixcal.engine.run import Runtime
-from pixcal.estimators.test_statistics.expectation import Reference, expect_nominal, expect_with
+from pixcal.estimators.test_statistics.expectation import (
+    Reference,
+    expect_nominal,
+    expect_with,
+    signature_key,
+)
 from pixcal.estimators.test_statistics.gap import log_likelihood
-from pixcal.estimators.test_statistics.signature import signature_key
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect

@@ -12,8 +12,8 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.beams import Light
 from pixcal.kernels.scene import DetectorMaps
 from pixcal.simulation.effect import Effect
+from pixcal.simulation.forward import field_of, numbers, set_of, with_numbers
 from pixcal.simulation.light_fit import LightStart
-from pixcal.simulation.numbers import field_of, numbers, set_of, with_numbers
 from pixcal.simulation.replica import set_recordings
 
 DRAWS = 24

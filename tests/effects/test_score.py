@@ -14,9 +14,8 @@ from pixcal.engine.run import Runtime
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
-from pixcal.simulation.deviations import pair_sums, pair_variance
+from pixcal.simulation.deviations import common_precision, pair_sums, pair_variance
 from pixcal.simulation.effect import Estimate
-from pixcal.simulation.map_deviations import common_precision
 from pixcal.simulation.replica import Replica
 from pixcal.stages import diagnose, fit, ingest, reduce, simulate
 from pixcal.stages.diagnose.trial import estimate

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from pixcal.estimators.test_statistics import Curve, Key
-from pixcal.estimators.test_statistics.expectation import Reference
+from pixcal.estimators.test_statistics.expectation import Reference, signature_key
 from pixcal.estimators.test_statistics.gap import compare, flagged
-from pixcal.estimators.test_statistics.signature import signature_key
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult

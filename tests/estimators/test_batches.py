@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from pixcal.estimators.fringe_fit.batches import plan_batches
+from pixcal.estimators.fringe_fit.sweep import plan_batches
 
 
 def test_a_long_run_has_batches_of_500():

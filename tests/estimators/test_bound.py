@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
 from pixcal.estimators.fringe_fit.sweep import phase_bound
 from pixcal.estimators.fringe_fit.tile_fit import Tile
-from pixcal.stages.budget.bound import (
+from pixcal.stages.budget.expected import (
     FrameSpread,
     WeightErrors,
     phase_information,

@@ -8,10 +8,10 @@ import pytest
 
 from pixcal.kernels.scene import electrons_per_unit, fibre_light
 from pixcal.model.bench import Bench, load_bench
-from pixcal.stages.budget.bound import WeightErrors, phase_information
 from pixcal.stages.budget.expected import (
     JoinedBound,
     SetBound,
+    WeightErrors,
     bias_frames_needed,
     brightest_allowed,
     flat_error,
@@ -19,6 +19,7 @@ from pixcal.stages.budget.expected import (
     frames_needed,
     grid,
     joined,
+    phase_information,
     pixel_contrast,
     planned_split,
     sample_variance,

@@ -15,7 +15,7 @@ from pixcal.estimators.frame_series.series import (
     without,
 )
 from pixcal.estimators.frame_series.spectral_line import cleared_of_line, find_line
-from pixcal.estimators.frame_series.walk_modes import walk_modes
+from pixcal.estimators.frame_series.variance_components import walk_modes
 from pixcal.estimators.fringe_fit.tile_fit import Coding
 
 T = 297

@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.fringe_fit.batches import plan_batches
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
-from pixcal.estimators.fringe_fit.sweep import frames_to_prime, phase_bound, sweep_tile
+from pixcal.estimators.fringe_fit.sweep import (
+    frames_to_prime,
+    phase_bound,
+    plan_batches,
+    sweep_tile,
+)
 from pixcal.estimators.fringe_fit.tile_fit import Coding, Tile
 
 CODING = Coding(1.0, -300.0, 65535)

@@ -17,8 +17,8 @@ from pixcal.estimators.frame_series.variance_components import (
     sigmas,
     signed_sigmas,
     trace_products,
+    walk_modes,
 )
-from pixcal.estimators.frame_series.walk_modes import walk_modes
 from pixcal.kernels.processes import damped_walk
 
 T = 199

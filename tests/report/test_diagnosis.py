@@ -14,13 +14,12 @@ from PIL import Image
 from pixcal.estimators.test_statistics import DETECTOR, known_statistics
 from pixcal.estimators.test_statistics.look import STEPS
 from pixcal.estimators.test_statistics.noise import OUTLIERS
-from pixcal.report import curve_places, diagnosis_words
 from pixcal.report import diagnosis_maps as maps
+from pixcal.report import diagnosis_words
 from pixcal.report import page as page_module
 from pixcal.report.contents import Contents, DiagnosisContents, StageRecord
-from pixcal.report.curve_places import place, places
 from pixcal.report.diagnosis_figures import Bar, curves_figure, gap_figure
-from pixcal.report.diagnosis_words import percent, with_interval
+from pixcal.report.diagnosis_words import percent, place, places, with_interval
 from pixcal.report.drawing import png
 from pixcal.report.page import render, section
 from pixcal.report.tables import provenance
@@ -483,7 +482,7 @@ def test_names_of_places_are_those_of_the_battery() -> None:
     limits = [*(-x for x in OUTLIERS), *OUTLIERS]
     outliers = places({"x_label": "sigma, low then high", "x": limits})
     assert outliers == [f"{v:+.0f}".replace("-", "−") for v in limits]
-    assert set(curve_places._AXES) <= {s.x_label for s in known_statistics().values()}
+    assert set(diagnosis_words._AXES) <= {s.x_label for s in known_statistics().values()}
     assert diagnosis_words.DETECTOR == DETECTOR
 
 

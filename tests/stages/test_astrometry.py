@@ -27,14 +27,15 @@ from pixcal.stages.astrometry.detector import (
     free_from_modes,
     open_components,
 )
-from pixcal.stages.astrometry.error_map import place_errors, tile_side
 from pixcal.stages.astrometry.stars import (
     KINDS,
     Observation,
     Telescope,
     exposures,
     observe,
+    place_errors,
     star,
+    tile_side,
 )
 from pixcal.stages.astrometry.summary import scientific, table, with_error
 from pixcal.stages.fitted_shape import fitted_shape

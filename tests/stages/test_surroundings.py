@@ -7,7 +7,7 @@ from pixcal.effects.ipc import Ipc
 from pixcal.kernels.crosstalk import couple_fringes, uncouple_fringes
 from pixcal.model.flags import PixelFlag
 from pixcal.simulation.effect import FringeMaps
-from pixcal.stages.correct.surroundings import border_misfit, decided, disturbed
+from pixcal.stages.correct.correct_maps import border_misfit, decided, disturbed
 from pixcal.stages.correct.sweep_to_correct import usable
 
 K = (2 * np.pi / 9, 0.02)

@@ -9,7 +9,7 @@ from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.estimators.maps.corrected import phase_change
 from pixcal.kernels.boundaries import REACH, moved_charge
 from pixcal.simulation.effect import FringeMaps
-from pixcal.stages.diagnose.undone import FitOfFrames, undone_on_samples
+from pixcal.stages.diagnose.fitted_set import FitOfFrames, undone_on_samples
 
 SHAPE = (23, 31)
 BENT = Nonlinearity(-0.05, 0.02)

@@ -14,7 +14,7 @@ from pixcal.kernels.tracks import add_tracks, draw_tracks
 from pixcal.model.arrays import F32, F64, I64, Mask
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
-from pixcal.simulation.numbers import numbers
+from pixcal.simulation.forward import numbers
 from pixcal.simulation.shot import Shot
 
 MARGIN_PX = 16  # how far beside the window tracks may begin

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.walk_modes import walk_modes
+from pixcal.estimators.frame_series.variance_components import walk_modes
 from pixcal.kernels.processes import brownian
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best, sigmas_of_chi2
 from pixcal.kernels.synthesis import walk_normals

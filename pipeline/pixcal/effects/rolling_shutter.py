@@ -14,7 +14,7 @@ from pixcal.estimators.frame_series.row_settling import (
     steps_of,
 )
 from pixcal.estimators.frame_series.row_sums import RowRamp, RowSums, enough_frames
-from pixcal.estimators.maps.imprint import imprint, left_in_samples
+from pixcal.estimators.maps.corrected import imprint, left_in_samples
 from pixcal.kernels.synthesis import illuminate
 from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench

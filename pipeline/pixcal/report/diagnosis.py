@@ -5,13 +5,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from pixcal.report.contents import DiagnosisContents
-from pixcal.report.curve_places import place
 from pixcal.report.diagnosis_words import (
     DETECTOR,
     considered,
     effect_title,
     listed,
     percent,
+    place,
     with_interval,
     worst,
 )

@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from pixcal.model.arrays import F64
 from pixcal.report.colours import BAND, BLUE, GREY, INK, RED
 from pixcal.report.contents import DiagnosisContents
-from pixcal.report.curve_places import axis_label, places
-from pixcal.report.diagnosis_words import DETECTOR, effect_title, percent
+from pixcal.report.diagnosis_words import DETECTOR, axis_label, effect_title, percent, places
 from pixcal.report.drawing import TITLE, WIDE, Unit, axes_grid, finish, note, plain_ticks, unit_for
 from pixcal.report.text import unit
 

@@ -14,9 +14,15 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.arrays import F32, F64, Mask
-from pixcal.simulation.deviations import Change, SetDeviations, StackDeviations
+from pixcal.simulation.deviations import (
+    Change,
+    Deviation,
+    SetDeviations,
+    StackDeviations,
+    common_precision,
+    is_smooth,
+)
 from pixcal.simulation.forward import ForwardModel, Stage
-from pixcal.simulation.map_deviations import Deviation, common_precision, is_smooth
 from pixcal.simulation.replica import Replica
 
 Key = tuple[str | int, str]  # fringe set or number of a stack, and which of its deviations

@@ -8,12 +8,14 @@ it, with all that the fit absorbs taken off.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct
+from scipy.ndimage import median_filter
 
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import (
@@ -24,11 +26,17 @@ from pixcal.estimators.diagnosis.evidence import (
     free_frames,
 )
 from pixcal.estimators.fringe_fit.tile_fit import Coding
-from pixcal.estimators.maps.structure import without_outliers
+from pixcal.estimators.maps.structure import flattened, without_outliers
 from pixcal.estimators.test_statistics.look import Look, neighbour_sums
 from pixcal.model.arrays import F32, F64, Indices, Mask
-from pixcal.simulation.map_deviations import MAPS, Deviation, change_of_maps, weighed
 
+# of the smooth surface that maps of the nominal bench may have
+DEGREES = {"offset": 3, "contrast": 2, "light": 3}
+MAPS = tuple(DEGREES)
+WILD_STEP = 5.0  # robust deviations from which a step between neighbours is an outlier
+AROUND = 5  # pixels along the side of a pixel's surroundings
+# share of the changes of pixels by which they may differ from those of their surroundings
+ALONE = 0.5
 WILD = 8.0  # standard deviations beyond which a residual is an outlier
 HARMONICS = 2  # of the phase, with which parameters of the frames may go for reasons of the fit
 KNOWN = 0.02  # relative error of the variance that the noise model gives to parameters of a frame
@@ -37,6 +45,60 @@ Change = dict[str, NDArray[Any]]
 # rows and columns to neighbours in other rows and other columns
 DIAGONAL = ((1, 1), (1, -1), (1, 2), (1, -2), (2, 1), (2, -1))
 FRAMES_APART = (1, 2, 3, 4)
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Values that differ from what is nominal, and one over their variance."""
+
+    value: NDArray[Any]
+    weight: NDArray[Any]
+
+
+def weighed(maps: F64) -> Deviation:
+    """Maps less their smooth surfaces, weighed by what neighbours differ by; NaN by nothing."""
+    flat, weight = without_smooth(maps), np.zeros(maps.shape)
+    for own, out in zip(maps, weight, strict=True):
+        steps = np.diff(own, axis=1)
+        if np.isfinite(steps).any():
+            spread = 1.4826 * float(np.nanmedian(np.abs(steps))) / np.sqrt(2)
+            out[np.isfinite(own)] = 1 / max(spread**2, 1e-30)
+    return Deviation(flat, weight)
+
+
+def common_precision(maps: F64) -> F64:
+    """Inverse covariance (m, m) of the noise of maps (m, y, x) of the same pixels.
+
+    By the steps between neighbours along both axes, without those beyond `WILD_STEP` deviations.
+    """
+    steps = np.concatenate([np.diff(maps, axis=a).reshape(len(maps), -1) for a in (1, 2)], axis=1)
+    steps = steps[:, np.isfinite(steps).all(axis=0)]
+    usual = 1.4826 * np.median(np.abs(steps), axis=1, keepdims=True)
+    scaled = steps / np.maximum(usual, 1e-30)
+    scaled = scaled[:, (np.abs(scaled) < WILD_STEP).all(axis=0)]
+    size = np.sqrt(2) / np.maximum(usual[:, 0], 1e-30)
+    correlation = np.atleast_2d(np.corrcoef(scaled))
+    return np.asarray(np.linalg.pinv(correlation, hermitian=True) * np.outer(size, size))
+
+
+def is_smooth(maps: F64, weight: F64) -> bool:
+    """Whether maps (m, y, x) change from pixel to pixel by less than they do at large."""
+    around = np.stack([median_filter(own, AROUND, mode="reflect") for own in maps])
+    rough, whole = (float((weight * v**2).sum()) for v in (maps - around, maps))
+    return rough <= ALONE**2 * whole
+
+
+def change_of_maps(maps: F64, measured: Deviation) -> F64:
+    """Change of maps less smooth surfaces, on the pixels that were measured."""
+    return without_smooth(np.where(measured.weight > 0, maps, np.nan))
+
+
+def without_smooth(maps: F64) -> F64:
+    """Maps less their smooth surfaces; zero where there are none."""
+    degrees = [DEGREES[name] for name in MAPS] if len(maps) == len(MAPS) else [DEGREES["light"]]
+    return np.nan_to_num(
+        np.stack([flattened(own, degree) for own, degree in zip(maps, degrees, strict=True)])
+    )
 
 
 class _Deviations:

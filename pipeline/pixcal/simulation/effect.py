@@ -17,11 +17,10 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.arrays import F32, F64
 from pixcal.model.errors import InputError
-from pixcal.simulation.forward import DOMAINS, ForwardModel, Stage
+from pixcal.simulation.forward import DOMAINS, ForwardModel, Stage, numbers, with_numbers
 from pixcal.simulation.frame_changes import acts_on_frames_alone
 from pixcal.simulation.frame_fit import detect_in_frames, fit_frames
 from pixcal.simulation.light_fit import LightFit, LightStart, fit_light
-from pixcal.simulation.numbers import numbers, with_numbers
 from pixcal.simulation.score import score, score_again
 
 __all__ = ["DOMAINS", "SETS_DISAGREE", "Effect", "Estimate", "FringeMaps", "LightStart", "Stage"]

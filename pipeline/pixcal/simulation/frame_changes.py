@@ -20,8 +20,7 @@ from pixcal.estimators.frame_series.spectral_line import Line
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.arrays import F64
 from pixcal.model.bench import Bench
-from pixcal.simulation.forward import ForwardModel
-from pixcal.simulation.numbers import field_of, numbers, with_numbers
+from pixcal.simulation.forward import ForwardModel, field_of, numbers, with_numbers
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import set_recordings
 

@@ -26,8 +26,7 @@ from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.scene import DetectorMaps
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import C128, F64, Indices, Mask
-from pixcal.simulation.forward import ForwardModel
-from pixcal.simulation.numbers import field_of, numbers, set_of, with_numbers
+from pixcal.simulation.forward import ForwardModel, field_of, numbers, set_of, with_numbers
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import set_recordings
 

@@ -24,8 +24,7 @@ from pixcal.estimators.frame_series.variance_components import log_chance, log_c
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64
 from pixcal.simulation.changes import LINEAR, Changes, Key, Template, Way
-from pixcal.simulation.forward import ForwardModel
-from pixcal.simulation.numbers import field_of, numbers, with_numbers
+from pixcal.simulation.forward import ForwardModel, field_of, numbers, with_numbers
 
 STEP = 1.1  # factor on a parameter for its derivative
 # factors on the default of a parameter that is no strength, where the score test is made too, and

@@ -10,7 +10,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.model.arrays import F64, Indices
 from pixcal.model.errors import InputError
-from pixcal.stages.fit.scouting import read_frames
+from pixcal.stages.fit.sweep import read_frames
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.cube import ArrayReader

@@ -15,8 +15,11 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import STRIPE, Evidence, FringeEvidence, Stack
 from pixcal.estimators.frame_series.light import LIGHT_PARTS, FrameLight
-from pixcal.estimators.frame_series.variance_components import Modes, estimate_components
-from pixcal.estimators.frame_series.walk_modes import walk_modes
+from pixcal.estimators.frame_series.variance_components import (
+    Modes,
+    estimate_components,
+    walk_modes,
+)
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.model.arrays import F32, F64, Mask
 

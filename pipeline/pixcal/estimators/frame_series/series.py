@@ -12,8 +12,12 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
-from pixcal.estimators.frame_series.variance_components import Modes, estimate_components
-from pixcal.estimators.frame_series.walk_modes import WalkModes, walk_modes
+from pixcal.estimators.frame_series.variance_components import (
+    Modes,
+    WalkModes,
+    estimate_components,
+    walk_modes,
+)
 from pixcal.kernels.frame_order import with_neighbours
 from pixcal.model.arrays import F64, Indices, Mask
 

@@ -11,9 +11,10 @@ Biometrics 51, 1440), which converges faster.
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
+from scipy.linalg import eigh_tridiagonal
 from scipy.optimize import brentq
 from scipy.special import ndtri_exp
 
@@ -26,6 +27,7 @@ _DOUBLINGS = 60  # of an error in search of the upper limit of a size
 HALVINGS = 12  # of a step that does not make the data likelier
 FAR = 1e3  # growth by the first step of the signals from which they are found before the noise
 NEAR = 2.0  # growth from which the average information makes the steps
+SHORTEST = 0.1  # step in time, of the median one, that shorter ones count as
 
 
 def trace_products(weight: F64, parts: F64) -> F64:
@@ -268,3 +270,38 @@ def log_chance_of_any(log_chances: Sequence[float]) -> float:
 def sigmas(log_chance: float) -> float:
     """Standard deviations of a normal variable beyond which lies a chance, by its logarithm."""
     return -float(ndtri_exp(min(log_chance, -1e-6)))
+
+
+# Modes of a series in which white noise and a random walk are independent
+
+
+@dataclass(frozen=True, eq=False)
+class WalkModes:
+    """Modes of series of t frames."""
+
+    vectors: F64  # (t - 1, t) orthonormal, slowest first
+    walk: F64  # (t - 1,) variance, s, of the modes of a random walk of unit variance a second
+
+    def of(self, series: F64) -> F64:
+        """Modes (t - 1, ...) of series (t, ...)."""
+        return np.asarray(np.tensordot(self.vectors, series, 1))
+
+    def series(self, modes: F64) -> F64:
+        """Series (t, ...), without mean, of some modes (t - 1, ...)."""
+        return np.asarray(np.tensordot(self.vectors.T, modes, 1))
+
+
+def walk_modes(time_s: F64) -> WalkModes:
+    """Modes of series at some times (t,), ascending, s."""
+    return _modes(np.ascontiguousarray(time_s, float).tobytes())
+
+
+@lru_cache(maxsize=16)
+def _modes(times: bytes) -> WalkModes:
+    steps = np.diff(np.frombuffer(times))
+    usual = float(np.median(steps)) if len(steps) else 1.0
+    # The inverse of a walk's covariance without the mean: differences of neighbours, weighted.
+    weight = 1 / np.maximum(steps, SHORTEST * usual if usual > 0 else 1.0)
+    diagonal = np.append(weight, 0.0) + np.append(0.0, weight)
+    values, vectors = eigh_tridiagonal(diagonal, -weight)
+    return WalkModes(np.ascontiguousarray(vectors.T[1:]), 1 / values[1:])

@@ -6,15 +6,47 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtr
 
-from pixcal.estimators.test_statistics import Curve, Key
-from pixcal.estimators.test_statistics.signature import statistic_named
+from pixcal.estimators.test_statistics import DETECTOR, Curve, Key, Statistic, known_statistics
 from pixcal.model.arrays import F64
 
+STRAIGHT = 10.0  # standard deviations beyond which they count by their logarithm
+_PREFIX, _INFIX = "estimate_of_", "_in_"
 Curves = Mapping[Key, Curve]
 
 TOLERANCE = 0.05  # share of what an effect does that its simulation may be wrong by
 # standard deviations from which one value of a curve is changed, whatever the others are
 STANDS_OUT = 2.5
+
+
+def signature_key(effect: str, domain: str) -> Key:
+    """Key of the signature of an effect that shows in a domain."""
+    return f"{_PREFIX}{effect}{_INFIX}{domain}", DETECTOR
+
+
+def signature_curve(significance: float) -> Curve:
+    """The curve, of one value."""
+    size = abs(significance)
+    if size > STRAIGHT:
+        size = STRAIGHT * (1 + float(np.log(size / STRAIGHT)))
+    return Curve(np.zeros(1), np.array([float(np.copysign(size, significance))]))
+
+
+def statistic_named(name: str) -> Statistic:
+    """A statistic of the test statistics, or the signature of an effect."""
+    if name in known_statistics():
+        return known_statistics()[name]
+    effect, _, domain = name.removeprefix(_PREFIX).rpartition(_INFIX)
+    title = f"detection significance of {effect}"
+
+    def nothing(_: object) -> None:
+        return None
+
+    return Statistic(
+        name, title, domain, "significance", "σ", "", "linear", False, False, FLOOR, nothing
+    )
+
+
+FLOOR = 0.7  # of a significance, by chance, at least
 
 
 def scaled(values: F64, usual: F64) -> F64:

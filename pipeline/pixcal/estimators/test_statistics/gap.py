@@ -13,8 +13,7 @@ import numpy as np
 from scipy.special import ndtri_exp, stdtr
 
 from pixcal.estimators.test_statistics import Key
-from pixcal.estimators.test_statistics.expectation import Expectation
-from pixcal.estimators.test_statistics.signature import statistic_named
+from pixcal.estimators.test_statistics.expectation import Expectation, statistic_named
 from pixcal.model.arrays import F64
 
 ALLOWED = 2.0  # standard deviations that a value may be off by before it counts as a gap

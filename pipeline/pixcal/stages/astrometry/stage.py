@@ -42,14 +42,17 @@ from pixcal.stages.astrometry.detector import (
     generator,
     open_components,
 )
-from pixcal.stages.astrometry.error_map import ErrorMaps, error_maps, place_errors, tile_side
 from pixcal.stages.astrometry.stars import (
+    ErrorMaps,
     Observation,
     Telescope,
     core_weights,
+    error_maps,
     exposures,
     observe,
+    place_errors,
     star,
+    tile_side,
 )
 from pixcal.stages.astrometry.summary import TARGET_PX, axis_facts, table
 from pixcal.stages.fitted_shape import fitted_shape

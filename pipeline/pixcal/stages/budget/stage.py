@@ -27,7 +27,6 @@ from pixcal.model.errors import InputError, naming
 from pixcal.model.options import Budget as Config
 from pixcal.report.budget_figures import budget_figure
 from pixcal.report.drawing import png
-from pixcal.stages.budget.bound import phase_information, unweighted_variance
 from pixcal.stages.budget.expected import (
     JoinedBound,
     SetBound,
@@ -40,9 +39,11 @@ from pixcal.stages.budget.expected import (
     frames_needed,
     joined,
     own_effects,
+    phase_information,
     pixel_contrast,
     planned_split,
     sample_variance,
+    unweighted_variance,
 )
 from pixcal.storage.manifest import digest, write_json, write_whole
 

@@ -27,9 +27,8 @@ from pixcal.model.options import Fit as Config
 from pixcal.model.options import Sweep
 from pixcal.simulation.effect import Effect
 from pixcal.stages import fit
-from pixcal.stages.correct.correct_maps import correct_sweep
+from pixcal.stages.correct.correct_maps import correct_sweep, sides_of
 from pixcal.stages.correct.gain import Maps, measure_gain, worsened
-from pixcal.stages.correct.surroundings import sides_of
 from pixcal.stages.correct.sweep_to_correct import RestoredSet, Swept
 from pixcal.stages.correct.uncertainty import parameter_errors
 from pixcal.stages.diagnose.look import ESTIMATE_BYTES, EVIDENCE_BYTES
@@ -37,7 +36,7 @@ from pixcal.stages.diagnose.windows import chosen_windows
 from pixcal.stages.evidence import Part, load_evidence
 from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
 from pixcal.stages.fit.maps import Totals, write_maps
-from pixcal.stages.fit.products import header_of, publish_maps, published
+from pixcal.stages.fit.stage import header_of, publish_maps, published
 from pixcal.stages.fit.sweep import load_run, sweep_set
 from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.stages.reduce.ingested import Ingested

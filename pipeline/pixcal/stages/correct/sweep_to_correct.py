@@ -17,7 +17,7 @@ from pixcal.model.arrays import F32, F64, U8, U16, Mask
 from pixcal.model.errors import InputError
 from pixcal.model.flags import PixelFlag
 from pixcal.simulation.effect import Effect, FittedFrames, FringeMaps
-from pixcal.stages.diagnose.undone import undone_on_samples
+from pixcal.stages.diagnose.fitted_set import undone_on_samples
 from pixcal.stages.evidence import Part, fitted_theta
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.treatment import Treatment

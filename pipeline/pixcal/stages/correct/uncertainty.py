@@ -17,7 +17,7 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages.correct.sweep_to_correct import Swept, corrected, maps_of
-from pixcal.stages.fit.scouting import scout_tiles
+from pixcal.stages.fit.sweep import scout_tiles
 
 # peak of a tile's task for each of its pixels, those around it included (measured),
 PIXEL_BYTES = 500

@@ -3,19 +3,148 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
-from pixcal.estimators.maps.corrected import corrected_offsets, phase_change, straight_modes
+from pixcal.estimators.maps.corrected import (
+    MIN_SIGNAL,
+    corrected_offsets,
+    phase_change,
+    straight_modes,
+    usual_fringe,
+)
 from pixcal.estimators.maps.structure import OffsetModel, smooth_surface, true_offsets
+from pixcal.kernels.beams import LightMaps, with_margin
 from pixcal.kernels.crosstalk import filled
 from pixcal.model.arrays import F32, F64, Mask
+from pixcal.model.bench import SimulatedDetector
 from pixcal.simulation.effect import Effect, FittedFrames, FringeMaps
-from pixcal.stages.diagnose.undone import FitOfFrames, undone_on_samples
 
+ACROSS = 9  # pixels along the side of a frame whose level is undone
+MAP_PHASES = 12  # spread over a fringe, at which an effect on samples is undone
+_PHASES = 2 * np.pi * np.arange(MAP_PHASES) / MAP_PHASES
+_EVEN = np.stack([np.ones(MAP_PHASES), np.cos(_PHASES), np.sin(_PHASES)], axis=1)
+TURNS = 5  # of the fits of pixels and frames: each gains a factor of three or more
 # degree, over a window, of the logarithm of the contrast of two Gaussian beams (their intensities'
 # ratio is the exponential of a quadratic form)
 TWO_BEAMS = 2
+
+
+@dataclass(frozen=True)
+class IntensityBeforeEffects:
+    """Levels of even light as they were before effects that are undone on samples."""
+
+    effects: Sequence[Effect]
+    detector: SimulatedDetector
+
+    def levels(self, levels: F64) -> F64:
+        """Even frames of these levels (e-) without the effects."""
+        frames = np.broadcast_to(levels[:, None, None], (len(levels), ACROSS, ACROSS))
+        found = start = np.asarray(frames, np.float32)
+        for effect in sorted(self.effects, key=lambda e: e.turn, reverse=True):
+            undone = effect.undo_samples(found)
+            found = found if undone is None else undone
+        if found is start:
+            return levels
+        return np.asarray(found[:, ACROSS // 2, ACROSS // 2], float)
+
+
+def undone_on_samples(
+    effect: Effect, maps: FringeMaps, fit: "FitOfFrames | None" = None, *, beyond: bool = False
+) -> FringeMaps | None:
+    """Maps that a fit finds in frames without noise that an effect was undone on.
+
+    None where the effect is not one of samples.
+
+    Parameters
+    ----------
+    fit : of the frames that the maps were fitted to; by default their phases are spread evenly
+    beyond : the fringes go on beyond the edges of the maps, as where an effect is simulated; by
+        default the effect is undone on frames that end there
+    """
+    flat = np.ones(maps.theta.shape[1:]) if maps.flat is None else maps.flat
+    margin = effect.undo_halo if beyond else 0
+    light = with_margin(LightMaps(*(maps.theta * flat).astype(np.float32)), margin)
+    wide = np.stack([light.iota, light.alpha_sin, light.alpha_cos])
+    charge = np.einsum("tm,myx->tyx", _EVEN, wide).astype(np.float32)
+    undone = effect.undo_samples(charge)
+    if undone is None:
+        return None
+    rows, columns = (slice(margin, margin + n) for n in flat.shape)
+    change = (undone.astype(float) - charge)[:, rows, columns]
+    fit = FitOfFrames.of(maps, _EVEN) if fit is None else fit
+    return replace(maps, theta=maps.theta + fit.taken_up(change) / flat)
+
+
+@dataclass(frozen=True)
+class FitOfFrames:
+    """What a joint fit of pixels and frames takes up of a change that depends on the phase.
+
+    Where phases are few or not spread evenly, harmonics of a change have a part in the maps: by the
+    pixels' fit directly, and by the frames' parameters that the fit finds beside.
+    """
+
+    psi: F64  # (y, x) phase of the pixels, rad
+    # by_pixel, by_frames: (3, MAP_PHASES, y, x) weights by which a change at each of the phases is
+    # summed into the maps: that of the pixel itself, and that of all pixels against the phase of
+    # their own fringe
+    by_pixel: F32
+    by_frames: F32
+
+    @classmethod
+    def of(cls, maps: FringeMaps, g: F64) -> Self:
+        """From the maps, and (B, A cos phi, A sin phi) of the frames, (t, 3)."""
+        light = (maps.theta * (1.0 if maps.flat is None else maps.flat)).reshape(3, -1)
+        weight = 1 / np.maximum(g @ light, MIN_SIGNAL)
+        frames = _taken_by_frames(g, light)
+        normal = np.einsum("ti,tj,tp->pij", g, g, weight, optimize=True)
+        own = np.einsum("ti,tk,tp->pik", g, _between(_phase(g)), weight, optimize=True)
+        other = np.einsum("ti,tjk,tp,jp->pik", g, frames, weight, light, optimize=True)
+        shape = 3, MAP_PHASES, *maps.theta.shape[1:]
+        by_pixel, by_frames = (
+            np.moveaxis(np.linalg.solve(normal, right), 0, -1).reshape(shape).astype(np.float32)
+            for right in (own, -other)
+        )
+        return cls(np.arctan2(*maps.theta[1:]), by_pixel, by_frames)
+
+    def taken_up(self, change: F64) -> F64:
+        """Part (3, y, x) of the maps in a change (phase, y, x) of samples, in its unit."""
+        orders = np.arange(MAP_PHASES // 2 + 1)[:, None, None]
+        turned = np.fft.rfft(change, axis=0) * np.exp(-1j * orders * self.psi)
+        of_all = np.fft.irfft(turned.mean(axis=(1, 2)), MAP_PHASES)
+        return np.asarray(
+            np.einsum("mtyx,tyx->myx", self.by_pixel, change)
+            + np.einsum("mtyx,t->myx", self.by_frames, of_all)
+        )
+
+
+def _phase(g: F64) -> F64:
+    return np.arctan2(g[:, 2], g[:, 1])
+
+
+def _between(phase: F64) -> F64:
+    """Weights (..., MAP_PHASES) that interpolate to some phases by all harmonics."""
+    apart = phase[..., None] - _PHASES
+    orders = np.arange(1, MAP_PHASES // 2).reshape(-1, *[1] * apart.ndim)
+    last = np.cos(MAP_PHASES // 2 * apart)
+    return np.asarray((1 + 2 * np.cos(orders * apart).sum(axis=0) + last) / MAP_PHASES)
+
+
+def _taken_by_frames(g: F64, light: F64) -> F64:
+    """What the parameters (t, 3) of frames take of a change at each phase (MAP_PHASES)."""
+    psi, usual = usual_fringe(light, 2 * MAP_PHASES)
+    weight = 1 / np.maximum(g @ usual, MIN_SIGNAL)
+    of_pixels = np.einsum("tp,ti,tj->pij", weight, g, g)
+    of_frames = np.einsum("tp,ip,jp->tij", weight, usual, usual)
+    change = _between(psi + _phase(g)[:, None])
+    taken = np.zeros((len(g), 3, MAP_PHASES))
+    for _ in range(TURNS):
+        rest = change - np.einsum("ip,tik->tpk", usual, taken)
+        theta = np.linalg.solve(of_pixels, np.einsum("tp,ti,tpk->pik", weight, g, rest))
+        rest = change - np.einsum("ti,pik->tpk", g, theta)
+        taken = np.linalg.solve(of_frames, np.einsum("tp,ip,tpk->tik", weight, usual, rest))
+    return taken
 
 
 @dataclass(frozen=True)

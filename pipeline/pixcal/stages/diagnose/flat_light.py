@@ -10,7 +10,7 @@ from pixcal.estimators.detector.flat_ladder import LAMP, flicker, ladder, rise_o
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.arrays import F64
 from pixcal.simulation.recording import Recording
-from pixcal.stages.diagnose.undone import IntensityBeforeEffects
+from pixcal.stages.diagnose.fitted_set import IntensityBeforeEffects
 
 SERIES = 8  # frames of a series whose light is taken as it was in each; of fewer it is drawn
 

@@ -29,11 +29,10 @@ from pixcal.simulation.recording import SEEDS_APART, Recording
 from pixcal.simulation.replica import TOP_ADU
 from pixcal.simulation.shot import Shot
 from pixcal.stages import reduce
-from pixcal.stages.diagnose.fitted_set import FittedSet
+from pixcal.stages.diagnose.fitted_set import FittedSet, IntensityBeforeEffects
 from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_change
 from pixcal.stages.diagnose.parts import Half, Raw, Table, select
-from pixcal.stages.diagnose.undone import IntensityBeforeEffects
 
 _GAIN, _NOISE, _DARK = 101, 102, 103  # keys of random numbers
 HOT = 40.0  # robust standard deviations of the dark current beyond which a pixel is hot

@@ -11,7 +11,7 @@ from scipy.special import log_ndtr, ndtr
 
 from pixcal import __version__
 from pixcal.estimators.test_statistics import DETECTOR, Curve, Key
-from pixcal.estimators.test_statistics.expectation import Reference
+from pixcal.estimators.test_statistics.expectation import Reference, statistic_named
 from pixcal.estimators.test_statistics.gap import (
     Difference,
     flagged,
@@ -19,10 +19,9 @@ from pixcal.estimators.test_statistics.gap import (
     sigmas_among,
     sigmas_of,
 )
-from pixcal.estimators.test_statistics.signature import statistic_named
 from pixcal.model.arrays import F64
 from pixcal.model.config import to_plain
-from pixcal.report.curve_places import place
+from pixcal.report.diagnosis_words import place
 from pixcal.simulation.effect import DOMAINS
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
 from pixcal.stages.diagnose.comparison import Shrinkage, Trial, differing, gap_interval, shrinkage

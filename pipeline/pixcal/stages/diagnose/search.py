@@ -11,8 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from pixcal.estimators.test_statistics import Key
-from pixcal.estimators.test_statistics.expectation import Reference
-from pixcal.estimators.test_statistics.signature import signature_key
+from pixcal.estimators.test_statistics.expectation import Reference, signature_key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 from pixcal.simulation.effect import Effect

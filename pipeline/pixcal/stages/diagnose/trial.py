@@ -15,7 +15,7 @@ from pixcal.engine.bounds import Bound, Exceeded
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.evidence import Evidence, Level
 from pixcal.estimators.test_statistics import Curve, Key, measure
-from pixcal.estimators.test_statistics.signature import signature_curve, signature_key
+from pixcal.estimators.test_statistics.expectation import signature_curve, signature_key
 from pixcal.model.config import to_plain
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.simulation.effect import Again, Effect, Estimate

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from pixcal.estimators.fringe_fit.geometry import TilePlane, unwrap
-from pixcal.estimators.fringe_fit.models import FringeShape, Start, fringe_models
+from pixcal.estimators.fringe_fit.models import FringeShape, Polynomial, Start, fringe_models
 from pixcal.estimators.fringe_fit.modes import ModeBasis
-from pixcal.estimators.fringe_fit.smooth import Polynomial
 from pixcal.estimators.fringe_fit.tile_sums import Carrier, TileSums
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F64

@@ -17,8 +17,7 @@ from pixcal.estimators.fringe_fit.fringes import wrapped
 from pixcal.estimators.fringe_fit.tile_sums import local_modes
 from pixcal.model.arrays import F32, F64, U8
 from pixcal.stages.fit.fringe_set import FittedSet
-from pixcal.stages.fit.scouting import read_frames
-from pixcal.stages.fit.sweep import BATCH_MAPS, DIGITS, rounded
+from pixcal.stages.fit.sweep import BATCH_MAPS, DIGITS, read_frames, rounded
 from pixcal.stages.tiles import STRIP, span
 from pixcal.storage.cube import (
     ArrayReader,

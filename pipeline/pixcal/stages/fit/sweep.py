@@ -6,8 +6,9 @@ the phases afterwards: trying another model does not read the cube again.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +16,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.engine.plan import within_memory
-from pixcal.engine.run import Runtime
-from pixcal.estimators.fringe_fit.batches import FrameBatches, plan_batches
+from pixcal.engine.run import Runtime, one_blas_thread, run_tasks
 from pixcal.estimators.fringe_fit.fit_flags import fit_flags, usual_chi2
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
 from pixcal.estimators.fringe_fit.geometry import tile_plane
-from pixcal.estimators.fringe_fit.sweep import BOUND_PIXELS, TileMaps, frames_to_prime, sweep_tile
+from pixcal.estimators.fringe_fit.scout import Scout, in_turn
+from pixcal.estimators.fringe_fit.sweep import (
+    BOUND_PIXELS,
+    FrameBatches,
+    TileMaps,
+    frames_to_prime,
+    plan_batches,
+    sweep_tile,
+)
 from pixcal.estimators.fringe_fit.tile_fit import Tile
 from pixcal.estimators.fringe_fit.tile_sums import Carrier, TileSums, sum_row
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.arrays import F32, F64, Mask
+from pixcal.model.arrays import F32, F64, U16, Indices, Mask
 from pixcal.model.config import result_options
 from pixcal.model.errors import InputError, naming
 from pixcal.model.options import Sweep as Config
-from pixcal.stages.fit.scouting import CACHE_BYTES, read_frames, scout_set
 from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.steps import run_steps
@@ -56,6 +63,16 @@ BATCH_MAPS = ("batch_phase", "batch_sigma")
 # disk again
 DIGITS = {"batch_phase": 10, "batch_sigma": 8, "batch_delta": 12}
 TABLES = ("tiles", "sums")  # of a row of numbers for each tile
+SCOUT_SHARE = 0.01  # share of the tiles that the scout reads (of large windows)
+SCOUT_TILES = 5  # tiles that the scout reads where they can be kept in memory
+# memory for the scout's tiles; fixed, so that results do not depend on ``--memory``
+CACHE_BYTES = 384 << 20
+PRIME_BYTES = 48 << 20  # memory for the codes of the scout's first look
+# chunks along time that the first look takes frames from: one may hold little of a slow scan
+LOOKS = 16
+# frames that the first look takes at most: pixels of three unknowns each add three parts in so many
+# to the variance of the frames' parameters; the time of the rank-three search grows with the square
+LOOK_FRAMES = 128
 
 
 def load_run(run_dir: Path) -> Acquisition:
@@ -248,3 +265,126 @@ def _sums(job: _Job, tile: Tile, maps: TileMaps, good: Mask) -> F64:
     slope = (kx - carrier.k[0], ky - carrier.k[1])
     plane = tile_plane(maps.phase, maps.sigma, ratio, good, slope, tile.centre)
     return sum_row(maps.phase, maps.sigma, good, maps.batch_phase, carrier, plane)
+
+
+# The scout's part: frame parameters of a set, from a few tiles
+
+
+@dataclass(frozen=True)
+class Lookout:
+    """Where the scout looks, and whether what it reads is kept for the sweep."""
+
+    source: ReducedSet
+    places: list[tuple[int, int]]
+    keep: bool
+
+    def codes(self, block: int) -> list[U16]:
+        """Codes (t, y, x) of a block of frames, for each place."""
+        return [self.source.codes(at, block, keep=self.keep) for at in self.places]
+
+
+def scout_tiles(grid: tuple[int, int], number: int) -> list[tuple[int, int]]:
+    """Tiles spread over the window: the central one, then each time the one farthest from all."""
+    tiles = np.array(list(product(range(grid[0]), range(grid[1]))), dtype=float)
+    middle = (np.array(grid) - 1) / 2
+    chosen = [int(np.argmin(((tiles - middle) ** 2).sum(axis=1)))]
+    distance = ((tiles - tiles[chosen[0]]) ** 2).sum(axis=1)
+    while len(chosen) < min(number, len(tiles)):
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, ((tiles - tiles[chosen[-1]]) ** 2).sum(axis=1))
+    return [(int(tiles[n][0]), int(tiles[n][1])) for n in chosen]
+
+
+def scout_set(
+    source: ReducedSet, nominal: tuple[float, float], folder: Local, runtime: Runtime, name: str
+) -> None:
+    """Find the frame parameters of a set, near the nominal vector (rad/px), and write them."""
+    n_tiles = len(source.tiles())
+    chunk_bytes = int(np.prod(source.signal.chunks)) * source.signal.dtype.itemsize
+    tile_bytes = source.n_blocks * chunk_bytes
+    number = max(1, round(SCOUT_SHARE * n_tiles), min(SCOUT_TILES, CACHE_BYTES // tile_bytes))
+    places = scout_tiles(source.grid, number)
+    keep = len(places) * tile_bytes <= CACHE_BYTES
+    tiles = [source.tile(at) for at in places]
+    # The first tile must show fringes: one with few good pixels is a bad place to look.
+    order = sorted(range(len(tiles)), key=lambda n: -int(tiles[n].good.sum() > 100))
+    places, tiles = [places[n] for n in order], [tiles[n] for n in order]
+    ny, nx = source.shape
+    # Here, whatever does the rest: in other processes nothing would be kept for the sweep.
+    here = replace(runtime.here, quiet=True)
+    if runtime.remote:
+        here = here.with_workers(0)
+    # The chunks kept; the first look's codes, copies of a tile's share, and its Gram matrix; for
+    # each task the sums of a tile, or chunks that are not kept.
+    kept = len(places) * tile_bytes if keep else 0
+    what = f"the scout of {name}"
+    per_task = (4 if keep else max(4, len(places))) * chunk_bytes
+    here = within_memory(what, per_task, 3 * PRIME_BYTES + kept, here)
+    each = partial(run_tasks, runtime=here, label=f"first look at {name}")
+    scout = Scout(tiles, source.coding, nominal, ((ny - 1) / 2, (nx - 1) / 2), each)
+    lookout = Lookout(source, places, keep)
+
+    first = _first_look(source, PRIME_BYTES // (len(places) * chunk_bytes))
+    looks = run_tasks(partial(_look, lookout), first, here, label=f"first look at {name}")
+    with one_blas_thread():
+        parts = [scout.prime([np.concatenate(tile) for tile in zip(*looks, strict=True)])]
+    del looks
+    scout.each = in_turn
+    if len(parts[0].g) < source.n_frames:
+        # A chunk of each place and what its solution takes.
+        runtime = within_memory(what, 3 * len(places) * chunk_bytes, kept, runtime)
+        parts = run_tasks(
+            partial(_solve_block, lookout, scout),
+            range(source.n_blocks),
+            runtime,
+            label=f"scout {name}",
+        )
+    g = np.concatenate([p.g for p in parts])
+    dk = np.concatenate([p.dk for p in parts])
+    for array, data in (("g", g), ("dk", dk), ("time", source.time_s())):
+        dims = ("time", "component")[: data.ndim]
+        write_array(folder / array, data, dims=dims)
+    again = 0 if keep else len(places) * (source.n_blocks + len(first))
+    facts: dict[str, Any] = {
+        "k": [float(v) for v in scout.k],
+        "nominal_k": list(nominal),
+        "reference": list(scout.reference),
+        "moving": bool(scout.moving),
+        "moving_significance": scout.moving_significance,
+        "noise": scout.noise,
+        "excess_scatter": scout.excess_scatter,
+        "scout_tiles": len(places),
+        "chunks_read": len(places) * source.n_blocks if keep else again,
+    }
+    write_json(folder / "scout.json", facts)
+
+
+def _look(lookout: Lookout, wanted: tuple[int, Indices]) -> list[U16]:
+    block, frames = wanted
+    return [codes[frames] for codes in lookout.codes(block)]
+
+
+def _solve_block(lookout: Lookout, scout: Scout, block: int) -> FrameParameters:
+    return scout.solve(lookout.codes(block))
+
+
+def _first_look(source: ReducedSet, blocks: int) -> list[tuple[int, Indices]]:
+    """Blocks spread over the run and frames of each, as many in all as in ``blocks`` whole ones."""
+    wanted = min(source.n_blocks, max(blocks, LOOKS))
+    each = max(1, source.block * max(1, min(blocks, wanted)) // wanted)
+    each = min(each, -(-LOOK_FRAMES // wanted))
+    # At random: frames at even steps may have the same phase again and again.
+    rng = np.random.default_rng(0)
+    looks = []
+    for n in np.linspace(0, source.n_blocks - 1, wanted).astype(int):
+        frames = rng.permutation(min(source.block, source.n_frames - n * source.block))
+        looks.append((int(n), np.sort(frames[:each])))
+    return looks
+
+
+def read_frames(folder: Local) -> FrameParameters:
+    """Frame parameters that the scout left in ``sweep.zarr/<set name>``."""
+    y, x = read_json(folder / "scout.json")["reference"]
+    return FrameParameters(
+        ArrayReader(folder / "g").read(), ArrayReader(folder / "dk").read(), (float(y), float(x))
+    )
