@@ -20,7 +20,7 @@ from pixcal.model.acquisition import Detector as Declared
 from pixcal.model.errors import InputError, PlanError
 from pixcal.report.drawing import png
 from pixcal.stages import astrometry
-from pixcal.stages.astrometry import Config, error_map, stage, stars
+from pixcal.stages.astrometry import Config, stage, stars
 from pixcal.stages.astrometry.detector import (
     DegenerateModes,
     PixelPositions,
@@ -339,9 +339,9 @@ def test_first_order_predicts_every_star(case: Path) -> None:
 def test_the_map_does_not_depend_on_the_tiles(
     case: Path, tmp_path: Path, tile: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(error_map, "TILE", tile)
+    monkeypatch.setattr(stars, "TILE", tile)
     detector, seen = the_detector(case / "run"), the_star()
-    maps = error_map.error_maps(tmp_path / "maps", detector, seen, Runtime(workers=3))
+    maps = stars.error_maps(tmp_path / "maps", detector, seen, Runtime(workers=3))
     whole = place_errors(detector, seen, (0, SHAPE[0]), (0, SHAPE[1]))
     for n, grid in enumerate(("perfect", "measured")):
         for k, name in enumerate("xy"):

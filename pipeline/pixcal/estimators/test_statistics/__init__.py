@@ -10,9 +10,10 @@ import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics.look import Look
@@ -28,6 +29,12 @@ class Curve:
 
     x: F64  # (n,)
     value: F64  # (n,) in the statistic's unit; its square where the statistic is a power
+
+    @classmethod
+    def numbered(cls, values: ArrayLike) -> Self:
+        """Values whose places are 0, 1, ...; none where there is nothing to look at."""
+        value = np.asarray(values, float)
+        return cls(np.arange(len(value), dtype=float), value)
 
 
 Key = tuple[str, str]  # name of a statistic and of the fringe set (or `DETECTOR`)

@@ -100,7 +100,7 @@ def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
         _neighbours((differences(evidence, stacks[n]) for n in own), evidence.good)
         for own in (order[:half], order[half:])
     )
-    return Curve(np.arange(float(len(STEPS))), bright - dim)
+    return Curve.numbered(bright - dim)
 
 
 @statistic(
@@ -125,7 +125,7 @@ def bias_change(evidence: Evidence) -> Curve | None:
     power[0, 0] = 0
     bands = np.bincount(band.ravel(), power.ravel()) / np.bincount(band.ravel())
     ends = [power[len(fy) // 2].mean(), power[:, -1].mean()]
-    return Curve(np.arange(BANDS + 2.0), np.concatenate([bands, ends]))
+    return Curve.numbered(np.concatenate([bands, ends]))
 
 
 KINDS = (("bias",), ("dark",), ("flat",))
@@ -141,7 +141,7 @@ def neighbours(kind: str, evidence: Evidence) -> Curve | None:
     if not stacks:
         return None
     value = _neighbours((differences(evidence, s) for s in stacks), evidence.good)
-    return Curve(np.arange(float(len(STEPS))), value)
+    return Curve.numbered(value)
 
 
 @family(
@@ -155,4 +155,4 @@ def line_repeats(kind: str, evidence: Evidence) -> Curve | None:
         return None
     rest = np.concatenate([differences(evidence, s) for s in stacks])
     value = [one for axis in (2, 1) for one in _repeats(rest, evidence.good, axis)]
-    return Curve(np.arange(float(len(value))), np.array(value))
+    return Curve.numbered(value)

@@ -28,7 +28,7 @@ def signature_curve(significance: float) -> Curve:
     size = abs(significance)
     if size > STRAIGHT:
         size = STRAIGHT * (1 + float(np.log(size / STRAIGHT)))
-    return Curve(np.zeros(1), np.array([float(np.copysign(size, significance))]))
+    return Curve.numbered([float(np.copysign(size, significance))])
 
 
 def statistic_named(name: str) -> Statistic:

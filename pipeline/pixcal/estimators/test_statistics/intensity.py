@@ -7,7 +7,7 @@ import numpy as np
 from pixcal.estimators.detector.flat_ladder import MIN_RUNGS, ladder, straight_line
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics import Curve, statistic
-from pixcal.estimators.test_statistics.look import CODES, LEVELS, Look
+from pixcal.estimators.test_statistics.look import CODES, Look
 from pixcal.model.arrays import F64
 
 of_intensity = partial(statistic, "intensity")
@@ -38,7 +38,7 @@ def harmonics(look: Look) -> Curve:
 @of_intensity("mean residual against signal", "mean residual", unit="e-", x="bin of level")
 def residual_by_level(look: Look) -> Curve:
     """Mean residual in bins of the level."""
-    return Curve(np.arange(LEVELS, dtype=float), look.by_level[0])
+    return Curve.numbered(look.by_level[0])
 
 
 @of_intensity_power(
@@ -47,10 +47,9 @@ def residual_by_level(look: Look) -> Curve:
     x="flat",
     sets=False,
 )
-def photon_transfer(evidence: Evidence) -> Curve | None:
+def photon_transfer(evidence: Evidence) -> Curve:
     """Variance of differences of flats over what shot and read noise give, for each level."""
-    values = _noise_of_flats(evidence)
-    return Curve(np.arange(len(values), dtype=float), values) if len(values) else None
+    return Curve.numbered(_noise_of_flats(evidence))
 
 
 def _noise_of_flats(evidence: Evidence) -> F64:
@@ -79,7 +78,7 @@ def photon_transfer_shape(evidence: Evidence) -> Curve | None:
     values = _noise_of_flats(evidence)
     if len(values) < MIN_RUNGS:
         return None
-    return Curve(np.arange(len(values), dtype=float), values / values.mean())
+    return Curve.numbered(values / values.mean())
 
 
 @of_intensity(

@@ -222,14 +222,14 @@ def _pairs(good: Mask, steps: Sequence[tuple[int, int]]) -> tuple[F32, F64]:
     return pairs, pairs.sum(axis=2, dtype=float)
 
 
-def by_cell(values: F64, good: Mask) -> F64 | None:
-    """Means (cell,) of the good pixels of each cell; None where a cell has hardly any."""
+def by_cell(values: F64, good: Mask) -> F64:
+    """Means (cell,) of the good pixels of each cell; empty where a cell has hardly any."""
     ny, nx = good.shape
     row = np.arange(ny)[:, None] * CELLS // ny
     cell = row * CELLS + np.arange(nx)[None, :] * CELLS // nx
     count = np.bincount(cell[good], minlength=CELLS**2)
     if count.min() < 8:
-        return None
+        return np.zeros(0)
     return np.asarray(np.bincount(cell[good], values[good], minlength=CELLS**2) / count)
 
 

@@ -10,8 +10,6 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics import Curve, family, statistic
 from pixcal.estimators.test_statistics.look import (
     ADJACENT,
-    CELLS,
-    LEVELS,
     OUTLIERS,
     STEPS,
     Look,
@@ -36,21 +34,20 @@ STILL = 1e-12  # ADU²: variance of pixels that do not change, whose square floa
 @of_noise_power("residual variance against signal", "noise / expected noise", x="bin of level")
 def variance_by_level(look: Look) -> Curve:
     """Mean square of residuals over their noise, in bins of the level."""
-    return Curve(np.arange(LEVELS, dtype=float), look.by_level[1])
+    return Curve.numbered(look.by_level[1])
 
 
 @of_noise_power("residual noise", "rms residual", unit="e-")
 def residual_noise(look: Look) -> Curve:
     """Mean square of the residuals."""
     squares = np.einsum("tp,tp->p", look.electrons, look.electrons) / len(look.electrons)
-    return Curve(np.zeros(1), np.array([float(squares[look.good.ravel()].mean())]))
+    return Curve.numbered([float(squares[look.good.ravel()].mean())])
 
 
 @of_noise_power("residual variance by position", "noise / expected noise", x="cell of 4 × 4")
-def variance_by_place(look: Look) -> Curve | None:
+def variance_by_place(look: Look) -> Curve:
     """Mean square of residuals over their noise, in cells of the window, row by row."""
-    cells = by_cell(look.moments[0], look.good)
-    return None if cells is None else Curve(np.arange(float(CELLS**2)), cells)
+    return Curve.numbered(by_cell(look.moments[0], look.good))
 
 
 @of_noise_power(
@@ -67,7 +64,7 @@ def variance_by_time(look: Look) -> Curve:
 def neighbours(look: Look) -> Curve:
     """Correlation of the residuals of pixels that touch: by itself, for most crosstalk is there."""
     sums, count = look.neighbours
-    return Curve(np.arange(float(ADJACENT)), _mean_product(sums, count)[:ADJACENT])
+    return Curve.numbered(_mean_product(sums, count)[:ADJACENT])
 
 
 @of_noise("correlation of pixels further apart", "correlation", x="far neighbour")
@@ -88,7 +85,7 @@ def neighbours_by_row(look: Look) -> Curve:
     value = np.stack(
         [_mean_product(sums[:, row == n], count[:, row == n]) for n in range(4)], axis=1
     )
-    return Curve(np.arange(8.0), (value - value.mean(axis=1, keepdims=True)).ravel())
+    return Curve.numbered((value - value.mean(axis=1, keepdims=True)).ravel())
 
 
 @of_noise("correlation of neighbours, bright minus dark", "correlation", x="neighbour")
@@ -97,7 +94,7 @@ def neighbours_by_level(look: Look) -> Curve:
     (bright, dark), count = neighbour_sums_by_level(
         look.residual, look.found.model, look.good, STEPS[:ADJACENT], look.thinned
     )
-    return Curve(np.arange(float(ADJACENT)), 2 * _mean_product(bright - dark, count))
+    return Curve.numbered(2 * _mean_product(bright - dark, count))
 
 
 def _mean_product(sums: F64, count: F64) -> F64:
@@ -120,7 +117,7 @@ def _line_power(rest: F32, good: Mask) -> F64:
 @of_noise_power("row and column noise", "noise / white noise", x="rows, columns")
 def lines(look: Look) -> Curve:
     """Of the fringe frames' residuals."""
-    return Curve(np.arange(2.0), _line_power(look.residual, look.good))
+    return Curve.numbered(_line_power(look.residual, look.good))
 
 
 def _calm(frames: F32, good: Mask) -> F32:
@@ -238,7 +235,7 @@ def hot_neighbours(evidence: Evidence) -> Curve | None:
     for dy, dx in ((0, -1), (0, 1), (-1, 0), (1, 0)):
         share = dark[y + dy, x + dx] / dark[y, x]
         value.append(float(np.mean([np.median(share[own]) for own in classes])))
-    return Curve(np.arange(4.0), np.array(value))
+    return Curve.numbered(value)
 
 
 @family(
@@ -252,4 +249,4 @@ def lines_of_stacks(kind: str, evidence: Evidence) -> Curve | None:
         return None
     rests = [_calm(stack.adu, evidence.good) for stack in stacks]
     values = [_line_power(rest, evidence.good) for rest in rests]
-    return Curve(np.arange(2.0), np.average(values, axis=0, weights=list(map(len, rests))))
+    return Curve.numbered(np.average(values, axis=0, weights=list(map(len, rests))))

@@ -78,7 +78,7 @@ def tones(kind: str, evidence: Evidence) -> Curve | None:
 def smooth_patterns(look: Look) -> Curve:
     """Root mean square of the strongest pattern in the residuals."""
     sizes = look.pattern_sizes
-    return Curve(np.zeros(1), np.array([strongest(sizes) / np.sqrt(len(sizes))]))
+    return Curve.numbered([strongest(sizes) / np.sqrt(len(sizes))])
 
 
 @family(
@@ -91,7 +91,7 @@ def smooth_patterns_of(kind: str, evidence: Evidence) -> Curve | None:
     if noise is None:
         return None
     sizes = pattern_sizes(noise, evidence.good)
-    return Curve(np.zeros(1), np.array([strongest(sizes) / np.sqrt(len(sizes))]))
+    return Curve.numbered([strongest(sizes) / np.sqrt(len(sizes))])
 
 
 @statistic("time", "smooth patterns that follow the phase", "strongest", unit="σ")
@@ -106,7 +106,7 @@ def smooth_patterns_by_phase(look: Look) -> Curve | None:
     if not shapes.size:
         return None
     sizes = shapes.T @ look.pattern_sizes
-    return Curve(np.zeros(1), np.array([strongest(sizes)]))
+    return Curve.numbered([strongest(sizes)])
 
 
 def _all_differences(kind: str, evidence: Evidence) -> F32 | None:

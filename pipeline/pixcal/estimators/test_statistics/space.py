@@ -17,7 +17,7 @@ from pixcal.estimators.maps.structure import (
     repeats,
 )
 from pixcal.estimators.test_statistics import Curve, family, statistic
-from pixcal.estimators.test_statistics.look import CELLS, Look, by_cell
+from pixcal.estimators.test_statistics.look import Look, by_cell
 from pixcal.model.arrays import F64, Mask
 
 of_space = partial(statistic, "space")
@@ -32,14 +32,14 @@ SAME = 0.98  # cosine of the angle below which two sets measure along the same a
     x="contrast, light of each pair",
     together=True,
 )
-def alike(looks: Sequence[Look]) -> Curve | None:
+def alike(looks: Sequence[Look]) -> Curve:
     """Correlation of the maps of each pair of sets."""
     values = [
         _correlation(one.flat_maps[name], other.flat_maps[name])
         for one, other in combinations(looks, 2)
         for name in ("contrast", "light")
     ]
-    return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None
+    return Curve.numbered(values)
 
 
 def _correlation(one: F64, other: F64) -> float:
@@ -50,7 +50,7 @@ def _correlation(one: F64, other: F64) -> float:
 @of_space_power(
     "difference of offsets between sets", "rms difference", unit="px", x="pair", together=True
 )
-def apart(looks: Sequence[Look]) -> Curve | None:
+def apart(looks: Sequence[Look]) -> Curve:
     """Mean square of the difference of the offsets along one axis, by two baselines."""
     values = []
     for one, other in combinations(looks, 2):
@@ -59,7 +59,7 @@ def apart(looks: Sequence[Look]) -> Curve | None:
         if abs(cosine) > SAME:
             other_map = np.sign(cosine) * other.maps["offset"]
             values.append(float(np.nanmean(flattened(one.maps["offset"] - other_map) ** 2)))
-    return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None
+    return Curve.numbered(values)
 
 
 # name, what it is, unit, what its low orders are
@@ -169,11 +169,10 @@ def peak(name: str, look: Look) -> Curve:
     "{0}_by_place", MAPS, "space", "{0}: power by position", "{1}, rms", unit="{2}",
     x="cell of 4 × 4", power=True,
 )  # fmt: skip
-def by_place(name: str, look: Look) -> Curve | None:
+def by_place(name: str, look: Look) -> Curve:
     """Mean square in cells of the window."""
     squares = look.maps_beside_fringes[name] ** 2
-    cells = by_cell(squares, np.isfinite(squares))
-    return None if cells is None else Curve(np.arange(float(CELLS**2)), cells)
+    return Curve.numbered(by_cell(squares, np.isfinite(squares)))
 
 
 def _binned(frequency: F64, power: F64) -> Curve:

@@ -95,7 +95,7 @@ def frames_by_phase(look: Look) -> Curve:
         for name in ("contrast", "intensity")
     ]
     value = np.concatenate(values)
-    return Curve(np.arange(len(value), dtype=float), value)
+    return Curve.numbered(value)
 
 
 @of_time_power(
@@ -140,7 +140,7 @@ def first_flats(evidence: Evidence) -> Curve | None:
     steps = np.array([float(light[0] / light[1:].mean()) - 1 for light in every])
     before = np.array([level_before(s, evidence) for s in stacks])
     lacking = 1 - before / [light.mean() for light in every]
-    return Curve(np.arange(2.0), np.array([steps.mean(), steps @ lacking / (lacking @ lacking)]))
+    return Curve.numbered([steps.mean(), steps @ lacking / (lacking @ lacking)])
 
 
 @family(
@@ -169,11 +169,11 @@ def means_of_frames(kind: str, evidence: Evidence) -> Curve | None:
         return None
     shortest = min(map(len, values))
     value = np.mean([v[:shortest] for v in values], axis=0)
-    return Curve(np.arange(shortest, dtype=float), value)
+    return Curve.numbered(value)
 
 
 @of_time("trend of the bias level", "change of level", unit="e-", sets=False)
-def bias_trend(evidence: Evidence) -> Curve | None:
+def bias_trend(evidence: Evidence) -> Curve:
     """Slope of the mean of bias and dark frames over their run, last less first."""
     values = []
     for stack in (*evidence.of_kind("bias"), *evidence.of_kind("dark")):
@@ -181,4 +181,4 @@ def bias_trend(evidence: Evidence) -> Curve | None:
             means = frame_means(stack.adu, evidence.good) * evidence.gain
             time = stack.time_s - stack.time_s.mean()
             values.append(float(np.polyfit(time / np.ptp(time), means, 1)[0]))
-    return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None
+    return Curve.numbered(values)
