@@ -126,7 +126,7 @@ class BiasDrift(Effect):
     def _in_run(self, shot: Shot) -> float:
         """Offset of a frame of fringes, e-: as measured, or by the laws where it was not."""
         time = float(shot.recording.times_s[shot.frame])
-        name = shot.bench.frames.fringes[shot.recording.number].name
+        name = shot.recording.set_name
         rng = shot.rng(self.name)
         if any(track.set == name for track in self.tracks):
             return float(at(self.tracks, name, time)) + self.jitter_rms * rng.standard_normal()

@@ -64,9 +64,7 @@ class ContrastNoise(Effect):
         keep = np.exp(-recording.period_s / self.polarisation_s) if self.polarisation_s else 0.0
         factor = np.exp(-energy * self.vibration_rad**2 / 2)
         factor *= np.maximum(1 + self.polarisation * damped_walk(drawn, keep), 0.0)
-        time = recording.times_s
-        name = recording.bench.frames.fringes[recording.number].name
-        factor *= np.maximum(1 + at(self.tracks, name, time), 0.0)
+        factor *= np.maximum(1 + at(self.tracks, recording.set_name, recording.times_s), 0.0)
         most = states.level / recording.bench.optics_of(recording.number).visibility
         return replace(states, amplitude=np.minimum(states.amplitude * factor, most))
 

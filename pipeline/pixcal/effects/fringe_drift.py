@@ -76,8 +76,8 @@ class FringeDrift(Effect):
         steps = recording.rng(self.name).standard_normal((recording.count, 2))
         walk = np.cumsum(steps, axis=0) * np.sqrt(recording.period_s / HOUR_S)
         change = self.vector_change(time) + walk * self.walk
-        name = recording.bench.frames.fringes[recording.number].name
-        change += np.stack([at(self.along_x, name, time), at(self.along_y, name, time)], axis=1)
+        tracks = self.along_x, self.along_y
+        change += np.stack([at(own, recording.set_name, time) for own in tracks], axis=1)
         return replace(states, dkx=states.dkx + change[:, 0], dky=states.dky + change[:, 1])
 
     def replayed(self, evidence: Evidence) -> Self | None:

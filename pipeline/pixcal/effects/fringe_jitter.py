@@ -60,8 +60,8 @@ class FringeJitter(Effect):
         phase = 2 * np.pi * recording.rng(self.name, 1).random()
         swung = swing(time, self.vibration_hz, phase, recording.exptime_s)
         change = drawn * np.array(self.rms) + np.outer(swung, self.vibration)
-        name = recording.bench.frames.fringes[recording.number].name
-        change += np.stack([at(self.along_x, name, time), at(self.along_y, name, time)], axis=1)
+        tracks = self.along_x, self.along_y
+        change += np.stack([at(own, recording.set_name, time) for own in tracks], axis=1)
         return replace(states, dkx=states.dkx + change[:, 0], dky=states.dky + change[:, 1])
 
     def replayed(self, evidence: Evidence) -> Self | None:

@@ -156,8 +156,7 @@ class GhostFringes(Effect):
             return light.masked(mean)
         if recording.kind != "fringes":
             return light
-        name = recording.bench.frames.fringes[recording.number].name
-        return self._reflected(light, name, rows, columns)
+        return self._reflected(light, recording.set_name, rows, columns)
 
     def predict(self, maps: FringeMaps) -> FringeMaps:
         return self._times(maps, 1)

@@ -82,11 +82,10 @@ class IntensityNoise(Effect):
         phase = 2 * np.pi * recording.rng(self.name, 1).random()
         change = self.rms * damped_walk(drawn, keep)
         change += self.line * swing(time, self.line_hz, phase, recording.exptime_s)
-        name = recording.bench.frames.fringes[recording.number].name
-        change += at(self.tracks, name, time)
+        change += at(self.tracks, recording.set_name, time)
         level = np.maximum(1 + (1 - self._ambient(recording.number)) * change, 0.0)
         contrast = self.separate * recording.rng(self.name, 2).standard_normal(recording.count)
-        contrast += at(self.contrast_tracks, name, time)
+        contrast += at(self.contrast_tracks, recording.set_name, time)
         fringe = np.maximum(1 + change, 0.0) * np.maximum(1 + contrast, 0.0)
         return replace(states, level=states.level * level, amplitude=states.amplitude * fringe)
 

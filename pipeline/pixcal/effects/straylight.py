@@ -118,8 +118,7 @@ class Straylight(Effect):
     def light(self, light: Light, recording: Recording, rows: Rows, maps: DetectorMaps) -> Light:
         if recording.kind != "fringes":
             return light
-        name = recording.bench.frames.fringes[recording.number].name
-        share = self.pattern(rows, (0, maps.response.shape[1]), name)
+        share = self.pattern(rows, (0, maps.response.shape[1]), recording.set_name)
         return light.with_incoherent(share * light.power)
 
     def predict(self, maps: FringeMaps) -> FringeMaps:

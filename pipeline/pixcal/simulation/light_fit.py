@@ -117,7 +117,7 @@ class _Lit:
     @property
     def name(self) -> str:
         """Of the set."""
-        return self.recording.bench.frames.fringes[self.recording.number].name
+        return self.recording.set_name
 
     @classmethod
     def of(cls, found: FringeEvidence, recording: Recording) -> "_Lit":

@@ -46,6 +46,11 @@ class Recording:
         return np.arange(self.count, dtype=float) * self.period_s
 
     @property
+    def set_name(self) -> str:
+        """Name of its fringe set."""
+        return self.bench.frames.fringes[self.number].name
+
+    @property
     def key(self) -> tuple[int, int]:
         """Key of its random numbers."""
         return KINDS.index(self.kind), self.number

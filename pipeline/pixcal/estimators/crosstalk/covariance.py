@@ -19,12 +19,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from pixcal.estimators.crosstalk.links import Place
 from pixcal.estimators.crosstalk.residuals import STRIDE, UNIT, Residuals, all_residuals
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.kernels import inner
+from pixcal.kernels import inner, kernel
 from pixcal.kernels.crosstalk import Coupling
 from pixcal.model.arrays import F32, F64, Indices
 
@@ -143,7 +142,7 @@ def _powers(parts: Sequence[Frames], highest: int) -> tuple[F32, ...]:
     return tuple(found)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel()
 def _multiply_up(factor: F32, charge: F32, one: F32, first: int, powers: F32) -> None:
     """The powers (n, y, x, t) of frames (t, y, x), from a place in time on."""
     nt, ny, nx = factor.shape
@@ -168,7 +167,7 @@ def _add_pixels(sums: F32, y: int, first: int, out: F32) -> None:
                 out[n, i, y, first + x] += sums[x, n, i]
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
+@kernel(fastmath=_FAST)
 def _add_right_sums(e0: F32, e1: F32, e2: F32, links: Any, right: F32) -> None:
     """Add to the sums (link, 5, y, x), of powers of the charge times residuals (y, x, t)."""
     ny, nx, nt = e0.shape
@@ -195,7 +194,7 @@ def _add_right_sums(e0: F32, e1: F32, e2: F32, links: Any, right: F32) -> None:
             _add_pixels(sums, y, first, right)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
+@kernel(fastmath=_FAST)
 def _add_normal_sums(w0: F32, w1: F32, w2: F32, w3: F32, w4: F32, links: Any, normal: F32) -> None:
     """Add to the sums (link, 14, y, x), of powers of the charge over the variance (y, x, t)."""
     ny, nx, nt = w0.shape
@@ -279,7 +278,7 @@ def _add_steady(parts: Sequence[Residuals], links: Indices, right: F32, normal: 
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
+@kernel(fastmath=_FAST)
 def _add(
     e: F32, ends: Indices, charge: F32, weight: F32, links: Any, right: F32, normal: F32
 ) -> None:
@@ -312,7 +311,7 @@ def _add(
                         out[first + x] += sums[i, x]
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
+@kernel(fastmath=_FAST)
 def _add_terms(
     products: F32, own: F32, partner: F32, of_own: F32, of_partner: F32, sums: F32
 ) -> None:
