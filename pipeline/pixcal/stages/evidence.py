@@ -40,10 +40,7 @@ def evidence_of(
     *,
     within: tuple[tuple[int, int], tuple[int, int]] | None = None,
 ) -> Evidence:
-    """The same of a run that is known to be whole, or is in memory.
-
-    ``within``: first row and column of the run in a larger window, and the shape of that.
-    """
+    """The same of a whole run; ``within``: first row and column in, and shape of, a window."""
     acquisition = read_acquisition(run_dir)
     ingested = Ingested(run_dir / "ingest")
     ny, nx = ingested.shape

@@ -17,10 +17,7 @@ def run_steps(
     *,
     label: str,
 ) -> None:
-    """Run a task on what each step needs, and note the step when all that it wrote is in place.
-
-    ``steps`` are by their names in the journal; ``label`` names them on stderr.
-    """
+    """Run a task on each of the ``steps`` (by name), noting each in the journal once in place."""
     done = made.journal()
     names = [name for name in steps if name not in done]
     run_tasks(

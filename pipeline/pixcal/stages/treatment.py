@@ -101,12 +101,9 @@ def treatments(
 ) -> Treatments:
     """What to do about the effects of a diagnosis, by the ``causes`` of ``diagnosis.json``.
 
-    Parameters
-    ----------
-    nominal : parameters of the effects that the nominal bench had, by name
-    model, models : shape of the fringes that the fit was asked for, and those fitted, by set
-    own : files with effects of the user's own; one that is not known is refused
-    where : the diagnosis, for messages
+    ``nominal``: effects of the nominal bench, by name. ``model, models``: shape of the fringes
+    asked for, and those fitted, by set. ``own``: files of own effects; an unknown one is refused.
+    ``where``: the diagnosis.
     """
     known = known_effects(own)
     entries: list[tuple[str, str, Any, Mapping[str, float]]]

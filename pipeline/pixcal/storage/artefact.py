@@ -123,12 +123,10 @@ def build(
 ) -> Iterator[Build]:
     """Build an artefact aside and put it in place when the block ends without an exception.
 
-    When the block raises (or the process is killed) the unfinished folder stays, and the next build
-    with the same key resumes in it, or begins anew if a chunk of it is not as it was written. An
-    artefact of the same stage with another key is replaced only once the new one is complete;
-    unfinished builds of the stage are then removed. ``cubes``: folder below which to make one for
-    the cubes, instead of ``RUN/<stage>``; no part of the key. An unfinished build whose cubes lie
-    under another is not resumed. Raises InputError if ``cubes`` cannot be written.
+    If it raises, the next build with the same key resumes, or begins anew if a chunk is not as it
+    was written. An artefact with another key stays until the new one is complete. ``cubes``: folder
+    below which to make one for the cubes, instead of ``RUN/<stage>``; no part of the key. Raises
+    InputError if ``cubes`` cannot be written.
     """
     key = artefact_key(stage, format, config, inputs)
     folder = run / ".partial" / f"{stage}-{digest(key, code_digest())[:_KEY_IN_NAME]}"

@@ -63,13 +63,8 @@ def create_array(
 ) -> "ArrayWriter":
     """Create an array to be written chunk by chunk, or reopen one that was left unfinished.
 
-    Parameters
-    ----------
-    path : folder of the array, e.g. ``raw.zarr/fringes/vertical``.
-    shape, chunks : in the order of ``dims``
-    dtype : of fixed size; stored little-endian
-    fill_value : value outside the array in edge chunks, and CF ``_FillValue`` where ``attrs`` says
-        so
+    ``shape, chunks``: in the order of ``dims``. ``dtype``: of fixed size; stored little-endian.
+    ``fill_value``: outside the array in edge chunks, and CF ``_FillValue`` where ``attrs`` says so.
     """
     shape, chunks = tuple(map(int, shape)), tuple(map(int, chunks))
     dtype = np.dtype(dtype).newbyteorder("<")
@@ -225,10 +220,7 @@ class ArrayWriter:
             yield name, (body, crc.to_bytes(4, "little"))
 
     def take(self, source: Place) -> None:
-        """Take the chunks of another array of the same shape and type as they are, unchecked.
-
-        Linked where the file systems allow, else copied; what is there already stays.
-        """
+        """Take the chunks of another such array, linked or copied, unchecked; own ones stay."""
         if isinstance(source, Path) and isinstance(self.path, Path):
             link_files(source / "c", self.path / "c")
             return
@@ -236,9 +228,8 @@ class ArrayWriter:
             copy_files(source, self.path, names)
 
     def finish(self) -> NDArray[Any]:
-        """Check that every chunk is there and write the index of sizes and checksums.
+        """Check that every chunk is there, write the index and return it (``size``, ``crc``).
 
-        Returns the index: ``size`` (bytes) and ``crc`` of each chunk, in the shape of their grid.
         Raises DamagedError naming the first chunk that is missing or cut.
         """
         grid = _grid(self.shape, self.chunks)
@@ -268,10 +259,7 @@ class ArrayWriter:
 
 
 def chunks_whole(folder: Path) -> bool:
-    """Whether every chunk in the arrays below a folder agrees with the checksum at its end.
-
-    For arrays that have no index yet. One reading of what was written, without decompression.
-    """
+    """Whether every chunk below a folder agrees with its crc, in arrays that have no index yet."""
     for at, folders, names in os.walk(folder):
         if "zarr.json" in names and "c" in folders:
             folders.clear()
@@ -303,8 +291,8 @@ def remove_arrays(path: Place) -> None:
 class ArrayReader:
     """Reads blocks of an array written by `ArrayWriter`, checking every chunk.
 
-    ``path``: folder of the array. Raises DamagedError if the metadata or the chunk index is
-    missing, cut or altered. Raises RemoteError if the array is at a URL that does not answer.
+    Raises DamagedError if metadata or index are missing, cut or altered, RemoteError if the URL
+    does not answer.
     """
 
     def __init__(self, path: Place) -> None:
@@ -353,10 +341,7 @@ class ArrayReader:
         return math.prod(_grid(self.shape, self.chunks))
 
     def read_chunk(self, index: Sequence[int], out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """One whole chunk (edge chunks too, padded with the fill value), decoded into ``out``.
-
-        Raises DamagedError naming the chunk's file when it is missing, cut or altered.
-        """
+        """One whole chunk, padded with the fill value, decoded into ``out``, or DamagedError."""
         if self._memory is not None:
             return self._memory.chunk(index)
         name = _chunk_name(index)
@@ -428,10 +413,7 @@ class ArrayReader:
 
 
 class CachedReader(ArrayReader):
-    """An `ArrayReader` that keeps chosen chunks in memory.
-
-    In another process it keeps none: who wants them again may be sent elsewhere.
-    """
+    """An `ArrayReader` that keeps chosen chunks in memory; in another process it keeps none."""
 
     def __init__(self, path: Place, *, keeps: bool = True) -> None:
         super().__init__(path)

@@ -40,8 +40,8 @@ def base_of(artefact: Path) -> Place | None:
 def chosen_base(named: StrPath | None, run: Path, like: Path) -> Place | None:
     """The folder for all cubes that the user wants; None: cubes stay in the artefacts.
 
-    ``named`` is a path or URL, the run directory itself to keep cubes in the artefacts, or None for
-    the same as the artefact ``like``.
+    ``named``: path or URL, or the run directory for None; None for the same as the artefact
+    ``like``.
     """
     if named is None:
         return base_of(like)

@@ -99,9 +99,8 @@ class FrameFile:
 def inspect(source: SourceFile) -> FrameFile:
     """Read a file's header and hold it against the file's length.
 
-    The image is the first header and data unit with 2-D or 3-D data. A ``.gz`` whose last bytes do
-    not agree with the header is decompressed to see whether it is whole. Raises InputError naming
-    the file: not FITS, cut short, no image, other dimensions or types than frames have.
+    The image is the first data unit of 2-D or 3-D. Raises InputError naming the file: not FITS, cut
+    short, no image, other dimensions or types than frames have.
     """
     with source.open() as handle:
         try:

@@ -58,17 +58,10 @@ def read_rows(
 ) -> F64:
     """Read rows of some planes of a plain file, each byte once.
 
-    Returns (plane, band, fact) float64: `FACTS` of each `BAND` rows, NaN where they were not looked
-    for. Raises InputError if the file was changed, or ends too early.
-
-    Parameters
-    ----------
-    file : a file in the container ``plain``
-    planes : numbers of the planes
-    rows : first row, which begins a band, and the one after the last
-    out : (plane, y, x) filled with the values (ADU); each plane of it contiguous, of the file's
-        type or one that holds it
-    crc_alone : leave out the other facts: the largest samples take half as long as reading them
+    Returns (plane, band, fact): `FACTS` of each `BAND` rows, NaN where not looked for. ``rows``:
+    first, which begins a band, and the one after the last. ``out``: (plane, y, x), ADU; each plane
+    contiguous, of the file's type or one that holds it. ``crc_alone``: leave out the other facts,
+    which double the time. Raises InputError if the file was changed, or ends too early.
     """
     _, ny, nx = file.shape
     coding, within = file.coding, bands(rows)
@@ -107,10 +100,7 @@ def read_rows(
 
 
 def rows_at_once(file: FrameFile) -> int:
-    """Rows, in whole bands, that `read_rows` holds at a time; they fit the cache of a core.
-
-    With a single band threads would wait for each other longer than they compute.
-    """
+    """Rows, in bands (more than one), that `read_rows` holds at a time, within a core's cache."""
     return BAND * max(1, _PIECE // (BAND * file.shape[2] * file.coding.stored.itemsize))
 
 

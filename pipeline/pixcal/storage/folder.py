@@ -43,10 +43,7 @@ class LocalFolder:
     path: Path
 
     def write(self, files: Iterable[File], *, durable: bool = False) -> None:
-        """Write files, or replace them, a few at a time: each is there whole or not at all.
-
-        ``durable``: they are on the disk when this returns, not on their way to it.
-        """
+        """Write files, or replace them, a few at a time: each whole or, ``durable``, on disk."""
         written = []
         for name, content in files:
             file = self.path / name
@@ -122,11 +119,7 @@ def flush(folder: Path) -> None:
 
 
 def read_file(path: str, size: int, later: str | None = None) -> bytes:
-    """Content of a file of this machine, but no more than a byte above its expected size.
-
-    The disk fetches the file ``later``, which will be asked for soon, meanwhile. Raises OSError if
-    the file is not there.
-    """
+    """Content of a local file, at most a byte above its size; ``later`` is fetched meanwhile."""
     if later is not None:
         with suppress(OSError):
             ahead = os.open(later, os.O_RDONLY)
@@ -146,10 +139,7 @@ def read_file(path: str, size: int, later: str | None = None) -> bytes:
 
 @dataclass(frozen=True)
 class UrlFolder:
-    """A folder at a URL, with the methods of `LocalFolder`.
-
-    An object store puts an object in place when all of it has arrived.
-    """
+    """A folder at a URL, with the methods of `LocalFolder`; a store puts whole objects in place."""
 
     path: UrlPath
 
@@ -235,11 +225,10 @@ def _batches(files: Iterable[File]) -> Iterator[dict[str, bytes]]:
 
 
 def link_files(source: Path, target: Path) -> None:
-    """Give every file below a folder a second name below another; copy where there are no links.
+    """Link every file below a folder into another; copy where there are no links.
 
-    What is in the target already stays, so that a call that was cut short can be repeated; hidden
-    files (those half written) are left out. Linked files share their bytes: replace them, as
-    `pixcal.storage.cube` does, and never write into them.
+    What is there stays, so a call cut short can be repeated; hidden (half-written) files are left
+    out. Linked files share their bytes: replace them, and never write into them.
     """
     for folder, _, names in os.walk(source):
         there = target / Path(folder).relative_to(source)
@@ -261,8 +250,7 @@ def _link(file: Path, target: Path) -> None:
 def copy_files(source: Place, target: Place, names: Sequence[str]) -> None:
     """Copy files of a folder to another, either of which may be at a URL.
 
-    Inside one store the store copies, and what is there already stays; else all come by here.
-    Raises OSError if a file is not there.
+    Inside one store the store copies, and what is there stays. Raises OSError if a file is missing.
     """
     if isinstance(source, UrlPath) and isinstance(target, UrlPath):
         inside = UrlFolder(target).copy(source, names)

@@ -59,8 +59,8 @@ def described(columns: Columns, number: int, folder: Path, frame: Sequence[int])
 class FrameReader:
     """Reads blocks of an array (time, y, x) from FITS files, checking every band of rows.
 
-    ``columns`` is what `describe` returned. ``table`` has the columns ``file`` and ``plane`` of the
-    frames in their order, ``checksums`` (time, band) those of the bytes of each band.
+    ``columns``: of `describe`. ``table``: ``file`` and ``plane`` of the frames in order.
+    ``checksums``: (time, band).
     """
 
     def __init__(

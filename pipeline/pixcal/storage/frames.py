@@ -57,21 +57,10 @@ def natural_key(name: str) -> tuple[list[tuple[int, str]], str]:
 def tabulate(
     array: str, files: Sequence[FrameFile], frame_period_s: float | None
 ) -> tuple[list[Frame], list[str]]:
-    """Put the frames of an array in order and give each its time.
+    """The frames of an array in the order of time, and sentences on what is odd about the times.
 
-    Ordered by time stamp where every file has one, else by natural file name. The later planes of
-    a cube follow its time stamp by ``frame_period_s``, else by its exposure time.
-
-    Parameters
-    ----------
-    array : name of the array, for the warnings
-    files : at least one
-    frame_period_s : from one frame to the next (s)
-
-    Returns
-    -------
-    frames, in the order of time
-    sentences on what is odd about the times
+    By time stamp where every file has one, else by natural file name. Later planes of a cube follow
+    by ``frame_period_s``, else by their exposure time. ``array``: its name, for the sentences.
     """
     ordered, stamped, warnings = _order(files)
     # No frame is over before its exposure: darks are longer than the pace of the fringes.

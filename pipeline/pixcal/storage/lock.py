@@ -75,9 +75,8 @@ def damage_noted(*runs: Path) -> Iterator[None]:
 def lock(run: Path) -> Iterator[None]:
     """Hold a run directory: a second process on it is refused, not mixed in.
 
-    When something of the run that the block reads turns out to be damaged, that is noted: the
-    artefact is not up to date any more, an unfinished build is removed. Raises InputError if
-    another process holds it, or the directory cannot be written.
+    What turns out to be damaged in it is noted, and an unfinished build removed. Raises InputError
+    if another process holds it, or it cannot be written.
     """
     try:
         run.mkdir(parents=True, exist_ok=True)

@@ -141,10 +141,9 @@ def _listed(folder: Path) -> Iterator[str]:
 
 
 def check_intact(folder: Path, manifest: Manifest) -> None:
-    """Hold the files of an artefact against its manifest; chunks are checked when they are read.
+    """Hold the files of an artefact against its manifest, but not their chunks.
 
-    Raises DamagedError naming the first file that is missing or altered, or was found to be so
-    earlier.
+    Raises DamagedError naming the first one missing or altered, or found to be so earlier.
     """
     mark = folder / UNFLUSHED
     if mark.exists() and mark.read_bytes() != boot().encode():

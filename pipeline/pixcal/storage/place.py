@@ -21,8 +21,7 @@ _EXTRAS = {"s3": "pixcal[s3]", "s3a": "pixcal[s3]", "gs": "gcsfs", "gcs": "gcsfs
 class UrlPath:
     """A file or folder at a URL, with as much of `pathlib.Path` as the reader of a cube needs.
 
-    It holds nothing but the URL, so that it can be sent to other processes and machines. The
-    settings (endpoint, credentials) are those of the environment of whoever opens it.
+    It holds the URL alone, to be sent anywhere; settings are those of whoever opens it.
     """
 
     url: str  # such as `s3://bucket/prefix`, without a slash at its end
@@ -53,12 +52,7 @@ class UrlPath:
         return found
 
     def read_bytes(self, most: int | None = None) -> bytes:
-        """Content of a file.
-
-        ``most``: bytes to read at most. Some file systems ask for the size first when they are not
-        told. Raises FileNotFoundError if it is not there. Raises RemoteError if that cannot be
-        known.
-        """
+        """Content of a file, ``most`` bytes of it; FileNotFoundError, or RemoteError if unknown."""
         system, path = self.filesystem()
         with explained(self.url):
             content: bytes = system.cat_file(path, start=None if most is None else 0, end=most)
@@ -73,8 +67,7 @@ Place = Local | UrlPath  # a file or folder, here or at a URL
 def explained(url: str) -> Iterator[None]:
     """Turn what the driver of a file system raises into one line that names the URL.
 
-    Raises FileNotFoundError with ``strerror`` and ``filename`` (the URL), if the file or the bucket
-    is not there. Raises RemoteError in all other cases.
+    FileNotFoundError (with ``strerror``, ``filename``) if it is not there; else RemoteError.
     """
     try:
         yield

@@ -134,15 +134,10 @@ def write_map(
     cards: Sequence[Card],
     history: Sequence[str] = (),
 ) -> None:
-    """Write a map with its errors and flags, a band of rows at a time.
+    """Write a map with its errors and flags, a band of rows at a time; ``path`` is replaced.
 
-    Parameters
-    ----------
-    path : of the FITS file; what is there is replaced once the new file is whole
-    data, sigma : (y, x) float32 map and 1-sigma error, px; NaN where masked
-    mask : (y, x) uint8 bits of `pixcal.model.flags.PixelFlag`
-    cards : (key, value, comment) for the primary header
-    history : HISTORY lines of the primary header
+    ``data, sigma``: (y, x) px, NaN where masked. ``mask``: (y, x) `PixelFlag`. ``cards``: (key,
+    value, comment).
     """
     # Headers of images of this shape, which are nowhere in memory.
     maps, flags_ = (np.broadcast_to(np.zeros((), t), data.shape) for t in (">f4", "u1"))

@@ -16,10 +16,7 @@ _KEPT = 2 * AHEAD
 
 
 class ReadAhead:
-    """Reads files below a URL; those that follow are fetched meanwhile, once two came in order.
-
-    Threads may share it, each with an order of its own.
-    """
+    """Reads files below a URL; those that follow are fetched meanwhile, once two came in order."""
 
     def __init__(self, path: UrlPath) -> None:
         self.path = path
@@ -34,11 +31,7 @@ class ReadAhead:
         return found
 
     def read(self, file: File, following: Sequence[File]) -> bytes:
-        """Content of a file, but not much more of it than its size should be.
-
-        Raises FileNotFoundError if it is not there, RemoteError if that cannot be known. Those
-        ``following`` will be read next, if this is not the only one.
-        """
+        """Content of a file, little more than its size; those ``following`` are read next."""
         expected = self.expected()
         in_order = file in expected
         fetched = expected.pop(file, None)

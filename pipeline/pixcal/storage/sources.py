@@ -29,8 +29,8 @@ Header = tuple[tuple[str, str | float], ...]  # keywords and values
 def read_headers(folder: Path, names: Iterable[str]) -> dict[str, Header]:
     """Headers of files by their names; empty where there is no ``headers.csv``.
 
-    Raises InputError naming the line that matches none of the ``names`` of the acquisition, names a
-    file again, or has no value that can be used.
+    Raises InputError naming the line that matches none of the ``names``, repeats one, or has no
+    usable value.
     """
     path = folder / HEADERS
     if not path.exists():
@@ -136,9 +136,8 @@ def fingerprint(sources: Sequence[SourceFile]) -> str:
 def find_sources(frames: Frames, description: Path) -> dict[str, tuple[SourceFile, ...]]:
     """Files of each array of an acquisition, by the array's name (``fringes/<set>`` for a set).
 
-    Kinds without globs are absent. Raises InputError if a glob leaves the folder or matches
-    nothing, a file is empty or unreadable, or one file is listed twice under two names or for two
-    kinds.
+    Raises InputError if a glob leaves the folder or matches nothing, or a file is empty, unreadable
+    or listed twice.
     """
     found: dict[str, tuple[SourceFile, ...]] = {}
     seen: dict[tuple[int, int], tuple[str, str]] = {}

@@ -81,15 +81,11 @@ def make(
 ) -> Manifest:
     """Make the artefact of a stage, unless it is up to date, in a run that the caller holds.
 
-    Parameters
-    ----------
-    config : plain data of the options that the result depends on
-    inputs : keys of what it is made from
+    config, inputs : options that the result depends on; keys of what it is made from
     body : writes it, into the folder of a `Build`
     cubes : as of `pixcal.storage.artefact.build`
     keep : whether an artefact that is up to date can stay as it is
-    publish : writes products beside those of `ArtefactKind.products`, when it is complete
-    published : whether those of an artefact that stays are there
+    publish, published : writes products beside `ArtefactKind.products`; whether they are there
     """
     key = artefact_key(stage.name, stage.format, config, dict(inputs))
     ready = up_to_date(run, stage.name, key)

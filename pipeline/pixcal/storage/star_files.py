@@ -58,11 +58,7 @@ def write_table(table: Table, path: Path, *, overwrite: bool) -> None:
 
 
 def distortion(correction: F32) -> WCS:
-    """A WCS whose step from detector to image adds a correction to pixel coordinates.
-
-    ``correction``: (2, y, x) float32 what to add to x and y, px, in the middle of each pixel;
-    linear between them.
-    """
+    """A WCS whose step from detector to image adds a correction (2, y, x) to x and y, px."""
     _, ny, nx = correction.shape
     wcs = WCS(naxis=2)
     wcs.pixel_shape = (nx, ny)

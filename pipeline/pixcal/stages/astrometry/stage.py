@@ -1,19 +1,6 @@
 """``pixcal astrometry``: how much the maps improve star centroids.
 
-``astrometry.json`` holds ``schema`` and ``pixcal``; ``detector`` (what the simulated pixels are,
-and with a truth the rms of the modes that it was freed from); ``telescope``; ``stars``; ``axes``,
-for ``x`` and ``y`` (or ``fringe``) errors in px and µas:
-
-- ``floor``: no photon noise; ``photons``: with it; ``averaged``: the mean over all positions of a
-  star, with photon noise; ``separation``: the difference of two stars' means. Each for a
-  ``perfect`` grid, for the ``measured`` maps, and the ``gain``, their ratio;
-- ``photon_bound``: the Cramér-Rao bound of one position; ``averaging``: errors against the number
-  of positions; ``positions_to_target``: how many the target takes if they are independent;
-- ``second_order_px``: by how much the fits differ from the first order (rms), and
-  ``everywhere``: errors of the first order at all places, a star in the middle of each pixel;
-
-and ``warnings`` (sentences). Errors are 1 sigma, of the simulation: other stars, the same detector.
-Values below the maps' own errors are null. ``astrometry.zarr`` holds the maps of errors.
+docs/reference/products.md describes ``astrometry.json``; ``astrometry.zarr`` holds maps of errors.
 """
 
 from collections.abc import Mapping

@@ -1,14 +1,6 @@
 """``pixcal budget``: the expected precision of a bench.
 
-``budget.json`` holds ``schema``, ``pixcal``, ``bench`` (its file and digest), ``precision_px``
-wanted and ``frames`` given (null where not asked for), ``window`` (y, x) and, by part, the
-``variance_e2`` of a sample without light. For each fringe set under ``sets``: ``interfringe_px``,
-``mean_e`` and ``visibility`` of the median pixel; ``frame_px``, the 1-sigma bound of one frame
-along the set's axis, of the median and of the worst pixel; ``planned`` frames and what they reach;
-``wanted`` frames, hours and bytes for the precision; what the frames ``given`` reach; ``shares``
-of the frames, ``limited_by``, and ``calibration``. ``joined`` has the same of the sets together:
-its frames are those of all sets, in the planned proportions. ``levers`` are changes of the bench,
-the most helpful first; ``left_out`` and ``warnings`` are sentences.
+docs/reference/products.md describes ``budget.json``.
 """
 
 from collections.abc import Callable

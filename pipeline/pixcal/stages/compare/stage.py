@@ -1,11 +1,6 @@
 """``pixcal compare``: common signal and differences of maps of the same pixels.
 
-``compare.json`` holds ``schema``, ``pixcal``, ``sides`` (label, run, key of its fit, fringe sets)
-and ``pairs``: for each two sides their numbers and, for each component, what
-`pixcal.stages.compare.stage` says of it, sizes in px at all ``scales`` together and one by one
-(``side_px``: the part that blocks of that side show and blocks of twice the side do not; the last
-holds all larger ones). The sizes of the scales add up in squares. With three sides or more
-``summary`` says what each holds of its own (from the differences of all pairs).
+docs/reference/products.md describes ``compare.json``.
 """
 
 from collections.abc import Iterable, Sequence

@@ -1,14 +1,7 @@
 """Crests and valleys: fibre positions independent of the fit (paper, section 6, figures 16, 17).
 
-``crests.json`` holds ``schema``, ``pixcal`` and, for each fringe set under ``sets``: ``frames``
-(numbers of those read), ``points``, ``points_used`` (no outliers), ``paths``, ``interfringe_px``,
-``segment_px``, ``point_sigma_median_px``; ``geometry`` (of each parameter the value, its 1-sigma
-error, the nominal value and the prior's error, mm, from pixel (0, 0)); ``cost_rad2`` (equation 7),
-``chi2_reduced``, ``evaluations``; ``unique_minimum`` of the cost as far as the maps go; and
-``agreement`` with the geometry of ``RUN/fit`` (null, with ``agreement_note``, where it has none):
-of each parameter the difference in mm and in its sigma, and the phases of both over the window,
-less a piston, in px. That sigma adds both errors in square: too much where priors or frames count
-in both. ``warnings`` are sentences. ``crests.zarr/<set name>`` holds the points and the maps.
+docs/reference/products.md describes ``crests.json``; ``crests.zarr/<set name>`` holds the points
+and the maps.
 """
 
 from collections.abc import Mapping

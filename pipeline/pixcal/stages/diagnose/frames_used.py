@@ -78,10 +78,9 @@ class FramesUsed:
 def missing_frames(
     acquisition: Acquisition, tables: Mapping[str, Table], steps: Sequence[float]
 ) -> dict[str, str]:
-    """Kinds of frames that are of use and that an acquisition does not have, each in words.
+    """Kinds of frames that would be of use, by kind (`Effect.frames_needed`), each in words.
 
-    By kind, as in `Effect.frames_needed`. ``steps`` are those of each set's phase, rad; zero where
-    the phases are random.
+    ``steps``: of each set's phase, rad; zero where phases are random.
     """
     axes = _axes([s.baseline_mm for s in acquisition.frames.fringes])
     missing = {}
@@ -104,11 +103,7 @@ def missing_frames(
 def recommend_frames(
     missing: Mapping[str, str], kinds: Iterable[type[Effect]] = (Effect,)
 ) -> list[str]:
-    """Those of the missing frames that tell effects apart, or all that tell on them (default: any).
-
-    What tells on one effect and not on another parts them; what tells on all of them only where
-    nothing else is missing, for each is known better then.
-    """
+    """Missing frames that tell effects apart, or else all that tell on them (default: any)."""
     told = [set(kind.frames_needed) for kind in kinds]
     some, every = told[0].union(*told), told[0].intersection(*told)
     for wanted in (some - every, some):

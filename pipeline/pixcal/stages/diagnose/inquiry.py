@@ -60,8 +60,7 @@ def inquire(
 ) -> Inquiry:
     """Look at a reduced run, simulate its nominal bench, and search for causes among ``kinds``.
 
-    The nominal bench has the effects of ``base`` from the start. Simulations are kept in
-    ``scratch``: an inquiry that was stopped goes on with them.
+    ``base``: effects the bench has from the start. ``scratch``: keeps simulations, to go on with.
     """
     candidates: dict[str, Candidate] = {}
     signatures: tuple[Signature, ...] = ()

@@ -61,9 +61,8 @@ def look_at(
 ) -> DiagnosisInput:
     """Take the parts of a reduced run that are looked at, and measure their nominal bench.
 
-    ``learnt``: is given the evidence that effects are fitted on and that they are tried on, and how
-    to run estimates in the memory that there is; tells whose estimates are statistics too. Raises
-    InputError if there are too few frames, or a part cannot be fitted.
+    ``learnt``: of the evidence fitted on and tried on, and how to run estimates; tells whose
+    estimates are statistics. Raises InputError: too few frames, or a part that cannot be fitted.
     """
     ingested = Ingested(run_dir / "ingest")
     acquisition, reduction = _acquisition(run_dir, ingested), _reduction(run_dir)

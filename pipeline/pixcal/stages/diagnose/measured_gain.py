@@ -36,11 +36,7 @@ class MeasuredGain:
     neighbours: tuple[tuple[int, int], ...] = ()
 
     def drawn(self, rng: np.random.Generator, change: float = 1.0) -> F32:
-        """Gain (y, x) over the one used, as it may be within its error.
-
-        ``change``: what effects do to the variance of flats over their mean: by as much the photon
-        transfer is wrong.
-        """
+        """Gain (y, x) over the one used, within its error; ``change``: of the variance of flats."""
         measured = np.array([value * change for value, _ in self.transfer])
         errors = np.array([error for _, error in self.transfer])
         # The declared gain is as wrong as the flats show it to be.
@@ -58,10 +54,9 @@ def photon_transfer_change(
     recordings: Sequence[Recording],
     neighbours: Sequence[tuple[int, int]] = (),
 ) -> float:
-    """What effects do to the variance of flats over their mean, neighbours at lags counted.
+    """What effects do to the variance of flats over their mean, neighbours at lags counted; or one.
 
-    One without flats below saturation. The gain that is measured by photon transfer is too large by
-    the inverse of it, and a bench that is simulated with the effects must not have them twice.
+    Photon transfer is off by the inverse, which a bench simulated with them must not have twice.
     """
     flats = [r for r in recordings if r.kind == "flat" and r.electrons > 0 and r.count > 1]
     detector = bench.detector

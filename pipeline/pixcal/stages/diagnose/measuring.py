@@ -44,8 +44,8 @@ def nominal_bench(
 ) -> NominalBench:
     """The nominal bench that was measured by several parts of an acquisition.
 
-    The ``evidence`` is of the same pixels, from the frames of each of the ``halves``; tables and
-    types are those of all frames, ``whole`` is the detector's window (y, x).
+    ``evidence``: of the same pixels, of each of the ``halves``. ``whole``: detector's window (y,
+    x).
     """
     one = evidence[0]
     good = np.all([e.good for e in evidence], axis=0)
@@ -193,10 +193,10 @@ def _frames(
 
 
 def excess_scatter(found: Sequence[FringeEvidence], good: Mask) -> float:
-    """By how much offsets of independent frames differ over what their errors allow; at least 1.
+    """Scatter of offsets of independent frames over their errors, at least 1.
 
-    Effects that differ from frame to frame add to the errors of the offsets. Taken for true ones,
-    that part would be in the simulation twice: as offsets, and by the effect.
+    What differs from frame to frame must not be in a simulation twice: as offsets, and by the
+    effect.
     """
     k = float(np.hypot(*found[0].k))
     most = 1.0

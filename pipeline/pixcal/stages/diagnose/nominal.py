@@ -136,13 +136,8 @@ class NominalBench:
     def simulate(self, half: Half, effects: Sequence[Effect], seed: int, *, window: int = 0) -> Raw:
         """Frames of a half of the acquisition, from this bench with some effects.
 
-        The measured maps have the effects in them, which are undone before they act anew.
-
-        Parameters
-        ----------
-        seed : of everything random; the same seed gives the same noise with other effects
-        window : which of the detector's, for noise of its own; what happens to a frame is the same
-            in all of them
+        The measured maps hold the effects, which are undone before they act anew. ``seed``: of
+        everything random. ``window``: of the detector's, for pixel noise of its own.
         """
         own_seed = seed + SEEDS_APART * window
         undone = IntensityBeforeEffects(effects, self.bench.detector)
@@ -253,11 +248,7 @@ class NominalBench:
 
 
 def uncoupled(dark: Dark, rng: np.random.Generator) -> Dark:
-    """Dark current (y, x) where pixels beside hot ones have that of any others.
-
-    Not the median of all: a sum over few neighbours would then be the same in every simulation,
-    and that of a real detector, whose pixels differ, would stand out.
-    """
+    """Dark current (y, x) where pixels beside hot ones have that of others, not the median."""
     rest = dark - np.median(dark)
     spread = 1.4826 * float(np.median(np.abs(rest)))
     brightest = maximum_filter(rest, size=2 * HOT_REACH + 1, mode="nearest")

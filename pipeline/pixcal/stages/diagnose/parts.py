@@ -98,11 +98,9 @@ def run_in_memory(
     reduction: reduce.Config,
     sweep: Sweep = NO_BATCHES,
 ) -> MemoryPath:
-    """A run of frames that are at hand, with straight fringes, as a run directory.
+    """A run of frames (t, y, x), ADU, by name of the array, as a run directory; straight fringes.
 
-    Of ``frames`` (t, y, x), ADU, by name of the array (``bias``, ``fringes/vertical``), and of what
-    is known of each, as in ``frames.json``. Its arrays are those of the stages; by default nothing
-    is fitted to batches of frames.
+    ``tables``: what is known of them, as in ``frames.json``. By default no batches are fitted.
     """
     run = MemoryPath()
     for name, samples in frames.items():

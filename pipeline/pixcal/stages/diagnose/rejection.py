@@ -72,10 +72,8 @@ def doubtful(
 ) -> Rejection | None:
     """A cause that closes little of the gap and may stand in for another.
 
-    For an unknown cause, if much more of the gap remains than it closes, or if what differs most
-    stays: the main cause is then none of them. For another law of the other causes, if their laws
-    produce a good part of its significance, or if it is not significant in the fitted frames.
-    ``comparison, current, without``: as for `redundant`. ``candidates``: by name.
+    For an unknown cause: more of the gap remains than it closes, or what differs most stays. For
+    another law of other causes: these produce much of its significance, or it has none.
     """
     where = comparison.gap_of(current)
     open_still = comparison.residual(current, where)

@@ -51,8 +51,8 @@ def describe(
 ) -> tuple[Json, list[Json]]:
     """The product, and every curve as measured, nominal and with the effects found.
 
-    ``data`` are the curves of the held-out frames on the reference's scales, ``measured`` in their
-    own units; ``places`` says how far windows are off by themselves, `by_domain`.
+    ``data``: held-out curves on the reference's scales; ``measured``: in their own units;
+    ``places``: how far windows are off, `by_domain`.
     """
     described = _Description(found, data, measured, reference, facts)
     return described.diagnosis(places), list(described.curves.values())
@@ -61,10 +61,7 @@ def describe(
 def by_domain(
     before: Mapping[Key, Difference], after: Mapping[Key, Difference]
 ) -> dict[str, list[float]]:
-    """Standard deviations of the statistic that is furthest off in each domain, before and after.
-
-    Of chance, all statistics of the domain being looked at; at least zero.
-    """
+    """Standard deviations, 0 or more, of what is furthest off in each domain, before and after."""
     found = {}
     for domain in DOMAINS:
         keys = [k for k in before if statistic_named(k[0]).domain == domain]

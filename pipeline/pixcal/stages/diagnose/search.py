@@ -63,14 +63,9 @@ Estimates = Callable[[Effects, Sequence[str]], Mapping[str, float]]
 class Search:
     """Greedy search over candidates.
 
-    Parameters
-    ----------
     data : test statistics of the held-out frames, on the scales of the reference
-    simulate : ``simulate(benches, seeds, label, asked)`` gives the test statistics of several
-        benches. The candidates ``asked`` are those that `estimates` will be called with for the
-        first bench.
-    estimates : ``estimates(effects, names)`` gives the significance of candidates on a simulation
-        of the fitted frames with some effects
+    simulate : of benches, seeds, label and the candidates asked of `estimates` next: statistics
+    estimates : of effects and names: significance of candidates on the fitted frames taken again
     most : number of simulations that the search may use
     """
 

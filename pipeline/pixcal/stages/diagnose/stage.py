@@ -104,10 +104,9 @@ def _base(nominal: Path | None, known: Mapping[str, type[Effect]]) -> Effects:
 
 
 def on_map(effect: Effect, fits: Iterable[FittedSet], run_dir: Path) -> dict[str, Any]:
-    """Rms and maximum (px) of the change of the offsets by an effect, and what is to be done.
+    """Rms and maximum (px) of the offsets' change by undoing an effect, and what is to be done.
 
-    The change is that of undoing the effect on the maps of every fringe set and window, without the
-    modes that the fit removes. It is zero where the free parameters of the fit take the effect up.
+    On maps of every set and window, modes removed; zero where free parameters take it up.
     """
     action = treatment_of(effect, *fitted_shapes(run_dir)).action
     square, count, most = 0.0, 0, 0.0

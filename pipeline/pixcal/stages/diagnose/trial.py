@@ -86,11 +86,9 @@ class Trials:
         label: str,
         beside: Callable[[], None] | None = None,
     ) -> list[list[Curves] | str]:
-        """Statistics of several benches.
+        """Of each bench its simulations (means over the windows), or why it has none.
 
-        Returns for each bench its simulations (means over the windows), or why it cannot be
-        simulated. ``benches``: effects of each. ``seeds``: number of simulations of each.
-        ``beside``: done along with them in this process, if any is to be made.
+        ``seeds``: simulations of each. ``beside``: done meanwhile in this process, if any is made.
         """
         wanted = [(frozenset(bench), seed) for bench in benches for seed in range(seeds)]
         missing = [one for one in dict.fromkeys(wanted) if one not in self._made]

@@ -28,9 +28,8 @@ TURN = (False, True, True, False)  # which blocks are held out: a steady drift i
 def chosen_windows(shape: tuple[int, int], frames: int = 0) -> tuple[Part, tuple[Part, ...]]:
     """The window that effects are fitted on, and those that they are tried on.
 
-    A small detector is one window, and only the frames are parted. On a large one, effects are
-    fitted in the middle and tried in four other places (two, where one side is short). Where there
-    are no fringes but few ``frames`` in each half, more pixels make up for them.
+    A small detector is one; on a large one, the middle, and four other places (two, if one side is
+    short). Without fringes but few ``frames`` in each half, more pixels make up for them.
     """
     if max(shape) <= LARGEST or 0 < frames * math.prod(shape) <= SAMPLES:
         return whole_of(shape), (whole_of(shape),)
