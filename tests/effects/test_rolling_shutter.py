@@ -9,7 +9,7 @@ from joint_fit import fit_jointly
 
 from pixcal.effects.rolling_shutter import RollingShutter
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.row_settling import profile
+from pixcal.estimators.frame_series.row_sums import profile
 from pixcal.kernels.scene import frame_states
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError

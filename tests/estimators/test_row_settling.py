@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.frame_series.row_settling import beside_own_phase, steps_of
+from pixcal.estimators.frame_series.row_sums import beside_own_phase, steps_of
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])

@@ -5,9 +5,15 @@ from functools import lru_cache
 
 import numpy as np
 
-from pixcal.estimators.detector.frame_lag import CLEAR, MAX_DECAY, common_lag, lag_of_flats
+from pixcal.estimators.detector.frame_lag import (
+    CLEAR,
+    MAX_DECAY,
+    Uneven,
+    common_lag,
+    lag_of_flats,
+    seen_share,
+)
 from pixcal.estimators.detector.noiseless_charge import missing_noise
-from pixcal.estimators.detector.pixel_lag import Uneven, seen_share
 from pixcal.estimators.detector.traps import BANDS, LossFit, in_bands
 from pixcal.estimators.diagnosis.evidence import MAX_SAMPLES, Evidence, FringeEvidence, central_crop
 from pixcal.kernels.scene import TILE, Rows, chip_map

@@ -7,13 +7,15 @@ from functools import partial
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.row_settling import (
+from pixcal.estimators.frame_series.row_sums import (
+    RowRamp,
+    RowSums,
+    enough_frames,
     find_settling,
     profile,
     settling_sigmas,
     steps_of,
 )
-from pixcal.estimators.frame_series.row_sums import RowRamp, RowSums, enough_frames
 from pixcal.estimators.maps.corrected import imprint, left_in_samples
 from pixcal.kernels.synthesis import illuminate
 from pixcal.model.arrays import F32, F64

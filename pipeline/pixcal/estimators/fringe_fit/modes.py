@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixcal.estimators.fringe_fit.gauge import FRINGE_MODES
-from pixcal.estimators.fringe_fit.geometry import TilePlane
 from pixcal.estimators.fringe_fit.models import FringeShape
 from pixcal.estimators.fringe_fit.tile_sums import (
     N_LOCAL,
     POWERS,
     SCALE_PX,
     Carrier,
+    TilePlane,
     TileSums,
     expand,
 )

@@ -19,8 +19,7 @@ from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.fringe_fit.combine import weighted_mean
 from pixcal.estimators.fringe_fit.fringes import wrapped
-from pixcal.estimators.fringe_fit.geometry import tile_plane
-from pixcal.estimators.fringe_fit.tile_sums import TileSums, sum_row
+from pixcal.estimators.fringe_fit.tile_sums import TileSums, sum_row, tile_plane
 from pixcal.estimators.maps.corrected import phase_change
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.simulation.effect import FringeMaps

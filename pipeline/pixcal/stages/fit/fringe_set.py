@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.estimators.fringe_fit.geometry import TilePlane, unwrap
 from pixcal.estimators.fringe_fit.models import FringeShape, Polynomial, Start, fringe_models
 from pixcal.estimators.fringe_fit.modes import ModeBasis
-from pixcal.estimators.fringe_fit.tile_sums import Carrier, TileSums
+from pixcal.estimators.fringe_fit.tile_sums import Carrier, TilePlane, TileSums, unwrap
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError

@@ -19,7 +19,6 @@ from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, one_blas_thread, run_tasks
 from pixcal.estimators.fringe_fit.fit_flags import fit_flags, usual_chi2
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
-from pixcal.estimators.fringe_fit.geometry import tile_plane
 from pixcal.estimators.fringe_fit.scout import Scout, in_turn
 from pixcal.estimators.fringe_fit.sweep import (
     BOUND_PIXELS,
@@ -30,7 +29,7 @@ from pixcal.estimators.fringe_fit.sweep import (
     sweep_tile,
 )
 from pixcal.estimators.fringe_fit.tile_fit import Tile
-from pixcal.estimators.fringe_fit.tile_sums import Carrier, TileSums, sum_row
+from pixcal.estimators.fringe_fit.tile_sums import Carrier, TileSums, sum_row, tile_plane
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F32, F64, U16, Indices, Mask
 from pixcal.model.config import result_options
