@@ -1,4 +1,4 @@
-"""Lag: of all pixels, by the contrast of fringes or first frames of flats; and how pixels differ."""
+"""Lag: of all pixels, by contrast of fringes or first frames of flats; and how pixels differ."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
