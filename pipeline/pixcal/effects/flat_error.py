@@ -1,9 +1,8 @@
 """A flat that is not the pixels' response to the light of the fringes.
 
-Waves of random direction and one length, which it may hold, make a ring in the power that two maps
-share. Each scale, the wavelength over 2 pi, has the mean power of such waves on the window as a
-template, less what a parabola takes of them; with white power beside it the template is fitted to
-the cross power of two maps whose noise is not the same, which therefore has none.
+Waves of random direction and one length make a ring in the power that two maps share. Each scale,
+the wavelength over 2 pi, gives a template of such waves on the window, less a parabola; with white
+power beside it, it is fitted to the cross power of two maps of independent noise.
 """
 
 from dataclasses import dataclass

@@ -1,10 +1,8 @@
 """Noise of the electronics that all pixels of a row, or of a column, have in common in a frame.
 
-It is measured by pairs of distant pixels. Each row is cut into blocks, and only products of blocks
-that are not neighbours count: noise that pixels have of their own, or share with pixels near them
-(crosstalk, brighter-fatter), drops out, whatever its size. The products are taken mode by mode of
-the Fourier transform across the rows; the mode of no frequency, which is the frame's own level, is
-left out.
+Each row is cut into blocks, and only products of blocks that are not neighbours count: noise that
+pixels have of their own, or share with pixels near them, drops out. The products are taken mode by
+mode of the Fourier transform across the rows, without the frame's own level.
 """
 
 from collections.abc import Sequence

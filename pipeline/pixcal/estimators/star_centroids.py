@@ -5,12 +5,10 @@ background of B in each pixel,
 
     S = N P(x + dx - a, y + dy - b) + B
 
-(P: `pixcal.kernels.psf`). Fitted are a, b, N and B, by Fisher scoring with the weights
-1 / (S + r²) that the model itself gives. Where the fit takes pixels to lie elsewhere than they do,
-the centroid is wrong, to first order by a weighted sum of the pixels' errors (`weights`): about the
-mean displacement, each pixel counting by what it tells of the position, P_x² / S. A map of offsets
-corrects centroids that were measured on a perfect grid by the same sum: a pixel whose offset is +d
-responds at larger x by d, so the star that it shows lies at larger x than its index says.
+(P: `pixcal.kernels.psf`). a, b, N and B are fitted by Fisher scoring with weights 1 / (S + r²).
+Where the fit takes pixels to lie elsewhere, the centroid is wrong, to first order by a weighted sum
+of the pixels' errors about their mean, each with the weight P_x² / S. A map of offsets corrects
+centroids on a perfect grid by the same sum (docs/explanation/centroid-errors.md).
 """
 
 import math

@@ -1,10 +1,9 @@
 """How frames differ from those of the nominal bench, and what a change of the samples makes of it.
 
-Of a fringe set: the residuals that its fit leaves, the parameters of the frames, the maps of the
-pixels, and second moments of the first two. Of calibration frames: their change in time, their
-mean, second moments. The nominal bench lets all of these be zero, but for noise of known variance
-and the scatter of the pixels. What a change of the samples makes of the first three is linear in
-it, with all that the fit absorbs taken off.
+Of a fringe set: residuals, parameters of the frames, maps of the pixels, and second moments of the
+first two. Of calibration frames: change in time, mean, second moments. All are zero on the nominal
+bench, but for known noise and the scatter of pixels. A change of the samples changes the first
+three linearly, with all that the fit absorbs taken off.
 """
 
 from collections.abc import Sequence

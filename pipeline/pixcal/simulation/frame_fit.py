@@ -1,10 +1,10 @@
 """Parameters of an effect that acts on whole frames, from the series of the frames.
 
-What the effect does to light, contrast and fringe vector follows from its forward model
-(`frame_changes`): steady strengths are shapes, random ones parts of the covariance. Their sizes are
-those of restricted maximum likelihood beside all else that moves frames (`frame_basis`) and the
-noise that two halves of the pixels show. A parameter that is no strength is profiled; one in Hz is
-that of the strongest line of the spectrum.
+What it does to light, contrast and fringe vector follows from its forward model (`frame_changes`):
+steady strengths are shapes, random ones parts of the covariance. Sizes are those of restricted
+maximum likelihood beside all else that moves frames (`FrameBasis`) and the noise that two halves of
+the pixels show. A parameter that is no strength is profiled; one in Hz is that of the strongest
+line.
 """
 
 from collections.abc import Mapping, Sequence

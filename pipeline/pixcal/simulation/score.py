@@ -1,12 +1,10 @@
 """Parameters of an effect from its forward model alone: score test and Gauss-Newton steps.
 
-The frames of an acquisition are taken again without noise (`pixcal.simulation.replica`), with and
-without the effect. The difference says how every deviation from the nominal bench
-(`deviations`) changes, what the fit absorbs being taken off. Held against the
-deviations that were measured, weighed by their noise, it is the score test of strength zero (Rao
-1948, Proc. Camb. Phil. Soc. 44, 50). An effect that is drawn at random changes nothing on average;
-it is known by what it adds to second moments (Lin 1997, Biometrika 84, 309), as is one that mixes
-the noise of samples. Parameters then follow by Gauss-Newton steps on simulations with the same
+The frames are taken again without noise (`pixcal.simulation.replica`), with and without the effect.
+How this changes the `deviations` from the nominal bench, held against those measured, weighed by
+their noise, is the score test of strength zero (Rao 1948, Proc. Camb. Phil. Soc. 44, 50). An effect
+drawn at random, or one that mixes the noise of samples, is known by what it adds to second moments
+(Lin 1997, Biometrika 84, 309). Parameters follow by Gauss-Newton steps on simulations with the same
 random numbers (indirect inference: Gourieroux, Monfort & Renault 1993, J. Appl. Econometrics 8,
 S85).
 """

@@ -1,16 +1,13 @@
-"""Versioned artefacts: what a stage leaves on disk.
+"""Versioned artefacts: what a stage leaves on disk (docs/explanation/artefacts.md).
 
-An artefact is a directory ``RUN/<stage>`` with a ``manifest.json``. It is built aside, in
-``RUN/.partial/<stage>-<key>``, and renamed when complete, so that a directory that exists is whole.
-The key is a digest of everything the result depends on: options, inputs, format, and the version of
-pixcal. A build with the same key that was killed is found again and resumed, if it was begun by the
-same code to the letter. Unfinished builds with other keys are removed when one completes.
+An artefact, a directory ``RUN/<stage>`` with a ``manifest.json``, is built in
+``RUN/.partial/<stage>-<key>`` and renamed when complete. The key is a digest of all that the result
+depends on: options, inputs, format, and the version of pixcal. A killed build with the same key,
+begun by the same code to the letter, is resumed; others are removed when one completes.
 
-An artefact may be complete before it is on the disk (`unflushed`). Until then it holds a mark with
-the boot of the machine; after another boot, as after a power failure, it is damaged.
-
-What turns out to be damaged (`pixcal.storage.manifest`) is noted in the artefact: it is not up to
-date from then on, and its stage makes it again.
+An artefact may be complete before it is on the disk (`unflushed`): until then it holds a mark with
+the boot of the machine, and after another boot it is damaged. What is damaged is noted in the
+artefact (`pixcal.storage.manifest`), and its stage makes it again.
 """
 
 import json

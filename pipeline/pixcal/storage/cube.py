@@ -1,11 +1,9 @@
 """Cubes (time, y, x) on disk: Zarr 3 arrays in whole, checksummed chunks, one writer a chunk.
 
-zarr-python makes the metadata; the chunks are read and written here, because its own pipeline does
-not scale with threads (design note on storage). The bytes are the same: the tests read each with
-the other. Cubes lie in folders of this machine or at URLs (`pixcal.storage.place`). Every chunk has
-a crc32c inside (the Zarr codec), and its size and that crc are kept in an index beside the array,
-so that a chunk that is missing, cut or exchanged is refused and never read as zeros. The index ends
-with a crc of itself and of the metadata.
+zarr-python makes the metadata; chunks, of the same bytes, are read and written here, because its
+own pipeline does not scale with threads. Cubes lie in folders of this machine or at URLs. Every
+chunk has a crc32c inside, and its size and crc are in an index beside the array, which ends with a
+crc of itself and of the metadata: a chunk that is missing, cut or exchanged is refused.
 """
 
 import errno

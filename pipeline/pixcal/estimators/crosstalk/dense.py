@@ -1,11 +1,10 @@
 """A whole kernel: every coupling within two pixels, shrunk by its error instead of dropped.
 
-Noise that neighbours share, hot pixels and the pattern of the maps are joined as least-squares sums
-of the same shares. A share is what all classes of pixels have in common both ways, what they have
-in common there rather than back, and what is its own; each of these parts is of a size that is
-learnt from all couplings of a kind (empirical Bayes, variance components by expectation and
-maximisation). Parts that the data do not show are small by that, and their errors are those of what
-may be there.
+Shared noise, hot pixels and the pattern of the maps are joined as least-squares sums of the shares.
+A share is what all classes have in common both ways, what they have in common there rather than
+back, and what is its own; the sizes of these parts are learnt from all couplings of a kind
+(empirical Bayes, by expectation and maximisation). Parts that the data do not show are small by
+that.
 """
 
 from collections.abc import Callable, Collection, Iterable, Sequence

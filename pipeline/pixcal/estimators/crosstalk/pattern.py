@@ -1,16 +1,13 @@
 """Couplings from the maps of a fit, class by class of pixels: visibility, and offsets.
 
 A pixel that gets the share k of one a step n away, and keeps the share o, has its fringe multiplied
-by ``(o + sum k exp(-i K n)) / (o + sum k)``: flats suffer the same as the mean light, so the ratio
-does not depend on them. Its size is seen in the visibility, its angle in the offset, as a shift of
-``arg / |K|``. A true displacement, periodic or not, is the same at every K; so of the offsets only
-what differs between sets counts, which needs more sets than the two axes. The visibility tells with
-a single set, up to pixels of a row being wider than those of another (`WIDTH`).
+by ``(o + sum k exp(-i K n)) / (o + sum k)``, whatever the flat. Its size shows in the visibility,
+its angle in the offset, as a shift of ``arg / |K|``. A true displacement is the same at every K; so
+of the offsets only what differs between sets counts, which needs more sets than the two axes. The
+visibility tells with one set, up to pixels of a class being wider than those of another (`WIDTH`).
 
-A kernel that repeats acts on all pixels of a class alike. True offsets have such a pattern by
-chance only, that of the mean of so many pixels; or, on a detector whose pixels are drawn so, a real
-one, whose size is free here and learnt beside the couplings (`dense`). Couplings that are known
-already are undone on the maps; what is left is linear in the rest.
+True offsets have a pattern of classes by chance; or a real one, whose size is learnt beside the
+couplings (`dense`). Known couplings are undone on the maps; what is left is linear in the rest.
 """
 
 from collections.abc import Callable, Sequence

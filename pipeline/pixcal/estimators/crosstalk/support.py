@@ -1,10 +1,8 @@
 """Which couplings there are: links, periods and classes of pixels that stand out of the noise.
 
-Every pair of pixels a step apart, and every period of rows and columns, is tried. For a link to be
-taken it must stand out by so much that, with all that was tried, chance takes anything at all in
-one acquisition of a hundred. Half of that chance is left to what crosstalk mostly is: adjacent
-pixels that couple alike everywhere. They are few looks, so that less is enough for them. A
-capacitance couples both ways alike, and a kernel repeats; so shares there and back, and of many
+Every pair of pixels a step apart, and every period of rows and columns, is tried. A link is taken
+if it stands out so far that chance takes any in one acquisition of a hundred; half of that is left
+to the few looks at adjacent pixels that couple alike everywhere. Shares there and back, and of many
 classes, are one number until the data tell them apart.
 """
 

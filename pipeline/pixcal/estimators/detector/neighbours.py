@@ -1,14 +1,10 @@
 """Noise that neighbouring pixels share because collected charge moves their boundary.
 
-The covariance of neighbours has three parts that differ in how they grow with the level: constant
-(noise of rows and columns, electronics), in proportion (crosstalk between pixels: a share of the
-shot noise), and with its square (brighter-fatter). They are told apart by weighted least squares on
-the products of neighbouring residuals of fringe frames and of flats; the first two are free for
-each direction.
-
-Before that the residuals lose all that is the same function of the frame's phase in every frame, up
-to the fifth harmonic, so that a nonlinear response cannot pass for noise; and outliers, since a
-particle hits neighbours together.
+The covariance of neighbours has parts that are constant (rows, columns, electronics), in proportion
+to the level (crosstalk: a share of the shot noise), and to its square (brighter-fatter). They are
+told apart by weighted least squares on products of neighbouring residuals of fringe frames and
+flats; the first two are free for each direction. Before that the residuals lose outliers, and what
+is the same function of the phase in every frame: a nonlinear response cannot pass for noise.
 """
 
 from collections.abc import Iterator

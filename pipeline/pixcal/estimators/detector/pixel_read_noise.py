@@ -1,10 +1,9 @@
 """Read noise pixel by pixel, from the scatter of few frames without light.
 
 The variance of a pixel in n frames has a relative error of sqrt(2 / (n - 1)), often more than
-pixels differ by. What is drawn here has both the scatter that pixels truly have and the values
-that single pixels are seen to have, as far as they can be known: a draw from the posterior. How
-pixels are distributed, with what tail, is found from all of them, as the likeliest distribution on
-a grid (Kiefer & Wolfowitz 1956, Ann. Math. Statist. 27, 887).
+pixels differ by. What is drawn here is a draw from the posterior; how pixels are distributed is
+found from all of them, as the likeliest distribution on a grid (Kiefer & Wolfowitz 1956, Ann. Math.
+Statist. 27, 887).
 """
 
 from collections.abc import Sequence

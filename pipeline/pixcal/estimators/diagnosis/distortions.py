@@ -1,10 +1,9 @@
 """Distortions of the signal that the fit of the fringes cannot absorb, fitted to its residuals.
 
-A distortion adds something to the samples that depends on the signal and a few sizes. The fit takes
-up whatever its free pixels and frames can follow; what it leaves is the rest, once the directions
-in which it is free are projected out (with its weights). The same projection on the residuals makes
-them blind to every error of the fit, a moving fringe vector included, and the sizes are a weighted
-least-squares fit of one to the other (Gauss-Newton, since the fitted signal is itself distorted).
+A distortion adds something to the samples that depends on the signal and a few sizes. The
+directions in which the fit is free are projected out of it and of the residuals (with weights),
+which makes both blind to every error of the fit; sizes follow by weighted least squares
+(Gauss-Newton).
 """
 
 from collections.abc import Callable, Sequence

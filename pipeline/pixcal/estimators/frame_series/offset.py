@@ -1,11 +1,10 @@
 """A constant added to a whole frame, told apart from noise of rows, columns and pixels.
 
-The pixels are halved by stripes of rows and by stripes of columns, which makes four quarters. The
-mean of a frame (W) holds its offset and all of the noise. The difference of the halves by rows (R)
-holds the noise of rows and pixels, that by columns (C) of columns and pixels, the one across (K)
-of the pixels alone; each as much of it as the mean does. So the variances of the four give that of
-the offset, and no model of the noise stands between. By them the noise in each frame's own offset
-is taken out (Wiener).
+Stripes of rows and stripes of columns halve the pixels. The mean of a frame (W) holds its offset
+and all noise; the difference of the halves by rows (R) the noise of rows and pixels, by columns (C)
+of columns and pixels, the one across (K) of pixels alone, each as much as the mean does. So the
+four variances give that of the offset, without a model of the noise, and its noise is taken out
+(Wiener).
 """
 
 from collections.abc import Sequence

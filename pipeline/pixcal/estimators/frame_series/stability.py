@@ -1,9 +1,8 @@
 """What a window's Allan deviations say: level, slope, knee, each with its error.
 
-The yardstick is a simulated population of pixels without any drift: white noise with the run's own
-gaps, pushed through the same estimator, from a fixed seed. It gives what no closed form gives for
-few batches and gaps: by how much the median over pixels of a deviation lies below the deviation
-itself, how it scatters, and how the lengths, which share batches, are correlated.
+A simulated population of pixels with white noise and the run's own gaps goes through the same
+estimator, from a fixed seed. It tells how far the median over pixels lies below the deviation, how
+it scatters, and how the lengths, which share batches, are correlated.
 """
 
 from collections.abc import Sequence

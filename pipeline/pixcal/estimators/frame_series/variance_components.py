@@ -1,11 +1,9 @@
 """How much of a series is white and how much wanders: components of its variance.
 
-Series are taken to their walk modes (`walk_modes`), in which white noise and a walk together are
-independent from mode to mode, exactly; other stationary noise is so but for ends and gaps. Each
-mode is then a normal vector of covariance ``sum_i size_i part_i`` about ``known @ beta``. The sizes
-are those of restricted maximum likelihood (Patterson & Thompson 1971, Biometrika 58, 545), by
-Fisher scoring, and near the end with the average information (Gilmour, Thompson & Cullis 1995,
-Biometrics 51, 1440), which converges faster.
+In walk modes white noise and a walk are independent from mode to mode. Each mode is a normal vector
+of covariance ``sum_i size_i part_i`` about ``known @ beta``. The sizes are those of restricted
+maximum likelihood (Patterson & Thompson 1971, Biometrika 58, 545), by Fisher scoring, and near the
+end with the average information (Gilmour, Thompson & Cullis 1995, Biometrics 51, 1440).
 """
 
 from collections.abc import Sequence

@@ -1,11 +1,9 @@
 """Fields of a detector whose masks the foundry laid side by side, each off by a little.
 
-A field moves all its pixels alike, so that offsets have steps along a grid of rows and columns.
-Steps have a share in every smooth pattern, and hide what bends a map by as much. With the fields
-known, the offset of each is a free term of a fit, and the map within them tells.
-
-Lines are looked for one after the other: the score test of a step of its own size in every field
-that a line would cut, smooth terms and the fields so far left free.
+A field moves all its pixels alike: offsets have steps along a grid of rows and columns, which have
+a share in every smooth pattern. With the fields known, the offset of each is a free term of a fit.
+Lines are found one by one: the score test of a step of its own size in every field that a line
+would cut, smooth terms and the fields so far left free.
 """
 
 import math

@@ -1,9 +1,8 @@
 """The gap between data and simulations: curve by curve, how far beyond what chance allows.
 
-Simulations of the same bench with other random numbers show how a statistic scatters. A value of
-the data is held against them by Student's distribution: with few simulations, a deviation counts
-for as much as it can. Mean squares are compared through a root below their usual size and a
-logarithm above it: the scatter of both is nearly normal, and the same for strong effects and weak.
+Values are held against simulations of the same bench by Student's distribution: with few of them, a
+deviation counts for as much as it can. Mean squares are compared through a root below their usual
+size and a logarithm above it, whose scatter is nearly normal.
 """
 
 from collections.abc import Mapping

@@ -1,15 +1,9 @@
 """The detector of the simulated stars: true and measured positions of its pixels.
 
-The true offsets of a real detector are not known, but the maps say what they may be: the measured
-offset and a draw of its error. That draw is what the maps do not know; a centroid that takes pixels
-where the maps say errs by it alone. Against a perfect grid such a detector is worse than the real
-one, its offsets holding the maps' errors twice (once in the maps, once in the draw): `summary`
-subtracts both. Where a truth is given, it is the detector, without the modes that no fringes can
-tell from the bench (physics note, section 2).
-
-Smooth modes (a plane; what moving a fibre does to hyperbolic fringes) act on stars like distortion
-of the telescope, which a mission has to measure anyway. The fringe and its harmonic are lost to
-free intensities; over a large window they contain almost no part of the true offsets.
+What the true offsets may be, the maps say: the measured offset and a draw of its error. A centroid
+that takes pixels where the maps say errs by the draw alone; against a perfect grid such a detector
+holds the maps' errors twice, which `summary` subtracts. Where a truth is given, it is the detector,
+without the modes that no fringes can tell from the bench (docs/explanation/gauge.md).
 """
 
 from collections.abc import Sequence

@@ -1,10 +1,9 @@
 """The errors of the stars as the numbers of ``astrometry.json``, and as a table.
 
-On a detector that is the maps plus a draw of their errors, true offsets t, errors of the maps e and
-the draw d are independent, e and d alike. Stars fitted on a perfect grid err by K(t + e + d), with
-K the weights of the pixels; those fitted where the maps say by K d. So the mean square that the
-true offsets alone would give is that of the first less twice that of the second, whatever the
-pattern of the offsets.
+True offsets t, errors of the maps e and their draw d are independent, e and d alike. Stars fitted
+on a perfect grid err by K(t + e + d), K being the weights of the pixels; those fitted where the
+maps say by K d. So the mean square by true offsets is that of the first less twice that of the
+second.
 """
 
 import math

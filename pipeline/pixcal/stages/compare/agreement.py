@@ -1,18 +1,13 @@
 """Agreement of two maps of the same pixels, scale by scale: common signal and noise.
 
-The window is cut into blocks of 1, 2, 4, ... pixels a side. The squares of a map's block means,
-each block counting with its pixels, fall from side to side; what they lose from one to the next is
-the part of the map at that scale: a nested analysis of variance (of Haar's wavelets, where no pixel
-is missing). The parts add up to the whole, and for white noise each holds as much per degree of
-freedom as a pixel does. Products of two maps are decomposed in the same way: the signal common
-to both is their covariance at a scale.
+The squares of a map's means over blocks of 1, 2, 4, ... pixels a side fall from side to side; what
+they lose from one to the next is the part of the map at that scale (a nested analysis of variance).
+The parts add up, and for white noise each holds as much per degree of freedom as a pixel does.
+Products of two maps are decomposed alike: the common signal is their covariance at a scale.
 
-Modes that neither map can know are fitted to both and removed from the sums of products: a map
-without its modes has sums that follow from those of the map and the modes. So maps of any size are
-read once, tile by tile.
-
-Sums over blocks are one array (k + 3, y, x): of the two maps and their modes (k), of the maps'
-variances (2), and of the good pixels.
+Modes that neither map can know are removed from the sums of products, so maps of any size are read
+once, tile by tile. Sums over blocks are one array (k + 3, y, x): of the two maps and their modes
+(k), of the maps' variances (2), and of the good pixels.
 """
 
 import math

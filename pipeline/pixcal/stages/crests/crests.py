@@ -1,15 +1,11 @@
 """Crests and valleys of the fringes (paper, section 6, equation 6), found in noisy frames.
 
-Where the phase of the fringes is k pi they have a crest (k even) or a valley (k odd). A maximum of
-single samples is lost in the noise, and moved by any slope of the illumination. Here the phase is
-measured in windows a few fringes wide and a segment of the fringe long, apart from the background
-and from slopes of the contrast; a path's point is where that phase crosses k pi.
-
-Windows share no pixel, so the errors of their points are independent; nothing is gained by points
-on the paths between, whose windows would overlap. A first pass over one frame, with a straight
-carrier, is followed outwards from a seed by a polynomial that numbers the fringes; the second pass,
-over every frame, takes this polynomial for a carrier and divides by the smooth illumination, so
-that neither curved fringes nor the shape of the beam move a point.
+Where the phase of the fringes is k pi they have a crest (k even) or a valley (k odd). The phase is
+measured in windows a few fringes wide and a segment long, apart from the background and from slopes
+of the contrast; a path's point is where it crosses k pi. Windows share no pixel, so the errors of
+their points are independent. A first pass over one frame, with a straight carrier, gives a
+polynomial that numbers the fringes; the second, over every frame, takes it for a carrier and
+divides by the smooth illumination.
 """
 
 from collections.abc import Callable

@@ -1,12 +1,10 @@
 """The nominal bench of an acquisition: an ordinary, well-behaved bench as its own frames show it.
 
-Straight fringes with one fringe vector a set, two beams whose contrast varies over the window as
-two Gaussian beams can make it, constant intensity and visibility, the phases as they were; a
-linear detector whose pixels and frames know nothing of each other; bias, dark current, read noise
-pixel by pixel, gain of each amplifier, flat and offsets as measured. What is known only within an
-error is drawn anew in every simulation. Offsets keep everything that true ones can have; fringes,
-rows or columns that repeat, and curvature are taken out of them, for no foundry makes these: they
-are what a simulation must bring about by some effect.
+Straight fringes with one fringe vector a set, two beams, constant intensity and visibility, the
+phases as they were; a linear detector without couplings; all else as measured
+(docs/explanation/diagnosis.md). What is known only within an error is drawn anew in every
+simulation. Fringes, repeating rows or columns, and curvature are taken out of the offsets, for no
+foundry makes these: they are what a simulation must bring about by some effect.
 """
 
 from collections.abc import Mapping, Sequence

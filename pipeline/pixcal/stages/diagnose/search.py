@@ -1,9 +1,9 @@
 """Search for the effects that close the gap: added one by one, then each left out in turn.
 
-A candidate comes with parameters that were fitted to other frames. It is accepted if it makes the
-held-out frames likelier by more than chance and complexity allow, and by more than any other. The
-search then goes on with it in the bench. The same estimate, made on a simulation with the accepted
-effects, tells how much of a candidate's significance these produce.
+A candidate is accepted if, with parameters fitted to other frames, it makes the held-out frames
+likelier by more than chance and complexity allow, and by more than any other. The same estimate, on
+a simulation with the accepted effects, tells how much of a candidate's significance these produce
+(docs/explanation/cause-search.md).
 """
 
 from collections.abc import Callable, Mapping, Sequence
