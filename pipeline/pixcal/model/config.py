@@ -38,8 +38,6 @@ def quantity(
 ) -> Any:
     """Declare a configuration field with its unit and range.
 
-    Parameters
-    ----------
     default : value used when the key is absent; without it the key is required
     unit : unit, for messages and the documentation
     low, high : inclusive limits of a number (of each number of a tuple)
@@ -84,8 +82,6 @@ def parse(cls: type[T], data: Any, where: str, *, key: str = "") -> T:
     Raises InputError naming the first key that is unknown, missing, of the wrong type or out of
     range.
 
-    Parameters
-    ----------
     cls : a frozen dataclass with type-annotated fields
     data : mapping as read from YAML (mistakes then have their line) or JSON
     where : name of the file, for messages

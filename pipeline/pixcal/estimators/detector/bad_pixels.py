@@ -41,8 +41,6 @@ _SAMPLE = 4096
 def hot(rate: F64, error: F64, sigma: float, limit: float) -> Mask:
     """Dark signal far above that of the neighbours: the glow of an amplifier is none.
 
-    Parameters
-    ----------
     rate, error : (y, x) dark signal of each pixel and its standard error (ADU/s), from a border of
         blocks on
     sigma : robust spread of the detector's dark signals (ADU/s); that of the neighbours may be
@@ -57,8 +55,6 @@ def hot(rate: F64, error: F64, sigma: float, limit: float) -> Mask:
 def dead(flat: F64, error: F64, low: float, high: float, floor: float) -> Mask:
     """Response far below or above that of the neighbours, or next to none at all.
 
-    Parameters
-    ----------
     flat, error : (y, x) relative response and its standard error, from a border of blocks on
     low, high : limits in units of the median of the pixel's block, and of the upper quartile of
         those in it above ``floor``: beside a dark edge most may see no light

@@ -348,8 +348,6 @@ class CodeWidths:
         is no linear change, so the fit is repeated about what was found, by changes of a code;
         where levels change places, by small ones.
 
-        Parameters
-        ----------
         scatter : variance of the widths beside
         law : of the converter
         start : (n,) errors of the weights from where the fit begins

@@ -63,8 +63,6 @@ def noise_before_missing_codes(
 
     None where no noise does.
 
-    Parameters
-    ----------
     variance, error : of a sample, on average over the pixels, and its standard error
     means : (n,) mean samples of pixels like these, over so many ``frames``
     counts : (code,) how often each code came up

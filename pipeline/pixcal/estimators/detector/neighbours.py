@@ -166,8 +166,6 @@ def pair_sums(
     The terms are a constant, the sum of the two charges, and what is ``shared`` in two ways. A
     product has the weight of one over the product of the two variances.
 
-    Parameters
-    ----------
     residual, variance, charge : (t, y, x) float32; pairs of which a residual is zero have no weight
     shared : two (t, y, x) float32, at the first pixel of each pair
     covariance, of_place : (t, j, j), (j, y, x) float32 of the functions of place that each frame

@@ -98,8 +98,6 @@ def flat_pair_sums(
 ) -> F64:
     """The same of flats, each made as bright as the other of its pair.
 
-    Parameters
-    ----------
     frames : (t, y, x) ADU above bias and dark
     levels : (t,) their common levels, in any unit; pairs that differ too much are not used
     gain, read_noise, quantum : as of `pair_statistics`

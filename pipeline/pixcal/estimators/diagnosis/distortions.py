@@ -40,8 +40,6 @@ DENIED = 0.25  # share of what sets show by themselves from which common sizes a
 class TwoWay:
     """A table of frames by pixels whose rows and columns are each free in some functions.
 
-    Parameters
-    ----------
     weight : (t, n) one over the variance; zero where a sample has no weight
     of_time : (k, t) the functions of time that a pixel is free to have
     of_place : (j, n) the functions of place that a frame is free to have
@@ -163,8 +161,6 @@ def fit_distortions(
 
     That is from the noise of the samples. Last, how far the sets agree on them.
 
-    Parameters
-    ----------
     distortion : from a set, its signal (t, y, x) without distortion and the sizes, what is added to
         the signal (t, y, x). Derivatives are the changes by sizes of one.
     margin : pixels along the edges that are not used

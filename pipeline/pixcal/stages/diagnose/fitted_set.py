@@ -57,8 +57,6 @@ def undone_on_samples(
 
     None where the effect is not one of samples.
 
-    Parameters
-    ----------
     fit : of the frames that the maps were fitted to; by default their phases are spread evenly
     beyond : the fringes go on beyond the edges of the maps, as where an effect is simulated; by
         default the effect is undone on frames that end there
