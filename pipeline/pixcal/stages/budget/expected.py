@@ -1,7 +1,7 @@
 """Expected precision of a bench: frames for a given precision, and what limits it.
 
-The bound of `bound` on a grid of pixels spread over the window, for each fringe
-set and for the sets joined. What is systematic is not in it.
+The Cramér-Rao bound (`phase_information`) on a grid of pixels spread over the window, for each
+fringe set and for the sets joined. What is systematic is not in it.
 """
 
 from collections.abc import Callable, Sequence
