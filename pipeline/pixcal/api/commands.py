@@ -97,7 +97,7 @@ def _simulate(bench: StrPath, out: StrPath, options: of.Simulate, runtime: Runti
 
 
 def function_of(
-    kind: type, name: str, body: Callable[..., T], fails: str, returns: str = ""
+    kind: type, body: Callable[..., T], fails: str, returns: str = "", name: str = ""
 ) -> Callable[..., T]:
     """The function of a command, which takes the fields of its options as keywords.
 
@@ -107,12 +107,13 @@ def function_of(
     Parameters
     ----------
     kind : of the options; its docstring says what the command does
-    name : of the function
     body : called by keywords, ``options`` and ``runtime`` among them; parameters after ``options``
         can only be given by name
     fails : when the function raises InputError
     returns : what it returns, where that is not simply the run
+    name : of the function, where that is not the one of its options
     """
+    name = name or kind.__name__.lower()
     declared, hints = inspect.signature(body), get_type_hints(kind)
     options, names = {f.name: f for f in fields(kind)}, list(declared.parameters)
     before, after = names[: names.index("options")], names[names.index("options") + 1 :]
@@ -173,76 +174,64 @@ def _words(parameter: Parameter) -> str:
 
 run = function_of(
     of.Run,
-    "run",
     _all_steps,
     "a file, key or option is wrong. A diagnosis or correction that is not possible is a warning",
     "Run\n    Without fringes in the acquisition it holds only what was measured of the detector.",
 )
-ingest = function_of(of.Ingest, "ingest", _ingest, "a file, key or option is wrong")
+ingest = function_of(of.Ingest, _ingest, "a file, key or option is wrong")
 reduce = function_of(
     of.Reduce,
-    "reduce",
     _step("reduce"),
     "the run was not ingested, or its gain is to be measured and cannot be",
 )
 fit = function_of(
     of.Fit,
-    "fit",
     _step("fit"),
     "the run was not reduced, was not diagnosed (for ``with_diagnosis``), or holds no fringes that "
     "can be fitted",
 )
 allan = function_of(
-    of.Allan,
-    "allan",
-    _step("allan"),
-    "the run was not fitted, or a region is not inside its window",
+    of.Allan, _step("allan"), "the run was not fitted, or a region is not inside its window"
 )
 write_report = function_of(
     of.Report,
-    "write_report",
     _step("report"),
     "the run was not reduced",
     "Run\n    Its ``report`` is the page.",
+    "write_report",
 )
 crests = function_of(
     of.Crests,
-    "crests",
     _json_of("crests", "crests.json"),
     "the run was not reduced, or a set has too few fringes",
     "dict\n    Contents of ``crests.json``.",
 )
 diagnose = function_of(
     of.Diagnose,
-    "diagnose",
     _json_of("diagnose", "diagnosis.json"),
     "the run was not reduced, or an effect is not known",
     "dict\n    Contents of ``diagnosis.json``.",
 )
 astrometry = function_of(
     of.Astrometry,
-    "astrometry",
     _json_of("astrometry", "astrometry.json"),
     "the run was not fitted, or the truth is not that of this detector",
     "dict\n    Contents of ``astrometry.json``.",
 )
 compare = function_of(
     of.Compare,
-    "compare",
     _compare,
     "a run was not fitted, or the windows differ",
     "dict\n    Contents of ``compare.json``; pictures are beside it in ``out``.",
 )
 budget = function_of(
     of.Budget,
-    "budget",
     _budget,
     "the bench cannot be read, or its frames determine nothing",
     "dict\n    Contents of ``budget.json``; with ``out`` it goes there, with ``budget.png``.",
 )
 simulate = function_of(
     of.Simulate,
-    "simulate",
     _simulate,
     "the bench is wrong, or a directory holds what simulate did not put there",
     "Path\n    The acquisition.",

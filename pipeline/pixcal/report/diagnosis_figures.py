@@ -97,15 +97,9 @@ def _share_axes(axes: Axes, rows: int) -> None:
 
 
 def _causes(axes: Axes, causes: Mapping[str, Mapping[str, Any]]) -> None:
-    low, high, alone, unique = shares = (
-        100
-        * np.array(
-            [
-                (*c["gap_closed_interval"], c["gap_closed"], c["gain_over_rest"])
-                for c in causes.values()
-            ]
-        ).T
-    )
+    ends = np.array([c["gap_closed_interval"] for c in causes.values()])
+    sizes = np.array([(c["gap_closed"], c["gain_over_rest"]) for c in causes.values()])
+    low, high, alone, unique = shares = 100 * np.hstack([ends, sizes]).T
     rows = range(len(causes))
     axes.plot([low, high], [rows, rows], color=BLUE, lw=3, solid_capstyle="butt")
     axes.plot(alone, rows, "o", color=BLUE, ms=8, label="gap closed")

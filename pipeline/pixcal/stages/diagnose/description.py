@@ -51,14 +51,11 @@ def bench_of(
         bias_adu=0.0,
         full_well_e=d.full_well_e,
     )
+    counts = [len(tables[name]["time_s"]) for name in listed]
+    peaks = [float(np.max(truth.light * (1 + truth.contrast))) for truth in sets]
     listed_sets = [
-        (
-            s.name,
-            s.baseline_mm,
-            len(tables[f"fringes/{s.name}"]["time_s"]),
-            float(np.max(truth.light * (1 + truth.contrast))),
-        )
-        for s, truth in zip(acquisition.frames.fringes, sets, strict=True)
+        (s.name, s.baseline_mm, count, peak)
+        for s, count, peak in zip(acquisition.frames.fringes, counts, peaks, strict=True)
     ]
     visibility = float(np.mean(contrast)) if contrast else 1.0
     return plain_bench(evidence, detector, visibility, (exposure, period), listed_sets)

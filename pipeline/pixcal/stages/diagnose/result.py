@@ -287,11 +287,8 @@ class _Description:
             listed = key in self.where or key[0] in ALWAYS
             if curve["unit"] not in ("px", "e-", "rad") or not listed:
                 continue
-            at, nominal, after = (
-                self.final.before[key].worst,
-                curve["nominal"],
-                curve["with_effects"],
-            )
+            at = self.final.before[key].worst
+            nominal, after = curve["nominal"], curve["with_effects"]
             alone = {name: self._band(trial, key)["value"][at] for name, trial in only.items()}
             rows.append(
                 {
