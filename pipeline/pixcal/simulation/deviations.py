@@ -366,16 +366,9 @@ def pair_sums(values: F32, good: Mask) -> F64:
         float(np.einsum("tn,tn->t", flat[n:], flat[:-n]).sum(dtype=float)) if n < count else 0.0
         for n in FRAMES_APART
     ]
-    return np.concatenate(
-        [
-            _upper(within_rows, 1),
-            _upper(within_columns, 1),
-            _upper(of_columns.T @ of_columns - within_rows, 0),
-            _upper(of_rows.T @ of_rows - within_columns, 0),
-            near.sum(axis=1),
-            apart,
-        ]
-    )
+    columns_apart = of_columns.T @ of_columns - within_rows
+    rows_apart = of_rows.T @ of_rows - within_columns
+    return _each_once((within_rows, within_columns), (columns_apart, rows_apart), near, apart)
 
 
 def pair_variance(frames: int, good: Mask) -> F64:
@@ -390,16 +383,7 @@ def pair_variance(frames: int, good: Mask) -> F64:
     of_rows[np.diag_indices(len(rows))] *= 2
     _, near = neighbour_sums(np.zeros((1, *good.shape), np.float32), good, DIAGONAL)
     apart = [max(frames - n, 0) / frames * there.sum() for n in FRAMES_APART]
-    return frames * np.concatenate(
-        [
-            _upper(in_rows, 1),
-            _upper(in_columns, 1),
-            _upper(of_columns, 0),
-            _upper(of_rows, 0),
-            near.sum(axis=1),
-            apart,
-        ]
-    )
+    return frames * _each_once((in_rows, in_columns), (of_columns, of_rows), near, apart)
 
 
 def taken_by_fit(place: F32, covariance: F64, of_time: F32, good: Mask) -> F64:
@@ -425,6 +409,9 @@ def taken_by_fit(place: F32, covariance: F64, of_time: F32, good: Mask) -> F64:
     return taken
 
 
-def _upper(matrix: F64, first: int) -> F64:
-    """Pairs of a symmetric matrix, each once, from a diagonal on."""
-    return np.asarray(matrix[np.triu_indices(len(matrix), first)])
+def _each_once(
+    within: tuple[F64, F64], between: tuple[F64, F64], near: F64, apart: Sequence[float]
+) -> F64:
+    """Pairs within a line (matrices without their diagonals), between lines, near, and in time."""
+    pairs = [m[np.triu_indices(len(m), k)] for k, own in ((1, within), (0, between)) for m in own]
+    return np.concatenate([*pairs, near.sum(axis=1), apart])
