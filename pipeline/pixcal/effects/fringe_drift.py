@@ -6,13 +6,12 @@ from typing import Self
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.fringe_motion import vector_courses
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.recording import Recording
-from pixcal.simulation.track import Track, at
+from pixcal.simulation.track import Track, moved, vector_tracks
 
 HOUR_S = 3600.0
 TRACKS = ("along_x", "along_y")
@@ -76,15 +75,9 @@ class FringeDrift(Effect):
         steps = recording.rng(self.name).standard_normal((recording.count, 2))
         walk = np.cumsum(steps, axis=0) * np.sqrt(recording.period_s / HOUR_S)
         change = self.vector_change(time) + walk * self.walk
-        tracks = self.along_x, self.along_y
-        change += np.stack([at(own, recording.set_name, time) for own in tracks], axis=1)
-        return replace(states, dkx=states.dkx + change[:, 0], dky=states.dky + change[:, 1])
+        return moved(states, recording, change, self.along_x, self.along_y)
 
     def replayed(self, evidence: Evidence) -> Self | None:
         """As in `Effect.replayed`: the slow part of each frame's own fringe vector."""
-        courses = vector_courses(evidence)
-        x, y = (
-            tuple(Track.of(name, time, vector[:, axis]) for name, time, vector, _ in courses)
-            for axis in (0, 1)
-        )
+        x, y = vector_tracks(evidence, slow=True)
         return replace(self.scaled(0.0), along_x=x, along_y=y)

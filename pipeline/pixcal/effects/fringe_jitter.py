@@ -6,13 +6,12 @@ from typing import Self
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.fringe_motion import vector_courses
 from pixcal.kernels.processes import swing
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.recording import Recording
-from pixcal.simulation.track import Track, at
+from pixcal.simulation.track import Track, moved, vector_tracks
 
 
 @dataclass(frozen=True)
@@ -60,15 +59,9 @@ class FringeJitter(Effect):
         phase = 2 * np.pi * recording.rng(self.name, 1).random()
         swung = swing(time, self.vibration_hz, phase, recording.exptime_s)
         change = drawn * np.array(self.rms) + np.outer(swung, self.vibration)
-        tracks = self.along_x, self.along_y
-        change += np.stack([at(own, recording.set_name, time) for own in tracks], axis=1)
-        return replace(states, dkx=states.dkx + change[:, 0], dky=states.dky + change[:, 1])
+        return moved(states, recording, change, self.along_x, self.along_y)
 
     def replayed(self, evidence: Evidence) -> Self | None:
         """As in `Effect.replayed`: each frame's own fringe vector, but for its slow changes."""
-        courses = vector_courses(evidence)
-        x, y = (
-            tuple(Track.of(name, time, vector[:, axis]) for name, time, _, vector in courses)
-            for axis in (0, 1)
-        )
+        x, y = vector_tracks(evidence, slow=False)
         return replace(self.scaled(0.0), along_x=x, along_y=y)

@@ -6,8 +6,12 @@ from typing import Self
 
 import numpy as np
 
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.fringe_motion import vector_courses
+from pixcal.kernels.scene import FrameStates
 from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
+from pixcal.simulation.recording import Recording
 
 
 @dataclass(frozen=True)
@@ -38,3 +42,19 @@ def at(tracks: Iterable[Track], name: str, time_s: F64 | float) -> F64:
         if track.set == name and track.time_s:
             found = found + np.interp(time_s, track.time_s, track.value)
     return found
+
+
+def vector_tracks(evidence: Evidence, *, slow: bool) -> list[tuple[Track, ...]]:
+    """Slow or fast change of the fringe vectors along x and along y, rad/px, as measured."""
+    courses = vector_courses(evidence)
+    changes = [(name, time, slowly if slow else fast) for name, time, slowly, fast in courses]
+    return [tuple(Track.of(name, time, c[:, axis]) for name, time, c in changes) for axis in (0, 1)]
+
+
+def moved(
+    states: FrameStates, recording: Recording, change: F64, *along: Iterable[Track]
+) -> FrameStates:
+    """States whose fringe vectors change by (t, 2), and by tracks along x and along y, rad/px."""
+    tracks = [at(own, recording.set_name, recording.times_s) for own in along]
+    dkx, dky = (change + np.stack(tracks, axis=1)).T
+    return replace(states, dkx=states.dkx + dkx, dky=states.dky + dky)
