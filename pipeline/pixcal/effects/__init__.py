@@ -1,7 +1,8 @@
 """The effects of a bench and its detector, one file each; found by `effects`.
 
 A new one is a file here with one subclass of `pixcal.simulation.effect.Effect`, and its test. One
-that is not part of pixcal is such a file anywhere: `effect_of_file`.
+that is not part of pixcal is such a file anywhere: `effect_of_file`. What each effect is, how it is
+measured and corrected, is told on its page in docs/reference/effects/.
 """
 
 import dataclasses

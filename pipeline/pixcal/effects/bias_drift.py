@@ -49,13 +49,9 @@ _KEY, _RUN = 1000, 2000  # first keys of the walks' random numbers: no recording
 class BiasDrift(Effect):
     """A bias common to all pixels of a frame, which varies; time starts at the first frame.
 
-    Slow changes are those of the temperature: a ramp, a settling after power-on, a random walk that
-    goes on through all frames. A ramp or walk may also begin anew with each run of fringes, when
-    the readout settles to its pace. ``tracks`` are offsets of fringe runs as measured, in place of
-    the laws.
-    The fit takes up by B, the intensity of a frame, as much of an offset as looks like light; the
-    rest is pattern, where the light is uneven or samples were divided by a flat. Maps alone do not
-    tell: the fit's mean intensity hides a constant offset, and nothing else is constant in time.
+    A ramp, a settling after power-on, a random walk that goes on through all frames, and a ramp or
+    walk that begins anew with each run of fringes. ``tracks`` are offsets of fringe runs as
+    measured, in place of the laws. The fit takes up by B as much of an offset as looks like light.
     """
 
     name = "bias_drift"
@@ -142,10 +138,7 @@ class BiasDrift(Effect):
         return offset
 
     def replayed(self, evidence: Evidence) -> Self | None:
-        """As in `Effect.replayed`: slow offsets of fringes, all offsets of bias and dark frames.
-
-        The jitter is that of the fringes: of few bias frames a walk may pass for some.
-        """
+        """As in `Effect.replayed`: slow offsets and jitter of fringes; all offsets of dark frames."""
         light = light_of(evidence)
         lit, jitter = ([], self.jitter_rms) if light is None else fringe_courses(light)
         tracks = [_with_level(Track.of(name, time, e), evidence) for name, time, e in lit]
@@ -165,11 +158,7 @@ class BiasDrift(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Levels of frames without light against time; of fringes what is not light.
-
-        What moves B and leaves A alone in fringes is an offset too; where frames without light do
-        not have as much of it, it is one of the runs of fringes.
-        """
+        """Levels of frames without light against time; of fringes, what moves B and not A."""
         through, in_runs = cls._through(evidence), cls._in_runs(evidence)
         found = [e for e in (through, in_runs) if e is not None]
         return max(found, key=lambda e: e.significance, default=None)
@@ -218,9 +207,8 @@ class BiasDrift(Effect):
     def _through(cls, evidence: Evidence) -> Estimate | None:
         """What drifts through all frames, by one clock.
 
-        A change of the dark current would look the same in one stack of darks; where there are bias
-        frames, they hold it down. Of few frames a walk may look like a ramp: what both explain is
-        given to the walk, for a ramp would go on for ever.
+        Bias frames hold down a change of the dark current. What a walk and a ramp explain alike in
+        few frames is given to the walk, for a ramp would go on for ever.
         """
         every = _all_series(evidence)
         if not every:

@@ -33,8 +33,7 @@ _TURNS = 4  # of the inverse: each gains the size of the effect, a few per cent
 class BrighterFatter(Effect):
     """Pixel boundaries shift with the charge around them (`pixcal.kernels.boundaries`).
 
-    It is not linear in the intensity, so maps alone tell neither what it does nor what would be
-    without it; `restored` undoes it on frames.
+    It is not linear in the intensity, so maps alone do not tell it; `restored` undoes it on frames.
     """
 
     name = "brighter_fatter"
@@ -99,12 +98,9 @@ class BrighterFatter(Effect):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Shared noise of neighbours, and what sets of other fringe spacing have otherwise.
 
-        The noise alone tells it from a nonlinear response: a response couples no pixels. From
-        crosstalk between pixels it differs because it rises with the square of the level. In the
-        fringes it makes a second harmonic that depends on their spacing and direction, which a
-        response cannot; that is far more precise, and is used as long as it does not contradict the
-        noise. Where it explains all harmonics with some falloff, and as much along y as along x or
-        another part of it, no response is taken to be beside it.
+        The noise alone tells it from a response; the second harmonic of the fringes, which depends
+        on their spacing and direction, is far more precise, and is used unless it contradicts the
+        noise. Where it explains all harmonics, no response is taken to be beside it.
         """
         evidence = central_crop(evidence)
         explaining = _explaining(evidence, cls().falloff_px) if evidence.fringes else None

@@ -19,13 +19,9 @@ from pixcal.simulation.track import Track, at
 class ContrastNoise(Effect):
     """The fringe amplitude A varies from frame to frame; the intensity B does not.
 
-    Within an exposure, a vibration of rms phase s smears the fringes by exp(-s²/2). That of a
-    resonance comes and goes: its energy in a frame is exponentially distributed, so the factor is
-    ``exp(-e vibration_rad² / 2)``, e exponential of mean 1, white, and never above 1. The
-    polarisations of the two fibres turn against each other slowly: a factor ``1 + polarisation u``,
-    u a damped random walk over ``polarisation_s``. Two fibres cannot interfere by more than all of
-    their light. Nothing of it but the mean loss is constant in time, and that is a visibility; so
-    maps alone do not tell of it, and the fit leaves every frame its own amplitude.
+    A resonance smears the fringes of a frame by ``exp(-e vibration_rad² / 2)``, e exponential of
+    mean 1, white. Polarisations turn slowly: a factor ``1 + polarisation u``, u a damped random
+    walk over ``polarisation_s``. Two fibres cannot interfere by more than all of their light.
     """
 
     name = "contrast_noise"

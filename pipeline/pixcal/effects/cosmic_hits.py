@@ -56,11 +56,9 @@ _FEWEST = 1e-6
 class CosmicHits(Effect):
     """Straight tracks of particles through the sensitive layer, in proportion to the exposure time.
 
-    While a frame waits to be read out it is hit as well: bias frames of a large, slow detector are.
-
-    A track leaves charge in proportion to its length, with the fluctuations of thin layers, and the
-    charge spreads before it is collected. Nothing of it is constant in time, so maps of the fit
-    neither show it nor can be mended; the samples that are hit have to be left out.
+    A frame that waits to be read out is hit as well. A track leaves charge in proportion to its
+    length, with the fluctuations of thin layers, and the charge spreads before it is collected.
+    Samples that are hit have to be left out: maps cannot be mended.
     """
 
     name = "cosmic_hits"
@@ -135,9 +133,8 @@ class CosmicHits(Effect):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Outliers upwards in single frames, less those downwards, beside all light.
 
-        A pixel that does it again is not hit but noisy, and does not count. Tracks are drawn to
-        know how many stay below the noise. Frames of several exposure times, bias frames among
-        them, tell hits while they are read out.
+        A pixel that does it again is noisy and does not count. Drawn tracks tell how many stay
+        below the noise; frames of several exposure times tell hits while they are read out.
         """
         searches = list(_searches(evidence))
         if not searches:

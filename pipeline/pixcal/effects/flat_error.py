@@ -48,10 +48,9 @@ _PARABOLA = 2
 class FlatError(Effect):
     """The response in the fringe frames differs from that in the flats.
 
-    Flats by a lamp of another colour, another angle or another polarisation. Mean and fringe of a
-    pixel change by the same factor: iota and alpha show it, divided by the flat, in the same pixels
-    in all sets; the offsets do not move. The pattern belongs to the chip, so maps alone do not hold
-    what `predict` would need.
+    Mean and fringe of a pixel change by the same factor, in the same pixels in all sets; the
+    offsets do not move. The pattern belongs to the chip, so maps do not hold what `predict` would
+    need.
     """
 
     name = "flat_error"
@@ -105,10 +104,9 @@ class FlatError(Effect):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """What iota and alpha share, divided by flats, beyond their light's shape.
 
-        iota is of some frames of the fringes over some of the flats, alpha of the others over the
-        others, and of another set where there is one: their product holds no noise. A ghost that
-        stands still is in iota alone; one that follows the modulator, and crosstalk, are in alpha
-        alone. What neighbours share is smooth; it is counted from a parabola, which beams make too.
+        iota is of some frames over some flats, alpha of the others over the others, and of another
+        set where there is one: their product holds no noise. What neighbours share is smooth,
+        counted from a parabola, which beams make too.
         """
         flats = _two_flats(evidence)
         sets = [f for f in evidence.fringes.values() if len(f.g) >= _MIN_FRAMES]
@@ -184,8 +182,8 @@ def _shared_power(pairs: list[tuple[F64, F64]], pixels: int) -> F64:
 def _smooth(neighbours: F64, ring: "Ring") -> tuple[float, float, float]:
     """Variance of the smooth part, its error by noise, and that as one draw of many.
 
-    What neighbours share is all of it, whatever its shape. Waves of one length are better known,
-    and taken where they account for what neighbours share.
+    What neighbours share; where waves of one length account for that, these, which are better
+    known.
     """
     variance, noise = float(neighbours.mean()), float(neighbours.std() / np.sqrt(neighbours.size))
     if abs(ring.variance - variance) < AGREE * np.hypot(noise, ring.noise):

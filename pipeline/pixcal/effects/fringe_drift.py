@@ -21,11 +21,9 @@ TRACKS = ("along_x", "along_y")
 class FringeDrift(Effect):
     """Slow drift of the fringe vector: a ramp, a decay, a random walk.
 
-    The time of each fringe set runs from its first frame: fibres are moved between sets, and the
-    mean vector of a set is fitted anyway. A slow change of the phase has no parameter: every frame
-    has a free phase, which takes it up. Nothing here is constant in time, so maps alone do not
-    tell of it; the fit leaves the vector free in each frame where it moves, and `vector_change`
-    gives it where a fit holds it.
+    The time of each fringe set runs from its first frame: fibres are moved between sets. A slow
+    change of the phase has no parameter, since every frame has a free phase; the fit leaves the
+    vector free in each frame where it moves, and `vector_change` gives it where a fit holds it.
     """
 
     name = "fringe_drift"

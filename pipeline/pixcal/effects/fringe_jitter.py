@@ -20,9 +20,8 @@ class FringeJitter(Effect):
 
     Two fibre tips that move against each other by d change the vector by ``2 pi pitch d /
     (wavelength distance)``, whatever the baseline and the window: 1.1e-4 rad/px a micrometre on the
-    paper's bench. The phase at the window's centre stays; the modulator makes it random anyway.
-    Nothing of it is constant in time, so maps alone do not tell of it, and there is nothing to undo
-    on them: the fit leaves the vector free in each frame where it moves.
+    paper's bench. The phase at the window's centre stays; the fit leaves the vector free where it
+    moves.
     """
 
     name = "fringe_jitter"

@@ -80,13 +80,11 @@ class GhostWave:
 class GhostFringes(Effect):
     """A weak reflection of one fibre interferes with the two direct beams.
 
-    Of amplitude ``share`` and at the angle of ``beat_rad_px`` to its parent's beam, it interferes
-    with both fibres. With its parent it makes a pattern that stands still: the mean light gains
-    ``2 share I cos(beat·r + phase_rad)``, I the parent's intensity. With the other fibre it makes
-    fringes that follow the modulator: the fringe's phasor is multiplied by
-    ``1 + share exp(±i (beat·r + phase_rad))``, plus for the modulated fibre, minus for the fixed
-    one. A ghost whose polarisation is crossed with the other fibre's makes the static pattern
-    alone. ``waves`` are ghosts as measured, set by set, with amplitudes that nothing ties.
+    With its parent it makes a pattern that stands still: the mean light gains ``2 share I
+    cos(beat·r + phase_rad)``, I the parent's intensity. With the other fibre it makes fringes that
+    follow the modulator: the phasor is multiplied by ``1 + share exp(±i (beat·r + phase_rad))``,
+    plus for the modulated fibre, minus for the fixed one; not where the polarisations are crossed.
+    ``waves`` are ghosts as measured, set by set, with amplitudes that nothing ties.
     """
 
     name = "ghost_fringes"
@@ -177,11 +175,7 @@ class GhostFringes(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Waves that mean light and fringes share, set by set (`find_waves`).
-
-        Amplitudes depart from the law where they do so by more than chance.
-        What true offsets, crosstalk or a flat do is in one of the maps alone, and is not claimed.
-        """
+        """Waves that mean light and fringes share, set by set (`find_waves`)."""
         found = find_waves(evidence)
         if found is None:
             return None
@@ -249,8 +243,7 @@ class TiedWaves:
     def shrunk(self, measured: Sequence[WaveFit], alike: int) -> list[WaveFit]:
         """The measured waves, nearer to the law by the share that chance has in their misfit.
 
-        They follow the law unless they depart from it significantly; then by Stein's estimator
-        (James & Stein 1961): all departures are taken for normal numbers of one size, in errors.
+        By Stein's estimator (James & Stein 1961), where they depart from the law significantly.
         ``alike``: sets along one axis, to whose waves the true offsets do the same.
         """
         chi2, freedom = self.misfit / alike, self.freedom // alike

@@ -34,13 +34,9 @@ class HyperbolicFringes(Effect):
     """Difference between the exact phase of two fibre tips and its paraxial limit.
 
     To leading order the curvature is ``-K·q q² / (2 D²)``, q from the foot of the fibres' centre:
-    in proportion to the fringe vector, so in pixels it does not depend on the baseline, and sets
-    of other fringe period do not tell it from true offsets. Its shape does: the foot and the
-    difference in height of the tips rule the curvature of a set. The arms of a mount do not move
-    together: ``pairs`` has the position of each set's fibres, where it is not that of all.
-
-    The maps of a fit do not say where on the chip they lie, so `predict` cannot tell; ``fit --model
-    hyperbolic`` takes it up.
+    in pixels it does not depend on the baseline, but its shape tells the foot and the difference in
+    height of the tips. ``pairs`` has the position of each set's fibres, where it is not that of
+    all. ``fit --model hyperbolic`` takes it up.
     """
 
     name = "hyperbolic_fringes"
@@ -113,11 +109,7 @@ class HyperbolicFringes(Effect):
 
     @classmethod
     def starts(cls, evidence: Evidence) -> list[LightStart]:
-        """One foot for all sets, or a position of each set's fibres, at the nominal distance.
-
-        The share, and the distance, would need the third order, which a small window does not show;
-        the foot is counted from the middle of the window that was read.
-        """
+        """One foot for all sets, or a position of each set's fibres, at the nominal distance."""
         pairs = tuple(FibrePair(name, (0.0, 0.0)) for name in evidence.fringes)
         common = cls((0.0, 0.0), evidence.distance_mm)
         own = cls(None, evidence.distance_mm, pairs=pairs)

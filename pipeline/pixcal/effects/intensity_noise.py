@@ -23,10 +23,9 @@ MAX_AMBIENT = 0.3
 class IntensityNoise(Effect):
     """Intensity B and amplitude A of each frame vary by the same factor.
 
-    White from frame to frame, or correlated over ``correlation_s`` (a first-order autoregression,
-    which is what a damped random walk is at equal steps), and a line of one frequency. Where each
-    fibre's power changes by itself, the contrast changes a little too. Nothing of it is constant in
-    time, so maps alone do not tell of it; the fit leaves every frame its own intensity.
+    White from frame to frame, or correlated over ``correlation_s`` (a damped random walk), and a
+    line of one frequency. Where each fibre's power changes by itself, the contrast changes a little
+    too. The fit leaves every frame its own intensity.
     """
 
     name = "intensity_noise"
@@ -110,11 +109,7 @@ class IntensityNoise(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """As of `Effect`, with what moves the contrast along.
-
-        Ambient light makes it follow the laser; fibres whose powers change separately move it by a
-        little of what they move the intensity.
-        """
+        """As of `Effect`, with what ambient light or separate powers do to the contrast."""
         found = super().estimate(evidence)
         if found is None:
             return None

@@ -31,10 +31,8 @@ _TURNS = 60
 class IntraPixelResponse(Effect):
     """Each pixel responds uniformly over a width along x and y, which differs from pixel to pixel.
 
-    The fringe's amplitude is multiplied by ``sin(u) / u`` with ``u = K width / 2`` along each axis:
-    the visibility falls, the more the closer the fringes; the mean light stays, and so do the
-    offsets, since the box is symmetric about the pixel's centre. `predict` and `undo` take
-    the mean width; that of each pixel belongs to the chip, which maps alone do not tell.
+    The fringe's amplitude is multiplied by ``sin(u) / u`` with ``u = K width / 2`` along each axis;
+    mean light and offsets stay. `predict` and `undo` take the mean width.
     """
 
     name = "intra_pixel_response"
@@ -86,12 +84,10 @@ class IntraPixelResponse(Effect):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Width, the same along both axes, from the visibility of sets of other fringe spacing.
 
-        The laser's own visibility is taken to be the same in all sets, to `REPEAT`. Crosstalk to
-        all neighbours alike lowers the visibility in nearly the same way and is not told apart
-        here: the noise of neighbours does that. The scatter of the width is what two halves of the
-        frames share in the visibility of single pixels, beyond what neighbours, rows and columns
-        share, as far as it grows with the fourth power of the fringe vector: lag, which scatters
-        too, does not. It is refused where fringes of crossed directions share most of the scatter.
+        The laser's visibility is taken to be the same in all sets, to `REPEAT`. The scatter of the
+        width is what two halves of the frames share in the visibility of single pixels, beyond what
+        neighbours, rows and columns share, as it grows with the fourth power of the fringe vector.
+        It is refused where fringes of crossed directions share most of it.
         """
         sets = [f for f in evidence.fringes.values() if np.count_nonzero(f.good) > _MIN_PIXELS]
         spacing = [np.hypot(*f.k) for f in sets]

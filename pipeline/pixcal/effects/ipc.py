@@ -154,9 +154,8 @@ class Ipc(Effect):
     def predict(self, maps: FringeMaps) -> FringeMaps:
         """Maps with the couplings on: ``L (flat theta) / L flat`` (physics note, section 5).
 
-        Shares that change with the signal are taken at intensity and amplitude 1, of the flat at
-        small signals. Pixels without data (NaN) stay so; to their neighbours they are like those
-        around them.
+        Shares that change with the signal are those at intensity and amplitude 1, of the flat at
+        small signals. Pixels without data (NaN) stay so; to others they are like those around them.
         """
         return _on_charge(
             maps,
@@ -179,8 +178,8 @@ class Ipc(Effect):
     def measured_again(self, parts: Iterable[Evidence]) -> Estimate | None:
         """All couplings within two pixels, and those found beyond, of the period that was found.
 
-        Shares that the frames do not show are shrunk by their errors, not dropped: of many small
-        ones the sum matters. The details hold their covariance.
+        Shares that the frames do not show are shrunk by their errors; the details hold the
+        covariance.
         """
         if not self.couplings or any(c.per_ke for c in self.couplings):
             return None
@@ -214,11 +213,7 @@ class Ipc(Effect):
         return reach * math.ceil(math.log(1e-8) / math.log(most)) if 0 < most < 1 else 0
 
     def noise_factor(self, charge: float, read_noise: float, maps: FringeMaps) -> F64:
-        """Error (y, x) of a pixel after `undo` over that before.
-
-        Coupled pixels share their shot noise and so show less of it; undoing gives it back, and
-        makes the read noise, which came after the couplings, a little larger.
-        """
+        """As in `Effect.noise_factor`: shot noise is coupled, read noise came after."""
         shape = (maps.theta.shape[1], maps.theta.shape[2])
         shot, read = noise_shares(self._at_small_signals, shape, maps.origin)
         before, after = charge * shot + read_noise**2, charge + read_noise**2 * read

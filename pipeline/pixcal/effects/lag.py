@@ -34,15 +34,10 @@ _TURNS = 3  # of the inverse: each gains a factor of the share
 class Lag(Effect):
     """Part of the charge of a frame appears in later frames.
 
-    It comes out with the next frame, or over several. No charge is lost. Before the first frame of
-    a recording the pixels were empty, or held what the last frame of the recording before left
-    (`carried`). A barrier may hold back another share of each
-    band of the level; traps take charge as long as they have room (`capacity_e`), so that what they
-    hold of earlier frames limits what they take.
-
-    A fit of the fringes takes up what all pixels have in common: the frame before is a sum of the
-    same maps, so every frame only gets another amplitude and phase. So maps show nothing of it;
-    `restored` undoes it on frames.
+    Before the first frame of a recording the pixels were empty, or held what the last frame of the
+    recording before left (`carried`). A barrier may hold back another share of each band of the
+    level; traps take charge as long as they have room (`capacity_e`). Maps show nothing of it: the
+    frame before is a sum of the same maps. `restored` undoes it on frames.
     """
 
     name = "lag"
@@ -221,11 +216,9 @@ class Lag(Effect):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Contrast of a frame by the step of the phase since the one before; pixels that differ.
 
-        What stays of a fringe of another phase lowers the contrast of the frame by
-        ``share (1 - cos step)``: random phases show it even where the contrast is noisy. Phases
-        that rise by equal steps show nothing. Pixels with another share than the rest leave the
-        frame before in their residuals; the frame after is the control. Without fringes the first
-        frame of each flat tells, which lacks what the dark before it could not give.
+        What stays lowers the contrast by ``share (1 - cos step)``. Pixels with another share than
+        the rest leave the frame before in their residuals; the frame after is the control. Without
+        fringes the first frame of each flat tells.
         """
         if not evidence.fringes:
             found = lag_of_flats(evidence)

@@ -53,9 +53,7 @@ class Nonlinearity(Effect):
     """Signal ``S (1 + quadratic u + cubic u²)`` of a charge S, with ``u = S / level_e``.
 
     ``bends`` are points of a measured response beside the polynomial, joined by a natural spline.
-    It is not linear in the intensity, so maps alone tell neither what it does nor what would be
-    without it (the offsets hardly change; harmonics of the phase are left in the residuals);
-    `linearised` undoes it on samples.
+    Offsets hardly change, and maps do not tell it; `linearised` undoes it on samples.
     """
 
     name = "nonlinearity"
@@ -124,10 +122,7 @@ class Nonlinearity(Effect):
         return signal
 
     def linearised(self, signal: F32) -> F32:
-        """Charge that gives a signal, e-: the inverse of `response`, from a table.
-
-        Signals beyond the top of the response give the charge at the top; NaN stays NaN.
-        """
+        """Charge (e-) that gives a signal: the inverse of `response` up to its top; NaN stays."""
         wanted = np.asarray(signal, float)
         brightest = float(np.nanmax(wanted, initial=self.level_e, where=np.isfinite(wanted)))
         top = min(self.turns_at * self.level_e, 2 * brightest)
@@ -145,10 +140,8 @@ class Nonlinearity(Effect):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Second and third harmonic of the phase in the residuals; without fringes, flats.
 
-        The levels of flats need exposure times and a lamp that can be trusted to that degree, so
-        they count only where there is nothing better. Moving boundaries (brighter-fatter) make a
-        second harmonic too: they are fitted beside, and the noise that they make neighbours share
-        says how much of them there is, where all fringes have the same spacing.
+        Moving boundaries (brighter-fatter) make a second harmonic too: they are fitted beside, as
+        the noise that neighbours share says where all fringes have the same spacing.
         """
         found = _polynomial(evidence)
         if found is None:

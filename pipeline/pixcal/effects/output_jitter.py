@@ -38,8 +38,7 @@ _LEAST = 1e-9  # noise of a level, e-²: frames may be alike
 class OutputJitter(Effect):
     """Each of several outputs, which read rectangles of pixels, has a level that varies by itself.
 
-    White noise from frame to frame and a random walk, independent in each output. What all outputs
-    have in common beyond that is `bias_drift`; a constant difference belongs to the bias.
+    White noise and a random walk, independent in each; what all have in common is `bias_drift`.
     """
 
     name = "output_jitter"

@@ -34,12 +34,10 @@ _MODEL = 0.01
 class RollingShutter(Effect):
     """Each row is exposed later than the one before.
 
-    The modulator goes to the next phase ``delay_us`` after the first row's exposure ends: rows that
-    are still exposed hold a share of the next frame's light, which grows with the row. A delay of
-    nearly a frame is a step that comes late: then the first rows hold a share of the last frame's.
-    A modulator that settles while rows are read turns the phase of each row by a share of its step
-    instead (``settling``). Both depend on the order of the phases: most is left in the residuals,
-    and some in the maps, which `undo` takes off with the phases as fitted.
+    The modulator steps ``delay_us`` after the first row's exposure ends: rows still exposed hold a
+    share of the next frame's light; after nearly a frame, the first rows one of the last frame's. A
+    modulator that settles while rows are read turns their phase by a share of its step
+    (``settling``). `undo` takes off maps what these leave in them, with the phases as fitted.
     """
 
     name = "rolling_shutter"
@@ -169,8 +167,8 @@ class RollingShutter(Effect):
     def _changes(self, frames: FittedFrames) -> Iterator[tuple[F64, F64]]:
         """Shares of the window's rows (y,), and by how much each frame (t, 3) is off at one.
 
-        Without what the frames' own parameters take up: a share that all rows have and, of the
-        phase, one that rises evenly where each frame has a fringe vector of its own.
+        Less what the frames' parameters take up: what all rows have and, where vectors are free,
+        slopes.
         """
         g, rows = frames.g, np.arange(frames.rows[1], dtype=float)
         turned = np.stack([np.zeros(len(g)), -g[:, 2], g[:, 1]], axis=1)
@@ -200,9 +198,8 @@ class RollingShutter(Effect):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Share of the next frame's model in the residuals, growing with the row.
 
-        A share that is the same in all rows goes into the frame's own phase and amplitude, so it is
-        free; lag, which is of the last frame and of no row, does not look alike. Phases in equal
-        steps tell nothing: there the next frame is what the fit takes for the pixel's own phase.
+        A share that all rows have goes into the frame's own phase and amplitude, so it is free; lag
+        does not look alike. Phases in equal steps tell nothing.
         """
         many = [RowSums.of(f) for f in evidence.fringes.values() if enough_frames(f)]
         if not many:

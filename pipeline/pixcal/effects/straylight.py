@@ -60,11 +60,9 @@ class StrayPattern:
 class Straylight(Effect):
     """Incoherent light in the fringe frames, relative to the light of the fibres.
 
-    It follows the laser's power. The mean light becomes ``1 + share + slope·r`` times what it was,
-    and more where a bump or a measured pattern says so; the fringe stays: the visibility falls, the
-    offsets keep still. Flats, of another lamp, do not have it. Where the pattern would be negative
-    there is none. An even share, and one that varies as two unequal Gaussian beams make the
-    visibility vary over a window, cannot be told from those beams.
+    The mean light becomes ``1 + share + slope·r`` times what it was, and more where a bump or a
+    measured pattern says so, never less; the fringe stays. An even share, and one that varies as
+    two unequal Gaussian beams do, cannot be told from those beams.
     """
 
     name = "straylight"

@@ -56,9 +56,8 @@ class TelegraphNoise(Effect):
     """Some pixels jump between two levels, as a trap fills and empties.
 
     Both states are equally likely unless ``upper`` says otherwise; the mean level does not change.
-    Amplitudes have a gamma distribution, by default an exponential one, but for pixels that were
-    measured by themselves. Nothing of it is constant in time, so maps of the fit neither show it
-    nor can be mended; the pixels are those that `reduce` flags as noisy.
+    Amplitudes have a gamma distribution, by default an exponential one, but for pixels measured by
+    themselves. The pixels are those that `reduce` flags as noisy.
     """
 
     name = "telegraph_noise"
@@ -123,13 +122,10 @@ class TelegraphNoise(Effect):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Pixels noisier than the rest whose noise is telegraph noise by its shape.
 
-        How many and how strong from the distribution of the pixels' variances; that they jump,
-        rather than being noisier, from three signs that Gaussian noise of any size has not: a flat
-        top (negative kurtosis), outliers to one side that come back, and neighbouring frames that
-        resemble each other. Each is summed
-        over the noisy pixels, so nothing is to be corrected for having looked at many of them.
-        Bias and dark frames; without enough of them the residuals of fringes. How long pixels stay,
-        by the fringes where there are any.
+        How many and how strong from the pixels' variances; that they jump, from a flat top,
+        outliers that come back, and neighbouring frames that resemble each other, each summed over
+        the noisy pixels. By bias and dark frames, else residuals of fringes, which also tell how
+        long pixels stay.
         """
         series = tuple(_series(evidence))
         if not series:

@@ -27,11 +27,9 @@ CALM = 2.0  # errors of a walk up to which the levels hold still
 class WavelengthDrift(Effect):
     """The wavelength changes by a ramp, a random walk, or hops to another laser mode and back.
 
-    A change by epsilon takes ``epsilon K / (1 + epsilon)`` off the fringe vector of every set, K
-    being its own: along the fringe axis, the more the closer the fringes. That of the refractive
-    index of air, or of the distance to the detector, does the same. The time of each set runs from
-    its first frame. Nothing here is constant in time, so maps alone do not tell of it; the fit
-    leaves the vector free in each frame where it moves.
+    A change by epsilon takes ``epsilon K / (1 + epsilon)`` off the fringe vector K of every set;
+    the refractive index of air, or the distance to the detector, does the same. The time of each
+    set runs from its first frame; the fit leaves the vector free where it moves.
     """
 
     name = "wavelength_drift"
@@ -118,9 +116,8 @@ def _hops(
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Size and rate of the hops; up and down count alike.
 
-    Those that stand out are the start; short stays between them are told by the likelihood, unless
-    the colour does more than hop between two levels. Beside a walk only the rate is taken from it:
-    levels that wander make its size worse than that of the hops one by one.
+    Those that stand out are the start; short stays are told by the likelihood, of the rate alone
+    beside a walk, unless the colour does more than hop between two levels.
     """
     size, error = np.array([abs(h.size) for h in jumps]), np.array([h.error for h in jumps])
     weight = 1 / error**2
