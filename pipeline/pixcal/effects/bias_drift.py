@@ -138,7 +138,7 @@ class BiasDrift(Effect):
         return offset
 
     def replayed(self, evidence: Evidence) -> Self | None:
-        """As in `Effect.replayed`: slow offsets and jitter of fringes; all offsets of dark frames."""
+        """As in `Effect.replayed`: slow offsets and jitter of fringes; all of dark frames."""
         light = light_of(evidence)
         lit, jitter = ([], self.jitter_rms) if light is None else fringe_courses(light)
         tracks = [_with_level(Track.of(name, time, e), evidence) for name, time, e in lit]
