@@ -164,7 +164,8 @@ def _add(
     """Add a tile's samples to ``sums``, whose [0, 0] is window ``first``.
 
     ``layout``: direction cosines (x, y), first edge and size of windows across and along, px.
-    ``polynomials`` of phase and light: ``c[i, j] Y^i X^j`` of pixels about ``frame``.
+    ``polynomials`` of phase and light: ``c[i, j] Y^i X^j``, (X, Y) being (x, y) less ``frame[:2]``,
+    over ``frame[2]``.
     """
     ux, uy, edge_u, edge_v, width, length = layout
     carrier, light = polynomials
