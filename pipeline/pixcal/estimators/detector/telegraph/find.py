@@ -58,20 +58,12 @@ class OwnLevels:
 
 
 @dataclass(frozen=True)
-class Telegraph:
-    """What was found."""
+class Telegraph(Population):
+    """What was found: the population, how its pixels jump, and single ones."""
 
-    # share, amplitude, shape, switching_s: of the pixels; mean, e-; of the amplitudes' gamma
-    # distribution; mean stay in a level, s (0: no longer than a frame)
-    share: float
-    amplitude: float
-    shape: float
-    switching_s: float
+    switching_s: float  # mean stay in a level, s; 0: no longer than a frame
     switching_decades: float  # range of the pixels' times, even in the logarithm
     upper: float  # share of the time in the upper level
-    share_error: float
-    amplitude_error: float
-    shape_error: float
     switching_error: float
     signs: Signs  # that noisy pixels jump
     # own, faintest: levels of single pixels, where the fringes tell; of jumps of so many electrons
@@ -112,10 +104,10 @@ def find_telegraph(
         found = _Found(find_population(parts, known[0]), *known, 0.0)
     else:
         found = _likeliest(parts, upper)
-    p = found.population
+    stays = found.stays
     return Telegraph(
-        p.share, p.amplitude, p.shape, found.stays.mean_s, found.stays.decades, found.stays.upper,
-        p.share_error, p.amplitude_error, p.shape_error, found.error, told, single, faintest,
+        **vars(found.population), switching_s=stays.mean_s, switching_decades=stays.decades,
+        upper=stays.upper, switching_error=found.error, signs=told, own=single, faintest=faintest,
     )  # fmt: skip
 
 
