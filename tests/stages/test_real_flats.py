@@ -215,6 +215,20 @@ def test_levels_that_some_pixels_fill_are_left_out(tmp_path: Path) -> None:
     assert report["saturation_adu"]["full_frames"] == list(range(4 * 10, 4 * 12))
 
 
+def test_dim_levels_are_not_full_where_the_wells_are(tmp_path: Path) -> None:
+    """At the dimmest level the read noise is as large as the signal, and outweighs the photons'."""
+    well, lamps = 10_000.0, np.linspace(0.01, 1.08, 23)
+    camera = Detector(
+        gain=50.0, noise=103.0, bias=40.4, top=255, dark=0.0, rate=well, shape=(160, 160),
+        flats=ladder([(1.0, lamp) for lamp in lamps]), response=lambda e: np.minimum(e, well),
+    )  # fmt: skip
+    _, report = reduced(camera, 3, tmp_path)
+    bright = np.flatnonzero(np.repeat(lamps, 2) > 0.93).tolist()
+    assert set(report["saturation_adu"]["full_frames"]) <= set(bright)
+    gain = report["gain_e_per_adu"]
+    assert gain["measured"] == pytest.approx(50.0, abs=3 * gain["error"])
+
+
 def test_levels_of_a_steady_lamp_a_little_apart_are_levels() -> None:
     pairs = np.repeat(np.linspace(0.02, 1, 50), 2) * 3000
     pairs *= 1 + 2e-4 * np.random.default_rng(3).standard_normal(len(pairs))

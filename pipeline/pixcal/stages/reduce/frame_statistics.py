@@ -227,8 +227,9 @@ def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined)
     if usual < (_COARSE * job.quantum) ** 2:
         usual = float(np.nanmean(found.variance[seen]))
     usual = max(level, 0) / job.gain + job.read_noise**2 if np.isnan(usual) else usual
-    brighter = np.fmax(signal / level, 1) if level > 0 else 1.0
-    variance = np.fmax(found.variance, usual * brighter) / frames
+    # A brighter pixel has more photon noise, and the same read noise.
+    brighter = np.fmax(signal - level, 0)
+    variance = np.fmax(found.variance, usual + brighter / job.gain) / frames
     if line is not None:
         variance = variance + column.noise * line.variance(exptime)
     column.rungs.append(Rung(group.exptime, frames, signal, variance))
