@@ -92,7 +92,8 @@ def ladder(
     for t in (0.1, 0.2, 0.4, 0.8):
         expected = 4e4 * t * response
         variance = np.full(shape, (4e4 * t + 225) / frames)
-        rungs.append(Rung(t, frames, rng.normal(expected, np.sqrt(variance)), variance))
+        signal = rng.normal(expected, np.sqrt(variance))
+        rungs.append(Rung(t, frames, signal, variance, 4e4 * t + 225))
     return rungs, response
 
 
@@ -105,7 +106,7 @@ def test_a_clean_ladder_is_linear() -> None:
 
 def test_a_curve_that_all_pixels_share_flags_none() -> None:
     rungs, _ = ladder(np.random.default_rng(6), (100, 100))
-    bent = [Rung(r.exptime, 4, r.signal - 2e-6 * r.signal**2, r.variance) for r in rungs]
+    bent = [Rung(r.exptime, 4, r.signal - 2e-6 * r.signal**2, r.variance, r.noise) for r in rungs]
     assert not nonlinear(bent, step_levels(bent), 0.03).any()
 
 

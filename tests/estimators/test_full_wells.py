@@ -9,6 +9,7 @@ from pixcal.estimators.detector.calibration import (
     relative_response,
     step_levels,
     unsaturated,
+    usual_variance,
 )
 
 SHAPE = (37, 53)
@@ -26,7 +27,9 @@ def ladder(
         light = rng.poisson(4000.0 * exptime * response, (8, *SHAPE))
         charge = np.minimum(light - bend * light**2 / 4e4, wells)
         adu = (charge + read_e * rng.standard_normal(charge.shape)) / GAIN
-        rungs.append(Rung(float(exptime), 8, adu.mean(axis=0), adu.var(axis=0, ddof=1) / 8))
+        variance = adu.var(axis=0, ddof=1)
+        noise = usual_variance(variance, 7)
+        rungs.append(Rung(float(exptime), 8, adu.mean(axis=0), variance / 8, noise))
     return rungs[::-1], response
 
 
@@ -60,7 +63,7 @@ def test_dim_levels_whose_noise_is_high_by_chance_are_no_slope() -> None:
     noise = (280.0, 290.0, 310.0, 340.0, 390.0)
     levels = (52.0, 340.0, 620.0, 910.0, 1200.0)
     rungs = [
-        Rung(1.0 + n, 2, np.full(SHAPE, level), np.full(SHAPE, variance / 2))
+        Rung(1.0 + n, 2, np.full(SHAPE, level), np.full(SHAPE, variance / 2), variance)
         for n, (level, variance) in enumerate(zip(levels, noise, strict=True))
     ]
     kept, _ = unsaturated(rungs, step_levels(rungs), 235.0)

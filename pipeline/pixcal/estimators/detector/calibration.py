@@ -15,7 +15,9 @@ MIN_RUNGS = 3  # fewest exposure times that tell a straight line from a bent one
 # Variance over the signal, in units of the least at lower levels, below which pixels are full. A
 # response that bends by a fifth lessens it to 0.64.
 COLLAPSED = 0.25
-SHOT = 0.1  # shot noise over the noise without light, in variance, from which a level tells a slope
+# Shot noise over the noise without light, in variance, from which a level tells a slope; it has to
+# be this many errors above it as well.
+SHOT, CERTAIN = 0.1, 5.0
 _OUTLYING, _CLIPPINGS = 0.01, 3  # chance of a variance that is left out of the mean; times
 NEARLY = 0.02  # relative distance from a pixel's own full well within which its signal is not used
 
@@ -74,6 +76,7 @@ class Rung:
     frames: int  # how many were combined
     signal: F64  # mean (ADU); NaN where any of the frames is saturated or not finite
     variance: F64  # of `signal` (ADU²)
+    noise: float  # variance of one sample of a usual pixel that sees the lamp (ADU²)
 
 
 def usual_variance(variance: NDArray[Any], dof: int) -> float:
@@ -128,16 +131,16 @@ def unsaturated(
     A full well, maybe far below the highest code, has no photon noise and would outweigh the rest.
     ``levels``: (rung,) of `step_levels`. ``dark_variance``: of a usual sample without light (ADU²).
     """
-    seen = lit(np.fmax.reduce([rung.signal for rung in rungs]))
     full, least, most = np.zeros(len(rungs), np.bool_), np.inf, 0.0
     for n in np.argsort(levels):
         if not levels[n] > 0:
             continue
-        noise = finite_median(rungs[n].variance[seen] * rungs[n].frames)
+        noise = rungs[n].noise
         slope = (noise - dark_variance) / levels[n]
         full[n] = slope < COLLAPSED * least < np.inf and noise < most
         most = max(most, noise)
-        if not full[n] and noise > (1 + SHOT) * dark_variance:
+        samples = max(np.isfinite(rungs[n].signal).sum() * (rungs[n].frames - 1), 1)
+        if not full[n] and noise > (1 + max(SHOT, CERTAIN * np.sqrt(2 / samples))) * dark_variance:
             least = min(least, slope)
     if not full.any():
         return rungs, levels

@@ -232,7 +232,7 @@ def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined)
     variance = np.fmax(found.variance, usual + brighter / job.gain) / frames
     if line is not None:
         variance = variance + column.noise * line.variance(exptime)
-    column.rungs.append(Rung(group.exptime, frames, signal, variance))
+    column.rungs.append(Rung(group.exptime, frames, signal, variance, usual))
 
 
 def _measure_response(job: Measuring, column: _Column) -> None:
