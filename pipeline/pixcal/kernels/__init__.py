@@ -30,7 +30,7 @@ Decorator = Callable[[Callable[..., Any]], Any]
 
 def kernel(**options: Any) -> Decorator:
     """Compile a function, and keep it; other threads run while it does."""
-    decorate: Decorator = numba.njit(cache=True, nogil=True, **options)
+    decorate: Decorator = numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True, **options)
     return decorate
 
 

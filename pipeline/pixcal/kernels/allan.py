@@ -38,15 +38,18 @@ def allan_deviation(series: NDArray[np.floating], lengths: Sequence[int]) -> F64
     (length, pixel) float64; NaN where no two means are left
     """
     out = np.empty((len(lengths), series.shape[1]))
-    _deviations(np.ascontiguousarray(series), np.array(lengths, dtype=np.int64), out)
+    # Not in compiled code: numpy's functions take longer to compile than loops.
+    running, sums = np.zeros((2, len(series) + 1, PIXELS_AT_ONCE)), np.empty((2, PIXELS_AT_ONCE))
+    given = np.ascontiguousarray(series), np.array(lengths, dtype=np.int64)
+    _deviations(*given, *running, *sums, out)
     return out
 
 
 @kernel()
-def _deviations(series: Any, lengths: Any, out: Any) -> None:
+def _deviations(
+    series: Any, lengths: Any, total: Any, missing: Any, squares: Any, count: Any, out: Any
+) -> None:
     n, n_pixels = series.shape
-    total = np.zeros((n + 1, PIXELS_AT_ONCE))
-    missing = np.zeros((n + 1, PIXELS_AT_ONCE))
     for start in range(0, n_pixels, PIXELS_AT_ONCE):
         size = min(PIXELS_AT_ONCE, n_pixels - start)
         for k in range(n):
@@ -57,8 +60,8 @@ def _deviations(series: Any, lengths: Any, out: Any) -> None:
                 missing[k + 1, p] = missing[k, p] + (1.0 if absent else 0.0)
         for number in range(len(lengths)):
             m = lengths[number]
-            squares = np.zeros(PIXELS_AT_ONCE)
-            count = np.zeros(PIXELS_AT_ONCE)
+            for p in range(PIXELS_AT_ONCE):
+                squares[p], count[p] = 0.0, 0.0
             for k in range(n - 2 * m + 1):
                 _add_difference(total, missing, k, m, squares, count)
             for p in range(size):
@@ -83,20 +86,8 @@ def disjoint_differences(series: NDArray[np.floating], m: int, most: int) -> F64
     """
     pairs = len(series) // (2 * m)
     chosen = np.unique(np.linspace(0, pairs - 1, min(pairs, most)).round().astype(np.int64))
-    out = np.zeros((len(chosen), series.shape[1]))
-    _differences(np.ascontiguousarray(series), 2 * m * chosen, m, out)
-    return out
-
-
-@kernel()
-def _differences(series: Any, starts: Any, m: int, out: Any) -> None:
-    before = np.empty(series.shape[1])
-    for number in range(len(starts)):
-        after, first = out[number], starts[number]
-        before[:] = 0.0
-        for k in range(first, first + m):
-            for p in range(before.size):
-                before[p] += series[k, p]
-                after[p] += series[k + m, p]
-        for p in range(before.size):
-            after[p] = after[p] / m - before[p] / m
+    before, after = np.zeros((2, len(chosen), series.shape[1]))
+    for k in range(m):
+        before += series[2 * m * chosen + k]
+        after += series[2 * m * chosen + m + k]
+    return after / m - before / m

@@ -103,25 +103,6 @@ def _count_row(codes: Any, row: int, fill: int, count: Any) -> None:
 
 
 @inner()
-def _sum_row(
-    codes: Any, row: int, scale: float, offset: float, fill: int, g: Any, dk: Any, moving: bool,
-    y: float, x0: float, t0: Any, t1: Any, t2: Any, read: Any, shot: Any, p: Any,
-) -> None:  # fmt: skip
-    s, o, f = np.float32(scale), np.float32(offset), np.float32(fill)
-    if moving:
-        _sweep_row(
-            codes, row, s, o, f, g, dk, np.float32(y), np.float32(x0), t0, t1, t2, read, shot,
-            p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9],
-        )  # fmt: skip
-    else:
-        _sweep_still_row(
-            codes, row, s, o, f, g, t0, t1, t2, read, shot,
-            p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9],
-        )  # fmt: skip
-    _count_row(codes, row, fill, p[10])
-
-
-@inner()
 def _pour(part: Any, total: Any) -> None:
     """Add sums to others, and begin again."""
     for k in range(part.shape[0]):
@@ -396,18 +377,34 @@ def sweep_batches(
     turn, sigma : (batch, y, x) written: phase of a batch relative to the start model and its error,
         rad; NaN where it does not give all three unknowns
     """
-    moving = np.any(dk != 0)
-    p = np.zeros((N_SUMS, codes.shape[2]), np.float32)
+    s, o, f, left = np.float32(scale), np.float32(offset), np.float32(fill), np.float32(x0)
+    # Loops, where numpy's functions would do: those take longer to compile.
+    moving = False
+    for t in range(dk.shape[0]):
+        moving |= dk[t, 0] != 0 or dk[t, 1] != 0
+    p = np.empty((N_SUMS, codes.shape[2]), np.float32)
+    for k in range(N_SUMS):
+        for i in range(codes.shape[2]):
+            p[k, i] = 0
     for row in range(codes.shape[1]):
         t0, t1, t2 = theta[0, row], theta[1, row], theta[2, row]
         q, whole = part[row], total[row]
         first = 0
         for n in range(stops.size):
             stop = stops[n]
-            _sum_row(
-                codes[first:stop], row, scale, offset, fill, g[first:stop], dk[first:stop], moving,
-                y0 + row, x0, t0, t1, t2, read[row], shot[row], p,
-            )  # fmt: skip
+            block, frames = codes[first:stop], g[first:stop]
+            if moving:
+                _sweep_row(
+                    block, row, s, o, f, frames, dk[first:stop], np.float32(y0 + row), left,
+                    t0, t1, t2, read[row], shot[row],
+                    p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9],
+                )  # fmt: skip
+            else:
+                _sweep_still_row(
+                    block, row, s, o, f, frames, t0, t1, t2, read[row], shot[row],
+                    p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9],
+                )  # fmt: skip
+            _count_row(block, row, fill, p[10])
             _pour(p, q)
             first = stop
             if closes[n] == GOES_ON:

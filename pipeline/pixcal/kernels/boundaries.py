@@ -71,28 +71,6 @@ def _push(charge: Any, shifts: Any, wide: Any, right: Any, below: Any) -> None:
                         out[x] += s * row[x]
 
 
-@kernel()
-def _move(charge: Any, shifts: Any, along_y: Any, out: Any) -> None:
-    """What pixels of frames (t, y, x) gain, added to ``out``."""
-    frames, ny, nx = charge.shape
-    wide = np.empty((ny + 2 * REACH, nx + 2 * REACH), np.float32)
-    right, below = np.empty((ny, nx), np.float32), np.empty((ny, nx), np.float32)
-    half = np.float32(0.5)
-    for t in range(frames):
-        q, gain = charge[t], out[t]
-        _push(q, shifts, wide, right, below)
-        for y in range(ny):
-            for x in range(nx - 1):
-                flow = half * (q[y, x] + q[y, x + 1]) * right[y, x]
-                gain[y, x + 1] -= flow
-                gain[y, x] += flow
-        for y in range(ny - 1):
-            for x in range(nx):
-                flow = half * (q[y, x] + q[y + 1, x]) * below[y, x] * along_y
-                gain[y + 1, x] -= flow
-                gain[y, x] += flow
-
-
 def moved_charge(charge: F32, shifts: F64, along_y: float = 1.0) -> F32:
     """What each pixel of a frame (y, x), or of frames (t, y, x), gains, e-; its sum is zero.
 
@@ -108,7 +86,17 @@ def moved_charge(charge: F32, shifts: F64, along_y: float = 1.0) -> F32:
     charge = np.ascontiguousarray(charge, np.float32)
     out = np.zeros_like(charge)
     ny, nx = charge.shape[-2:]
-    _move(charge.reshape(-1, ny, nx), shifts, np.float32(along_y), out.reshape(-1, ny, nx))
+    wide = np.empty((ny + 2 * REACH, nx + 2 * REACH), np.float32)
+    right, below = np.empty((2, ny, nx), np.float32)
+    half, factor = np.float32(0.5), np.float32(along_y)
+    for q, gain in zip(charge.reshape(-1, ny, nx), out.reshape(-1, ny, nx), strict=True):
+        _push(q, shifts, wide, right, below)
+        flow = half * (q[:, :-1] + q[:, 1:]) * right[:, :-1]
+        gain[:, 1:] -= flow
+        gain[:, :-1] += flow
+        flow = half * (q[:-1] + q[1:]) * below[:-1] * factor
+        gain[1:] -= flow
+        gain[:-1] += flow
     return out
 
 
@@ -147,7 +135,8 @@ def shared_noise(
     out = np.zeros_like(charge)
     dy, dx = step
     there, back = _slopes(shifts, dy, dx, axes), _slopes(shifts, -dy, -dx, axes)
-    _share(charge, *pushes, there, back, dy, dx, out)
+    one, other = np.empty((2, charge.shape[2]), np.float32)
+    _share(charge, *pushes, there, back, dy, dx, one, other, out)
     return out
 
 
@@ -180,7 +169,8 @@ def _gain(
     before, after = q[y, left - 1 : right - 1], q[y, left + 1 : right + 1]
     push_right, push_left = push_x[y, left:right], push_x[y, left - 1 : right - 1]
     push_below, push_above = push_y[y, left:right], push_y[y - 1, left:right]
-    (s_right, s_left, s_below, s_above), (c_right, c_left, c_below, c_above) = slopes
+    s_right, s_left, s_below, s_above = slopes[0, 0], slopes[0, 1], slopes[0, 2], slopes[0, 3]
+    c_right, c_left, c_below, c_above = slopes[1, 0], slopes[1, 1], slopes[1, 2], slopes[1, 3]
     for x in range(right - left):
         out[x] = (
             s_right * (here[x] + after[x])
@@ -196,11 +186,11 @@ def _gain(
 
 @kernel()
 def _share(
-    charge: Any, push_x: Any, push_y: Any, there: Any, back: Any, dy: int, dx: int, out: Any
-) -> None:
+    charge: Any, push_x: Any, push_y: Any, there: Any, back: Any, dy: int, dx: int,
+    one: Any, other: Any, out: Any,
+) -> None:  # fmt: skip
     frames, ny, nx = charge.shape
     left, right = REACH + max(0, -dx), nx - REACH - max(0, dx)
-    one, other = np.empty((2, max(0, right - left)), np.float32)
     for t in range(frames):
         q, across, along = charge[t], push_x[t], push_y[t]
         for y in range(REACH + max(0, -dy), ny - REACH - max(0, dy)):

@@ -47,7 +47,8 @@ def pixel_normals(key: Key, frame: int, rows: tuple[int, int], columns: int) -> 
     """
     first, last = rows[0] // 2, -(-rows[1] // 2)
     pairs = np.empty((2, last - first, 2, columns), np.float32)
-    _fill(np.uint32(key[0]), np.uint32(key[1]), np.uint32(frame), first, pairs)
+    words = np.empty((4, columns), np.uint32)
+    _fill(np.uint32(key[0]), np.uint32(key[1]), np.uint32(frame), first, words, pairs)
     skip = rows[0] - 2 * first
     every = pairs.reshape(2, -1, columns)
     return every[:, skip : skip + rows[1] - rows[0]]
@@ -71,16 +72,20 @@ def philox(
 
 
 @kernel()
-def _fill(key: np.uint32, other: np.uint32, frame: np.uint32, first: int, pairs: F32) -> None:
-    """Fill (2, pair of rows, 2, x) from a pair of rows on: one counter for each pair and column."""
-    words = np.empty((4, pairs.shape[3]), np.uint32)
+def _fill(
+    key: np.uint32, other: np.uint32, frame: np.uint32, first: int, words: U32, pairs: F32
+) -> None:
+    """Fill (2, pair of rows, 2, x) from a pair of rows on: one counter for each pair and column.
+
+    ``words`` (4, x) is scratch.
+    """
     for i in range(pairs.shape[1]):
         _draw(np.uint32(first + i), frame, key, other, words)
         _box_muller(words[0], words[1], pairs[0, i, 0], pairs[1, i, 0])
         _box_muller(words[2], words[3], pairs[0, i, 1], pairs[1, i, 1])
 
 
-@kernel()
+@inner()
 def _draw(row: np.uint32, frame: np.uint32, key: np.uint32, other: np.uint32, words: U32) -> None:
     """Words (4, x) of a pair of rows; in a loop of its own, of which the compiler makes vectors."""
     for x in range(words.shape[1]):

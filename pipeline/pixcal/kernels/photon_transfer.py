@@ -21,11 +21,7 @@ import numpy as np
 
 from pixcal.kernels import kernel
 from pixcal.kernels.bilinear import FAST
-from pixcal.kernels.robust import (
-    clipped_variance_factor,
-    deviation_of_sorted,
-    median_of_columns,
-)
+from pixcal.kernels.robust import clipped_variance_factor, median_and_deviation
 from pixcal.model.arrays import F32, F64
 
 BLOCK = 16  # pixels along each side of a block
@@ -53,20 +49,20 @@ _SIGMA_OF_MAD = 1.482602218505602
 @kernel(fastmath=FAST, error_model="numpy")
 def _add_blocks(
     first: F32, second: F32, per_level: float, read_variance: float, quantum: float,
-    centre: F32, spread: F32, lags: Any, out: F64,
+    centre: F32, spread: F32, lags: Any, used: F32, there: F32, out: F64,
 ) -> None:  # fmt: skip
     slope, floor = np.float32(per_level), np.float32(read_variance)
     clip, step = np.float32(_CLIP), np.float32(quantum)
     columns, zero = -(-first.shape[1] // BLOCK), np.float32(0)
-    # Flat, with zeros between the rows and after them: a neighbour is so many places on.
+    # ``used`` and ``there`` are scratch. Flat, with zeros between the rows and after them: a
+    # neighbour is so many places on.
     width = BLOCK + REACH
-    used = np.zeros(width * (width + 1), np.float32)
-    there = np.zeros_like(used)
     for block in range(len(out)):
         # With too few pixels it is NaN, and nothing is within the limits.
         middle, wide = centre[block], spread[block]
         y0, x0 = block // columns * BLOCK, block % columns * BLOCK
-        used[:], there[:] = zero, zero
+        for i in range(used.size):
+            used[i], there[i] = zero, zero
         n = total = square = level = zero
         for y in range(min(BLOCK, first.shape[0] - y0)):
             one, two = first[y0 + y, x0 : x0 + BLOCK], second[y0 + y, x0 : x0 + BLOCK]
@@ -135,14 +131,13 @@ def pair_statistics(
     pair = np.ascontiguousarray(first, np.float32), np.ascontiguousarray(second, np.float32)
     ratios = np.full((BLOCK * BLOCK, blocks), np.nan, np.float32)
     _ratios(*pair, 1 / gain, read_noise**2, ratios)
-    centre, spread = np.empty((2, blocks), np.float32)
     few = np.isfinite(ratios).sum(axis=0) < _MIN_PIXELS
-    median_of_columns(ratios, centre)
-    deviation_of_sorted(ratios, centre, spread)
+    centre, spread = median_and_deviation(ratios)
     centre[few] = np.nan
     out = np.zeros((blocks, COLUMNS))
     spread *= np.float32(_SIGMA_OF_MAD)
-    _add_blocks(*pair, 1 / gain, read_noise**2, quantum, centre, spread, LAGS, out)
+    scratch = np.empty((2, (BLOCK + REACH) * (BLOCK + REACH + 1)), np.float32)
+    _add_blocks(*pair, 1 / gain, read_noise**2, quantum, centre, spread, LAGS, *scratch, out)
     out[:, 2:] /= clipped_variance_factor(_CLIP)
     return out
 

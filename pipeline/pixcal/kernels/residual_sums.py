@@ -41,7 +41,9 @@ def residual_sums(
     sums = np.zeros((len(steps), 7))
     arrays = (shot_factor, read, of_time, of_pixels, taken)
     factor, still, *fitted = (np.ascontiguousarray(a, np.float32) for a in arrays)
-    _sum(rest, model, factor, still, good, *fitted, steps, np.float32(limit), sums)
+    # Not in compiled code: that takes longer to compile.
+    frame, line = np.empty((3, *good.shape), np.float32), np.empty(good.shape[1], np.float32)
+    _sum(rest, model, factor, still, good, *fitted, steps, np.float32(limit), line, *frame, sums)
     return sums
 
 
@@ -49,13 +51,13 @@ def residual_sums(
 @kernel(fastmath={"reassoc", "contract"})
 def _sum(
     rest: Any, model: Any, factor: Any, read: Any, good: Any, of_time: Any, of_pixels: Any,
-    taken: Any, steps: Any, limit: Any, sums: Any,
+    taken: Any, steps: Any, limit: Any, fitted: Any, signal: Any, root: Any, size: Any, sums: Any,
 ) -> None:  # fmt: skip
     frames, ny, nx = rest.shape
-    signal, root, size = np.empty((3, ny, nx), np.float32)
     for t in range(frames):
         for y in range(ny):
-            fitted = np.zeros(nx, np.float32)
+            for x in range(nx):
+                fitted[x] = 0
             for k in range(of_pixels.shape[0]):
                 share = of_time[t, k]
                 for x in range(nx):
@@ -71,7 +73,7 @@ def _sum(
                 root[y, x] = np.sqrt(weight) if used else np.float32(0)
                 size[y, x] = value / left if used else np.float32(0)
         for n in range(len(steps)):
-            dy, dx = steps[n]
+            dy, dx = steps[n, 0], steps[n, 1]
             low, high = max(0, -dx), nx - max(0, dx)
             for y in range(ny - dy):
                 # Views, whose indices are never negative: only then are loops vectorised.

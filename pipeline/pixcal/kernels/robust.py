@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pixcal.kernels import inner, kernel
@@ -66,8 +67,8 @@ def _sort_columns(rows: Any) -> None:
         p //= 2
 
 
-@kernel()
-def median_of_columns(rows: Any, out: Any) -> None:
+@inner()
+def _median_of_columns(rows: Any, out: Any) -> None:
     """Median of each column of (row, column) float32, NaN not counted; sorts the rows."""
     for x in range(rows.shape[1]):
         out[x] = 0
@@ -83,18 +84,17 @@ def median_of_columns(rows: Any, out: Any) -> None:
         out[x] = 0.5 * (rows[(m - 1) // 2, x] + rows[m // 2, x]) if m > 0 else np.nan
 
 
-@kernel()
-def deviation_of_sorted(rows: Any, median: Any, out: Any) -> None:
-    """Median of the absolute deviations of columns that `median_of_columns` sorted.
+@inner()
+def _deviation_of_sorted(rows: Any, median: Any, least: Any, out: Any) -> None:
+    """Median of the absolute deviations of columns that `_median_of_columns` sorted.
 
     Deviations rise from the median on to either side. So the smaller ones of the first on one side
     and the last on the other, and so on, are the lower half of them all (Batcher's bitonic merge).
     """
     n, columns = rows.shape
     half = n // 2
-    least = np.full(columns, np.inf, np.float32)
     for x in range(columns):
-        out[x] = 0
+        least[x], out[x] = np.inf, 0
     for i in range(half):
         left, right = rows[half - 1 - i], rows[n - 1 - i]
         for x in range(columns):
@@ -129,40 +129,35 @@ def _deviation_of_some(column: Any, median: float) -> float:
 
 
 @kernel()
-def _medians_around(wide: F32, side: int, out: F32) -> None:
-    rows = np.empty((side * side, out.shape[1]), np.float32)
-    for y in range(out.shape[0]):
-        for n in range(side * side):
-            for x in range(out.shape[1]):
-                rows[n, x] = wide[y + n // side, x + n % side]
-        median_of_columns(rows, out[y])
-
-
-def median_around(values: NDArray[Any], side: int) -> F32:
-    """Median (y, x) of an odd square about each pixel, NaN left out; edges mirror the map."""
-    out = np.empty(values.shape, np.float32)
-    _medians_around(np.pad(values.astype(np.float32), side // 2, "symmetric"), side, out)
-    return out
-
-
-@kernel()
-def _median_and_deviation(frames: Any, median: Any, deviation: Any) -> None:
-    rows = np.empty((frames.shape[0], frames.shape[2]), np.float32)
+def _median_and_deviation(frames: Any, rows: Any, median: Any, deviation: Any) -> None:
+    # The last of the rows (t + 1, x), which are scratch, is not of a frame.
+    sorted_rows, least = rows[: frames.shape[0]], rows[frames.shape[0]]
     for y in range(frames.shape[1]):
         # A loop: assigning the slice takes seconds to compile.
         for t in range(frames.shape[0]):
             for x in range(frames.shape[2]):
                 rows[t, x] = frames[t, y, x]
-        median_of_columns(rows, median[y])
-        deviation_of_sorted(rows, median[y], deviation[y])
+        _median_of_columns(sorted_rows, median[y])
+        _deviation_of_sorted(sorted_rows, median[y], least, deviation[y])
 
 
 def median_and_deviation(frames: F32) -> tuple[F32, F32]:
-    """Median (y, x) of frames (t, y, x), NaN apart, and of the absolute deviations from it."""
-    median = np.empty(frames.shape[1:], np.float32)
-    deviation = np.empty_like(median)
-    _median_and_deviation(frames, median, deviation)
-    return median, deviation
+    """Median (..., x) of frames (t, ..., x), NaN apart, and of the absolute deviations from it."""
+    count, columns = len(frames), frames.shape[-1]
+    median, deviation = np.empty((2, frames[0].size // columns, columns), np.float32)
+    rows = np.empty((count + 1, columns), np.float32)
+    _median_and_deviation(frames.reshape(count, -1, columns), rows, median, deviation)
+    return median.reshape(frames.shape[1:]), deviation.reshape(frames.shape[1:])
+
+
+def median_around(values: NDArray[Any], side: int) -> F32:
+    """Median (y, x) of an odd square about each pixel, NaN left out; edges mirror the map."""
+    out = np.empty(values.shape, np.float32)
+    wide = np.pad(values.astype(np.float32), side // 2, "symmetric")
+    for y, row in enumerate(out):
+        around = sliding_window_view(wide[y : y + side], len(row), axis=1)
+        row[:], _ = median_and_deviation(around.reshape(side * side, len(row)))
+    return out
 
 
 @inner()

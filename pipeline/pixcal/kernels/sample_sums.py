@@ -89,10 +89,15 @@ def _count(rest: float, variance: float, limits: F64, beyond: F64) -> None:
             beyond[int(rest > 0), n] += 1
 
 
-@kernel()
 def count_beyond(rest: F32, variance: F32, good: Mask, limits: F64) -> F64:
     """How many residuals of good pixels are below and above (2, n) ascending limits, in sigmas."""
     beyond = np.zeros((2, len(limits)))
+    _count_beyond(rest, variance, good, limits, beyond)
+    return beyond
+
+
+@kernel()
+def _count_beyond(rest: F32, variance: F32, good: Mask, limits: F64, beyond: F64) -> None:
     least = np.float32(limits[0] ** 2)
     for t in range(rest.shape[0]):
         for y in range(rest.shape[1]):
@@ -100,7 +105,6 @@ def count_beyond(rest: F32, variance: F32, good: Mask, limits: F64) -> F64:
                 one = rest[t, y, x]
                 if one * one > least * variance[t, y, x] and good[y, x]:
                     _count(one, variance[t, y, x], limits, beyond)
-    return beyond
 
 
 @kernel()
@@ -123,49 +127,48 @@ def level_sums(
                     sums[n, 2] += np.float64(squared[t, y, x]) ** 2
 
 
-@kernel()
 def count_remainders(codes: Any, good: Mask, divisor: int) -> Indices:
     """How often whole numbers (t, y, x) of good pixels have each remainder on division by 2ⁿ."""
     count = np.zeros(divisor, np.int64)
-    for t in range(codes.shape[0]):
-        for y in range(codes.shape[1]):
-            for x in range(codes.shape[2]):
-                count[codes[t, y, x] & (divisor - 1)] += good[y, x]
+    _count_remainders(codes, good, divisor, count)
     return count
 
 
 @kernel()
+def _count_remainders(codes: Any, good: Mask, divisor: int, count: Indices) -> None:
+    for t in range(codes.shape[0]):
+        for y in range(codes.shape[1]):
+            for x in range(codes.shape[2]):
+                count[codes[t, y, x] & (divisor - 1)] += good[y, x]
+
+
 def pixel_moments(values: F32) -> tuple[F64, F64]:
     """Mean square and mean fourth power (y, x) of the samples (t, y, x) of each pixel."""
-    nt, ny, nx = values.shape
-    second, fourth = np.zeros((ny, nx)), np.zeros((ny, nx))
-    for t in range(nt):
-        for y in range(ny):
-            for x in range(nx):
-                square = np.float64(values[t, y, x]) ** 2
-                second[y, x] += square
-                fourth[y, x] += square * square
-    return second / nt, fourth / nt
+    second, fourth = np.zeros((2, *values.shape[1:]))
+    for frame in values:
+        square = np.square(frame, dtype=float)
+        second += square
+        fourth += square * square
+    return second / len(values), fourth / len(values)
+
+
+def frame_means(values: Any, good: Mask) -> F64:
+    """Mean (t,) over the good pixels of each frame (t, y, x); what others hold may be NaN."""
+    sums = np.empty(len(values))
+    _sum_frames(values, good, sums)
+    return sums / max(int(np.count_nonzero(good)), 1)
 
 
 @kernel(fastmath=_FAST)
-def frame_means(values: Any, good: Mask) -> F64:
-    """Mean (t,) over the good pixels of each frame (t, y, x); what others hold may be NaN."""
-    nt, ny, nx = values.shape
-    means, count = np.zeros(nt), 0
-    for y in range(ny):
-        for x in range(nx):
-            count += good[y, x]
-    for t in range(nt):
+def _sum_frames(values: Any, good: Mask, sums: F64) -> None:
+    for t in range(values.shape[0]):
         total = 0.0
-        for y in range(ny):
-            for x in range(nx):
+        for y in range(values.shape[1]):
+            for x in range(values.shape[2]):
                 total += np.float64(values[t, y, x]) if good[y, x] else 0.0
-        means[t] = total / max(count, 1)
-    return means
+        sums[t] = total
 
 
-@kernel()
 def neighbour_products(values: F32, pairs: F32, steps: Indices, every: int = 1) -> F64:
     """Sums (step, y) of the products of samples with those some steps on, by their first row.
 
@@ -174,40 +177,30 @@ def neighbour_products(values: F32, pairs: F32, steps: Indices, every: int = 1) 
     (not negative) and columns to the right. Only ``every`` so many frames are used.
     """
     sums = np.zeros((len(steps), values.shape[1]))
-    for t in range(0, values.shape[0], every):
-        _add_products(values[t], pairs, steps, sums)
+    _add_products(values, pairs, steps, every, sums)
     return sums
 
 
-@kernel()
 def products_by_level(
     values: F32, level: F32, middle: float, pairs: F32, steps: Indices, every: int = 1
 ) -> F64:
     """The same (2, step, y) of pairs that are both above the ``middle`` of ``level``, both not."""
-    sums = np.zeros((2, len(steps), values.shape[1]))
-    above, below = np.empty_like(values[0]), np.empty_like(values[0])
-    zero = np.float32(0)
+    some, high = values[::every], level[::every] > middle
+    parts = (np.where(part, some, np.float32(0)) for part in (high, ~high))
+    return np.stack([neighbour_products(part, pairs, steps) for part in parts])
+
+
+@kernel(fastmath=_FAST)
+def _add_products(values: F32, pairs: F32, steps: Indices, every: int, sums: F64) -> None:
     for t in range(0, values.shape[0], every):
-        for y in range(values.shape[1]):
-            for x in range(values.shape[2]):
-                one, high = values[t, y, x], level[t, y, x] > middle
-                above[y, x] = one if high else zero
-                below[y, x] = zero if high else one
-        _add_products(above, pairs, steps, sums[0])
-        _add_products(below, pairs, steps, sums[1])
-    return sums
-
-
-@inner(fastmath=_FAST)
-def _add_products(frame: F32, pairs: F32, steps: Indices, sums: F64) -> None:
-    for n in range(len(steps)):
-        dy, dx = steps[n]
-        here, there, width = max(0, -dx), max(0, dx), frame.shape[1] - abs(dx)
-        for y in range(frame.shape[0] - dy):
-            weight = pairs[n, y]
-            one = frame[y, here : here + width]
-            other = frame[y + dy, there : there + width]
-            line = np.float32(0)
-            for x in range(width):
-                line += weight[x] * one[x] * other[x]
-            sums[n, y] += np.float64(line)
+        for n in range(len(steps)):
+            dy, dx = steps[n, 0], steps[n, 1]
+            here, there, width = max(0, -dx), max(0, dx), values.shape[2] - abs(dx)
+            for y in range(values.shape[1] - dy):
+                weight = pairs[n, y]
+                one = values[t, y, here : here + width]
+                other = values[t, y + dy, there : there + width]
+                line = np.float32(0)
+                for x in range(width):
+                    line += weight[x] * one[x] * other[x]
+                sums[n, y] += np.float64(line)

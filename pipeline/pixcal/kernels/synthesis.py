@@ -84,12 +84,9 @@ class _Seed(np.random.SeedSequence):
         return self.words
 
 
-@kernel()
 def fill_normal(rng: np.random.Generator, out: F32) -> None:
     """Fill a 2-D array with standard normals: those of ``rng.standard_normal``, rounded."""
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            out[i, j] = rng.standard_normal()
+    out[...] = rng.standard_normal(out.shape)
 
 
 @kernel()

@@ -28,44 +28,50 @@ def left_over(
         inverse normal matrix
     """
     rest = np.where(weight > 0, table, np.float32(0))
-    _project(rest, weight, of_place, covariance, of_time, inverse, turns)
+    # Not in compiled code: that takes longer to compile.
+    sums, share = np.zeros((2, len(of_time), rest.shape[1]), np.float32)
+    dots, size = np.empty((2, len(of_place)), np.float32)
+    given = rest, weight, of_place, covariance, of_time, inverse, turns
+    _project(*given, sums, share, dots, size)
     rest[weight == 0] = 0
     return rest
 
 
 @kernel(fastmath={"reassoc", "contract"})
 def _project(
-    rest: Any, weight: Any, of_place: Any, covariance: Any, of_time: Any, inverse: Any, turns: int
-) -> None:
-    (frames, pixels), free, functions = rest.shape, len(of_place), len(of_time)
-    sums = np.zeros((functions, pixels), np.float32)
-    share = np.zeros((functions, pixels), np.float32)
-    dots, size = np.zeros(free, np.float32), np.zeros(free, np.float32)
+    rest: Any, weight: Any, of_place: Any, covariance: Any, of_time: Any, inverse: Any, turns: int,
+    sums: Any, share: Any, dots: Any, size: Any,
+) -> None:  # fmt: skip
+    frames, pixels, free, functions = rest.shape[0], rest.shape[1], len(of_place), len(of_time)
     one = np.float32(1)
     for _ in range(turns):
-        sums[:] = 0
+        for i in range(functions):
+            for x in range(pixels):
+                sums[i, x] = 0
         for t in range(frames):
-            dots[:] = 0
+            for j in range(free):
+                dots[j] = 0
             for first in range(0, pixels, _PIXELS):
-                part = slice(first, first + _PIXELS)
-                row, own = rest[t, part], weight[t, part]
+                stop = first + _PIXELS
+                row, own = rest[t, first:stop], weight[t, first:stop]
                 for i in range(functions):
-                    _subtract(row, of_time[i, t], share[i, part])
+                    _subtract(row, of_time[i, t], share[i, first:stop])
                 for j in range(free):
-                    dots[j] += _dot(of_place[j, part], own, row)
+                    dots[j] += _dot(of_place[j, first:stop], own, row)
             for i in range(free):
                 size[i] = 0
                 for j in range(free):
                     size[i] += covariance[t, i, j] * dots[j]
             for first in range(0, pixels, _PIXELS):
-                part = slice(first, first + _PIXELS)
-                row, own = rest[t, part], weight[t, part]
+                stop = first + _PIXELS
+                row, own = rest[t, first:stop], weight[t, first:stop]
                 for j in range(free):
-                    _subtract(row, size[j], of_place[j, part])
+                    _subtract(row, size[j], of_place[j, first:stop])
                 for i in range(functions):
-                    _add_weighted(sums[i, part], of_time[i, t], own, row)
+                    _add_weighted(sums[i, first:stop], of_time[i, t], own, row)
         for i in range(functions):
-            share[i] = 0
+            for x in range(pixels):
+                share[i, x] = 0
             for k in range(functions):
                 _add_weighted(share[i], one, inverse[i, k], sums[k])
     for t in range(frames):

@@ -136,25 +136,13 @@ def _powers(parts: Sequence[Frames], highest: int) -> tuple[F32, ...]:
     count = sum(len(factor) for factor, _, _ in parts)
     found = np.empty((highest + 1, *parts[0][0].shape[1:], count), np.float32)
     first = 0
-    for part in parts:
-        _multiply_up(*(np.ascontiguousarray(a) for a in part), first, found)
-        first += len(part[0])
+    for factor, charge, one in parts:
+        value, ratio = factor * one, charge / np.maximum(one, TINY)
+        for power in found[..., first : first + len(factor)]:
+            power[...] = np.moveaxis(value, 0, -1)
+            value *= ratio
+        first += len(factor)
     return tuple(found)
-
-
-@kernel()
-def _multiply_up(factor: F32, charge: F32, one: F32, first: int, powers: F32) -> None:
-    """The powers (n, y, x, t) of frames (t, y, x), from a place in time on."""
-    nt, ny, nx = factor.shape
-    for y in range(ny):
-        for left in range(0, nx, _COLUMNS):
-            for t in range(nt):
-                for x in range(left, min(left + _COLUMNS, nx)):
-                    value = factor[t, y, x] * one[t, y, x]
-                    ratio = charge[t, y, x] / max(one[t, y, x], TINY)
-                    for n in range(len(powers)):
-                        powers[n, y, x, first + t] = value
-                        value *= ratio
 
 
 @inner()

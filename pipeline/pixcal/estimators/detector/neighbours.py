@@ -174,7 +174,8 @@ def pair_sums(
     margin : pixels along the edges that are not used
     """
     sums = np.zeros((_TERMS, _TERMS + 1))
-    _sum(residual, variance, charge, *shared, covariance, of_place, *step, margin, sums)
+    scratch = np.empty((2, residual.shape[2]), np.float32)
+    _sum(residual, variance, charge, *shared, covariance, of_place, *step, margin, *scratch, sums)
     normal = np.triu(sums[:, :_TERMS])
     return normal + np.triu(normal, 1).T, sums[:, _TERMS]
 
@@ -183,11 +184,10 @@ def pair_sums(
 @kernel(fastmath={"reassoc", "contract"})
 def _sum(
     residual: Any, variance: Any, charge: Any, shared1: Any, shared2: Any, covariance: Any,
-    of_place: Any, dy: int, dx: int, margin: int, sums: Any,
+    of_place: Any, dy: int, dx: int, margin: int, taken: Any, share: Any, sums: Any,
 ) -> None:  # fmt: skip
     frames, ny, nx = residual.shape
     left, right = margin + max(0, -dx), nx - margin - max(0, dx)
-    taken, share = np.empty((2, max(0, right - left)), np.float32)
     zero = np.float32(0)
     for t in range(frames):
         for y in range(margin, ny - margin - dy):
@@ -195,9 +195,11 @@ def _sum(
             var1, var2 = variance[t, y, left:right], variance[t, y + dy, left + dx : right + dx]
             q1, q2 = charge[t, y, left:right], charge[t, y + dy, left + dx : right + dx]
             first, second = shared1[t, y, left:right], shared2[t, y, left:right]
-            taken[:] = 0
+            for x in range(right - left):
+                taken[x] = 0
             for i in range(len(of_place)):
-                share[:] = 0
+                for x in range(right - left):
+                    share[x] = 0
                 for j in range(len(of_place)):
                     factor = covariance[t, i, j]
                     there = of_place[j, y + dy, left + dx : right + dx]

@@ -11,7 +11,7 @@ import numpy as np
 
 from pixcal.estimators.detector.emva import Measure
 from pixcal.kernels.photon_transfer import BLOCK, COLUMNS, LAGS, bin_pairs, pair_statistics
-from pixcal.kernels.robust import lit, median_and_sigma, median_of_columns
+from pixcal.kernels.robust import lit, median_and_deviation, median_and_sigma
 from pixcal.model.arrays import F32, F64
 
 LINES = {"row": ((0, 1), (0, 2)), "column": ((1, 0), (2, 0))}  # lags along a line
@@ -142,10 +142,8 @@ def _blocks(
 
 def _common(difference: F32, line: str) -> F32:
     """Median of each line, to be broadcast; zero where a line has no sample."""
-    rows = np.array(difference.T if line == "row" else difference, order="C")
-    median = np.empty(rows.shape[1], np.float32)
-    median_of_columns(rows, median)
-    median = np.nan_to_num(median)
+    rows = np.ascontiguousarray(difference.T if line == "row" else difference)
+    median = np.nan_to_num(median_and_deviation(rows)[0])
     return median[:, None] if line == "row" else median[None]
 
 
