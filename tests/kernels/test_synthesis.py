@@ -39,7 +39,7 @@ def test_pixels_of_each_purpose_have_a_key_of_their_own() -> None:
     assert all(0 <= word < 1 << 32 for key in found for word in key)
 
 
-def test_compiled_normals_are_those_of_numpy() -> None:
+def test_normals_are_those_of_numpy() -> None:
     out = np.empty((17, 31), np.float32)
     synthesis.fill_normal(generator(5, Stream.NOISE, 1), out)
     expected = generator(5, Stream.NOISE, 1).standard_normal((17, 31))
