@@ -283,9 +283,13 @@ def _add(
             for first in range(max(-dx, 0), nx - max(dx, 0), _STEADY_COLUMNS):
                 last = min(first + _STEADY_COLUMNS, nx - max(dx, 0))
                 v, left, end = y + dy, first + dx, last + dx
-                sums[:] = 0
+                # Loops: assigning the slices takes longer to compile.
+                for i in range(len(sums)):
+                    for x in range(last - first):
+                        sums[i, x] = 0
                 for level in range(len(charge)):
-                    products[:] = 0
+                    for x in range(last - first):
+                        products[x] = 0
                     for t in range(ends[level], ends[level + 1]):
                         here, there = e[t, y, first:last], e[t, v, left:end]
                         for x in range(len(here)):
@@ -299,7 +303,7 @@ def _add(
                         out[first + x] += sums[i, x]
 
 
-@kernel(fastmath=_FAST)
+@inner(fastmath=_FAST)
 def _add_terms(
     products: F32, own: F32, partner: F32, of_own: F32, of_partner: F32, sums: F32
 ) -> None:
