@@ -10,8 +10,8 @@ import yaml
 from pixcal.kernels.optics import interfringe, paraxial_vector
 from pixcal.kernels.scene import geometry
 from pixcal.model.bench import Bench, load_bench
-from pixcal.model.config import read_yaml
 from pixcal.model.errors import InputError
+from pixcal.model.yaml_file import read_yaml
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 FILES = sorted(CONFIGS.glob("*.yaml"))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime
 from pixcal.model.bench import Bench, load_bench
-from pixcal.model.config import to_yaml
+from pixcal.model.yaml_file import to_yaml
 from pixcal.stages import allan, crests, fit, ingest, reduce, simulate
 from pixcal.stages.fit.sweep import load_run
 from pixcal.stages.fitted_shape import nominal_vector as declared_vector

@@ -20,7 +20,8 @@ from pixcal.model.acquisition import SCHEMA as ACQUISITION
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.bench import SCHEMA as BENCH
 from pixcal.model.bench import Bench
-from pixcal.model.config import parse, read_yaml
+from pixcal.model.config import parse
+from pixcal.model.yaml_file import read_yaml
 from pixcal_cli.main import cli
 
 ROOT = Path(__file__).parents[2]

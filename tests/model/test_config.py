@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pixcal.model.config import MAX_CONFIG_BYTES, parse, quantity, read_yaml, to_plain, to_yaml
+from pixcal.model.config import parse, quantity, to_plain
 from pixcal.model.errors import InputError
+from pixcal.model.yaml_file import MAX_CONFIG_BYTES, read_yaml, to_yaml
 
 
 @dataclass(frozen=True)

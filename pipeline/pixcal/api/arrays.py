@@ -12,8 +12,9 @@ from pixcal.api import commands
 from pixcal.api.opened import Run
 from pixcal.engine.run import Runtime
 from pixcal.model.acquisition import SCHEMA, Acquisition
-from pixcal.model.config import StrPath, parse, to_yaml
+from pixcal.model.config import StrPath, parse
 from pixcal.model.errors import InputError
+from pixcal.model.yaml_file import to_yaml
 from pixcal.storage.fits_out import FrameWriter
 
 Frames = NDArray[Any]

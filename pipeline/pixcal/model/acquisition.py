@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pixcal.model.config import parse, quantity, read_yaml
+from pixcal.model.config import parse, quantity
 from pixcal.model.errors import InputError
+from pixcal.model.yaml_file import read_yaml
 
 SCHEMA = "pixcal/acquisition/1"
 

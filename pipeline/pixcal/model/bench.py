@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from pixcal.model.acquisition import Detector, FringeSet, Optics, check_names, check_set
-from pixcal.model.config import as_in, parse, quantity, read_yaml
+from pixcal.model.config import as_in, parse, quantity
 from pixcal.model.errors import InputError
+from pixcal.model.yaml_file import read_yaml
 
 SCHEMA = "pixcal/bench/1"
 

@@ -28,9 +28,10 @@ from pixcal.kernels.scene import DetectorMaps, Rows, geometry
 from pixcal.model import acquisition as described
 from pixcal.model.arrays import U16
 from pixcal.model.bench import Bench, load_bench
-from pixcal.model.config import to_plain, to_yaml
+from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError, naming
 from pixcal.model.options import Simulate as Config
+from pixcal.model.yaml_file import to_yaml
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import Camera, states_of
 from pixcal.simulation.recording import Recording, recordings
