@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_count
 from pixcal.kernels.tracks import add_tracks, draw_tracks
 from pixcal.model.arrays import F32, F64, I64, Mask
@@ -246,9 +247,8 @@ def _search(residual: F32, sigma: F32, seconds: float, area: float) -> _Search:
     ratio = residual / sigma
     usable = np.isfinite(ratio)
     # Of every seventh sample: what the noise is beyond what was predicted.
-    some = np.abs(ratio.ravel()[::7])
-    wide = 1.4826 * float(np.nanmedian(some)) if np.isfinite(some).any() else 1.0
-    limit = np.float32(THRESHOLD * max(wide, 1.0))
+    wide = robust_sigma(ratio.ravel()[::7])
+    limit = np.float32(THRESHOLD * np.fmax(wide, 1.0))
     up, down = ratio > limit, ratio < -limit
     often = np.count_nonzero(up | down, axis=0) > _OFTEN
     up &= ~often

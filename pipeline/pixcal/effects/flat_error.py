@@ -20,6 +20,7 @@ from pixcal.estimators.maps.map_fit import (
     without,
 )
 from pixcal.kernels.beams import LightMaps
+from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.scene import TILE, DetectorMaps, Rows, chip_map
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.bench import SimulatedDetector
@@ -166,7 +167,7 @@ def _structure(
         size = theta[0] if n == 0 else np.hypot(theta[1], theta[2])
         ratio = np.log(np.maximum(size * flat[good] / flats[n][good], 1e-12))
         rest = without(ratio[:, None], free)[:, 0]
-        limit = _CLIP * 1.4826 * np.median(np.abs(rest - np.median(rest)))
+        limit = _CLIP * robust_sigma(rest - np.median(rest))
         out = np.zeros(good.shape)
         out[good] = np.where(np.abs(rest) < limit, rest, 0.0)
         maps.append(out)

@@ -13,6 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.variance_components import walk_modes
 from pixcal.kernels.processes import brownian
+from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best, sigmas_of_chi2
 from pixcal.kernels.synthesis import walk_normals
 from pixcal.model.arrays import F32, F64, Indices, Mask
@@ -170,7 +171,7 @@ def output_numbers(
 def _calm(rest: F32, good: Mask) -> F32:
     """Without the mean of each frame; samples of bad pixels and outliers are zero."""
     rest = rest - rest[:, good].mean(axis=1)[:, None, None]
-    spread = 1.4826 * float(np.median(np.abs(rest[:, good])))
+    spread = robust_sigma(rest[:, good])
     rest[np.abs(rest) > _WILD * max(spread, 1e-6)] = 0
     return np.asarray(rest * good, np.float32)
 
@@ -213,7 +214,7 @@ def _steps(lines: Sequence[F64], width: int, dof: int) -> F64:
         expected = _means(noise, places, width)[0] + _means(noise, places - width, width)[0]
         steps = _means(own, places, width) - _means(own, places - width, width)
         steps /= np.sqrt(np.maximum(expected, 1e-12))
-        usual = 1.4826 * np.median(np.abs(steps)) or 1.0
+        usual = robust_sigma(steps) or 1.0
         square += np.square(np.clip(steps / usual, -_CLIP, _CLIP)).sum(axis=0)
     found = np.zeros(size + 1)
     found[places] = square * dof / max(float(np.median(square)), 1e-9)

@@ -21,7 +21,7 @@ import numpy as np
 
 from pixcal.kernels import kernel
 from pixcal.kernels.bilinear import FAST
-from pixcal.kernels.robust import clipped_variance_factor, median_and_deviation
+from pixcal.kernels.robust import SIGMA_OF_MAD, clipped_variance_factor, median_and_deviation
 from pixcal.model.arrays import F32, F64
 
 BLOCK = 16  # pixels along each side of a block
@@ -43,7 +43,6 @@ _SIZES = 12  # of covariances of neighbours that are tried
 _PAIRED = 1 - REACH / BLOCK
 _CLIP = 5.0
 _MIN_PIXELS = 32  # fewer do not tell outliers from noise
-_SIGMA_OF_MAD = 1.482602218505602
 
 
 @kernel(fastmath=FAST, error_model="numpy")
@@ -135,7 +134,7 @@ def pair_statistics(
     centre, spread = median_and_deviation(ratios)
     centre[few] = np.nan
     out = np.zeros((blocks, COLUMNS))
-    spread *= np.float32(_SIGMA_OF_MAD)
+    spread *= np.float32(SIGMA_OF_MAD)
     scratch = np.empty((2, (BLOCK + REACH) * (BLOCK + REACH + 1)), np.float32)
     _add_blocks(*pair, 1 / gain, read_noise**2, quantum, centre, spread, LAGS, *scratch, out)
     out[:, 2:] /= clipped_variance_factor(_CLIP)

@@ -28,7 +28,7 @@ from pixcal.model.arrays import F32, F64, Mask
 BATCH = 64  # frames that are looked at together
 _LEVEL_PIXELS = 4096
 _ROUNDING = np.float32(1e-6)
-_SIGMA_OF_MAD = 1.482602218505602
+SIGMA_OF_MAD = 1.482602218505602
 _BRIGHT, _LIT = 0.9, 0.1  # quantile of a tile that sees the lamp if any does; share of its signal
 
 
@@ -268,7 +268,7 @@ class Combination:
         # Twice: the frames' common part, which some pixels tell, is taken out before the limits are
         # measured for good.
         reference, deviation = median_and_deviation(_some(frames)[:, None])
-        scale = _SIGMA_OF_MAD * len(frames) / max(len(frames) - 0.8, 0.2)
+        scale = SIGMA_OF_MAD * len(frames) / max(len(frames) - 0.8, 0.2)
         seen = lit(reference) if self._lamp else np.ones(reference.shape, np.bool_)
         self._sigma = scale * finite_median(deviation[seen])
         levels = self._common(_some(frames), reference[0])[:, None, None]
@@ -325,6 +325,11 @@ def finite_median(values: NDArray[Any]) -> float:
     return median(finite) if finite.size else math.nan
 
 
+def robust_sigma(values: NDArray[Any]) -> float:
+    """Robust standard deviation of the finite values about zero (1.4826 median); NaN if none."""
+    return SIGMA_OF_MAD * finite_median(np.abs(values))
+
+
 def median(values: NDArray[Any]) -> float:
     """Median of finite values (n,), which are put in another order; as numpy's, in less time."""
     low, high = (len(values) - 1) // 2, len(values) // 2
@@ -339,4 +344,4 @@ def median_and_sigma(values: NDArray[Any]) -> tuple[float, float]:
     if not finite.size:
         return np.nan, np.nan
     middle = median(finite)
-    return middle, _SIGMA_OF_MAD * median(np.abs(finite - middle))
+    return middle, robust_sigma(finite - middle)

@@ -27,6 +27,7 @@ from pixcal.estimators.diagnosis.evidence import (
 from pixcal.estimators.fringe_fit.tile_fit import Coding
 from pixcal.estimators.maps.structure import flattened, without_outliers
 from pixcal.estimators.test_statistics.look import Look, neighbour_sums
+from pixcal.kernels.robust import SIGMA_OF_MAD, robust_sigma
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 # of the smooth surface that maps of the nominal bench may have
@@ -60,7 +61,7 @@ def weighed(maps: F64) -> Deviation:
     for own, out in zip(maps, weight, strict=True):
         steps = np.diff(own, axis=1)
         if np.isfinite(steps).any():
-            spread = 1.4826 * float(np.nanmedian(np.abs(steps))) / np.sqrt(2)
+            spread = robust_sigma(steps) / np.sqrt(2)
             out[np.isfinite(own)] = 1 / max(spread**2, 1e-30)
     return Deviation(flat, weight)
 
@@ -72,7 +73,7 @@ def common_precision(maps: F64) -> F64:
     """
     steps = np.concatenate([np.diff(maps, axis=a).reshape(len(maps), -1) for a in (1, 2)], axis=1)
     steps = steps[:, np.isfinite(steps).all(axis=0)]
-    usual = 1.4826 * np.median(np.abs(steps), axis=1, keepdims=True)
+    usual = SIGMA_OF_MAD * np.median(np.abs(steps), axis=1, keepdims=True)
     scaled = steps / np.maximum(usual, 1e-30)
     scaled = scaled[:, (np.abs(scaled) < WILD_STEP).all(axis=0)]
     size = np.sqrt(2) / np.maximum(usual[:, 0], 1e-30)
@@ -176,7 +177,7 @@ class SetDeviations(_Deviations):
         """Parameters (4, t) of the frames; their noise by samples or, if larger, by steps."""
         series = self._series(self.found.free)
         steps = np.diff(series, axis=1)
-        spread = (1.4826 * np.median(np.abs(steps), axis=1, keepdims=True)) ** 2 / 2
+        spread = (SIGMA_OF_MAD * np.median(np.abs(steps), axis=1, keepdims=True)) ** 2 / 2
         return Deviation(series, _inverse(np.maximum(spread, self._frame_noise**2)))
 
     @cached_property

@@ -9,6 +9,7 @@ themselves respond differently the noise follows the light, and does not step.
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
+from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F64, Mask
 
 MAX_BOUNDARIES = 7  # boundaries that are looked for along each axis
@@ -54,7 +55,7 @@ def _profile(values: F64, axis: int) -> F64:
 def _boundaries(along: F64) -> list[int]:
     """First places of the blocks after the first, most significant steps first, in order."""
     steps: list[int] = []
-    noise = 1.4826 * float(np.median(np.abs(np.diff(along)))) / np.sqrt(2)
+    noise = robust_sigma(np.diff(along)) / np.sqrt(2)
     places = range(NARROWEST, len(along) - NARROWEST + 1)
     while noise > 0 and len(steps) < MAX_BOUNDARIES:
         free = [p for p in places if all(abs(p - s) >= NARROWEST for s in steps)]

@@ -12,6 +12,7 @@ import numpy as np
 
 from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 
@@ -130,7 +131,7 @@ def flicker(evidence: Evidence) -> tuple[float, float]:
         return 0.0, 1.0
     # Of few values the median of what is off the median is too low (Croux and Rousseeuw 1992).
     few = len(every) / max(len(every) - 0.8, 0.7)
-    spread = 1.4826 * few * float(np.median(np.abs(every))) / float(np.sqrt(2))
+    spread = few * robust_sigma(every) / float(np.sqrt(2))
     return spread, max(_OF_MEDIAN * len(every), 1.0)
 
 

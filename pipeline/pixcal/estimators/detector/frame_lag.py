@@ -15,6 +15,7 @@ from pixcal.estimators.detector.flat_ladder import (
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.frame_order import follows
+from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 # of the phase that pixels are free to have, so that a bent response is not taken for lag
@@ -200,7 +201,7 @@ def _contrast_steps(frames: F64, numbers: Indices) -> tuple[F64, F64] | None:
         shares = np.linalg.solve(normal, rest @ y)
         left = y - shares @ rest
         scatter = np.sqrt(left @ left / (used.sum() - LAGS - basis.shape[1]))
-        spread = 1.4826 * np.median(np.abs(left))
+        spread = robust_sigma(left)
         used[used] = np.abs(left) <= CLIP * max(spread, 1e-12)
     return shares, normal / scatter**2
 

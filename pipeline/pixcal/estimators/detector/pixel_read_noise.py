@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import digamma, polygamma
 
+from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 FEWEST = 8  # frames that tell pixels apart
@@ -54,7 +55,7 @@ class PixelNoise:
         bias, error = float(digamma(half) - np.log(half)), float(polygamma(1, half))
         own = good[told]
         seen -= float(np.median(seen[own]))
-        spread = (1.4826 * float(np.median(np.abs(seen[own])))) ** 2
+        spread = robust_sigma(seen[own]) ** 2
         step = max(np.sqrt(error) / FINENESS, float(np.ptp(seen)) / (MOST - 3))
         log = np.arange(np.floor(seen.min() / step) - 1, np.ceil(seen.max() / step) + 2) * step
         # The bins of measured variances lie about the points of the grid.

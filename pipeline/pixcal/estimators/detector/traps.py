@@ -16,6 +16,7 @@ from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.frame_order import since_gap
 from pixcal.kernels.normal_matrix import inverse_normal
+from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F32, F64
 
 BANDS = (0.0, 0.125, 0.25, 0.5)  # where bands of the level begin, over the full scale
@@ -129,7 +130,7 @@ class LossFit:
     def weigh(self, lost: Loss, value: Sequence[float] | F64) -> None:
         """Take what a loss leaves of the contrast for its noise."""
         for one, rest in zip(self._sets, self._rests(lost, np.array(value)), strict=True):
-            one.contrast_error *= 1.4826 * float(np.median(np.abs(rest.contrast[one.known])))
+            one.contrast_error *= robust_sigma(rest.contrast[one.known])
 
     def _rests(self, lost: Loss, value: F64) -> list["_Rest"]:
         return [one.rest(lost(value, one.level)) for one in self._sets]
@@ -191,7 +192,7 @@ class _Set:
             slow += [np.cos(n * phase), np.sin(n * phase)]
         self._slow = np.linalg.svd(np.stack(slow).T, full_matrices=False)[0]
         self._contrast = self._without_slow(np.log(amplitude / b))
-        self.contrast_error = 1.4826 * float(np.median(np.abs(self._contrast)))
+        self.contrast_error = robust_sigma(self._contrast)
         self._residual = freedom.left_over(freedom.of_good(fringes.residual))
         self._sigma = np.sqrt(freedom.weight)
         self.known = ~since_gap(fringes.frame, UNKNOWN)

@@ -13,6 +13,7 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.series import MEDIAN, FrameSeries, mode_variance, motion_series
 from pixcal.estimators.frame_series.spectral_line import Line, cleared_of_line
+from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F64
 
 CROSSED = 0.5  # sine of the angle between fringes from which they count as different
@@ -161,7 +162,7 @@ def _is_step(values: F64, at: int, width: int, size: float) -> bool:
     frame = np.arange(-width, width, dtype=float)
     design = np.stack([np.ones(2 * width), frame, frame >= 0], axis=1)
     steps = np.convolve(values, np.linalg.pinv(design)[2, ::-1], "valid")
-    scatter = 1.4826 * float(np.median(np.abs(steps - np.median(steps))))
+    scatter = robust_sigma(steps - np.median(steps))
     same = abs(steps[at] - size) < 3 * scatter
     return bool(same and abs(steps[at]) > SIGNIFICANT_STEP * scatter)
 
@@ -173,7 +174,7 @@ def _measured(along: F64, found: dict[int, float]) -> tuple[Hop, ...]:
     width = max(HOP_WINDOWS)
     steps = np.diff(along)
     slope = float(np.median(along[width:] - along[:-width])) / width if len(along) > width else 0.0
-    scatter = float(1.4826 * np.median(np.abs(steps - np.median(steps)))) / np.sqrt(2)
+    scatter = robust_sigma(steps - np.median(steps)) / np.sqrt(2)
     hops, frames = [], sorted(found)
     for at, before, after in zip(frames, [0, *frames[:-1]], [*frames[1:], len(along)], strict=True):
         first, last = max(before, at - width), min(after, at + width)
@@ -190,7 +191,7 @@ def _differences(values: F64, width: int) -> tuple[F64, float]:
     means = (sums[width:] - sums[:-width]) / width
     change = means[width:] - means[:-width]
     change = change - np.median(change)
-    return change, float(1.4826 * np.median(np.abs(change))) or 1e-300
+    return change, robust_sigma(change) or 1e-300
 
 
 def _with_hops(series: FrameSeries, hops: Sequence[Hop], times: float) -> FrameSeries:

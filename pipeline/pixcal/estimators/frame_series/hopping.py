@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixcal.kernels import kernel
+from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F64
 
 ROUNDS = 200
@@ -101,7 +102,7 @@ def _error(likelihood: Callable[[float], float], step: float) -> float:
 
 def scatter_of(values: F64) -> float:
     """Standard deviation of a series from frame to frame, as if nothing but noise were in it."""
-    return 1.4826 * float(np.median(np.abs(np.diff(values)))) / float(np.sqrt(2)) or 1e-300
+    return robust_sigma(np.diff(values)) / float(np.sqrt(2)) or 1e-300
 
 
 def _change(rate: float, time_s: F64) -> F64:

@@ -16,7 +16,7 @@ from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.estimators.maps.stitching import within
 from pixcal.estimators.maps.structure import CELLS
 from pixcal.kernels.normal_matrix import inverse_normal
-from pixcal.kernels.robust import median
+from pixcal.kernels.robust import median, robust_sigma
 from pixcal.model.arrays import F64, Indices, Mask
 
 _CLIP = 5.0
@@ -42,7 +42,7 @@ class MapPart:
         for _ in range(2):
             left = _left(values[:, None], terms.T, at, field)[:, 0]
             centre = median(left.copy())
-            kept = np.abs(left - centre) <= _CLIP * 1.4826 * median(np.abs(left - centre))
+            kept = np.abs(left - centre) <= _CLIP * robust_sigma(left - centre)
             if kept.all():
                 break
             at, terms, values = at[kept], terms[:, kept], values[kept]

@@ -24,6 +24,7 @@ from pixcal.estimators.maps.map_fit import (
     without,
 )
 from pixcal.estimators.maps.structure import PERIODS
+from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import F64, Mask
 
@@ -81,7 +82,7 @@ class _Map:
     def rest(self) -> tuple[F64, float]:
         """The map without its free terms, zero where masked, and its variance."""
         left = without(self.data[self.good][:, None], self.free[:, self.good].T)[:, 0]
-        scatter = 1.4826 * float(np.median(np.abs(left - np.median(left))))
+        scatter = robust_sigma(left - np.median(left))
         left = np.where(np.abs(left) > _CLIP * scatter, 0, left)
         out = np.zeros(self.good.shape)
         out[self.good] = left

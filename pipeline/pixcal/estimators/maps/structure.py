@@ -9,7 +9,7 @@ from numpy.polynomial.legendre import legvander
 
 from pixcal.estimators.maps.stitching import FieldFit, fields
 from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
-from pixcal.kernels.robust import median_around
+from pixcal.kernels.robust import median_around, robust_sigma
 from pixcal.model.arrays import C128, F64, Indices, Mask
 
 DEGREE = 3  # of a smooth surface
@@ -25,7 +25,7 @@ _RED, _RED_LINES = 2.0, 1.4
 def clipped(values: F64) -> F64:
     """A map about its median, values beyond six robust standard deviations left out (NaN)."""
     rest = values - np.nanmedian(values)
-    spread = 1.4826 * float(np.nanmedian(np.abs(rest)))
+    spread = robust_sigma(rest)
     return np.asarray(np.where(np.abs(rest) <= _CLIP * max(spread, 1e-300), rest, np.nan))
 
 

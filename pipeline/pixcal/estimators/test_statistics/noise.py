@@ -16,6 +16,7 @@ from pixcal.estimators.test_statistics.look import (
     by_cell,
     neighbour_sums_by_level,
 )
+from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.sample_sums import count_beyond
 from pixcal.model.arrays import F32, F64, Mask
 
@@ -124,7 +125,7 @@ def _calm(frames: F32, good: Mask) -> F32:
     """Frames less the mean of each pixel and of each frame, over the noise; outliers zero."""
     rest = frames - frames.mean(axis=0)
     rest -= rest[:, good].mean(axis=1)[:, None, None]
-    spread = 1.4826 * float(np.median(np.abs(rest[:, good]))) or 1.0
+    spread = robust_sigma(rest[:, good]) or 1.0
     rest = rest / np.float32(spread)
     rest[np.abs(rest) > 8] = 0
     return np.asarray(rest * good, np.float32)
@@ -152,7 +153,7 @@ def dark_outliers(evidence: Evidence) -> Curve | None:
     for stack in stacks:
         rest, sigma = evidence.dark_noise(stack)
         # The read noise is that of most pixels.
-        spread = 1.4826 * float(np.nanmedian(np.abs(rest / sigma)))
+        spread = robust_sigma(rest / sigma)
         variance = np.ascontiguousarray((max(spread, 1.0) * sigma) ** 2)
         counts += count_beyond(np.nan_to_num(rest), variance, evidence.good, limits)
     value = 2 * np.sqrt(counts.ravel())
@@ -222,7 +223,7 @@ def ranges_about(values: F64, quantiles: Sequence[float]) -> F64:
 def hot_neighbours(evidence: Evidence) -> Curve | None:
     """Dark current beside hot pixels over theirs."""
     dark = evidence.dark_rate - np.median(evidence.dark_rate)
-    spread = 1.4826 * float(np.median(np.abs(dark)))
+    spread = robust_sigma(dark)
     # Only the brightest about: what it gave to its neighbours does not make them hot.
     hot = (dark > max(40 * spread, 1e-9)) & (dark >= maximum_filter(dark, size=5))
     hot[[0, -1]] = hot[:, [0, -1]] = False

@@ -21,6 +21,7 @@ from pixcal.estimators.fringe_fit.combine import weighted_mean
 from pixcal.estimators.fringe_fit.fringes import wrapped
 from pixcal.estimators.fringe_fit.tile_sums import TileSums, sum_row, tile_plane
 from pixcal.estimators.maps.corrected import phase_change
+from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.simulation.effect import FringeMaps
 from pixcal.stages.correct.sweep_to_correct import (
@@ -209,9 +210,7 @@ def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, phase: F64) -> list
     ``unknown``: of any light up to twice that around them; ``beyond``: the window, of unknown
     offsets that scatter as a ``phase`` (y, x), rad, does.
     """
-    apart = np.abs(np.diff(phase, axis=1))
-    apart = apart[np.isfinite(apart)]
-    scatter = 1.4826 * float(np.median(apart)) / np.sqrt(2) if apart.size else 0.0
+    scatter = np.nan_to_num(robust_sigma(np.diff(phase, axis=1)) / np.sqrt(2))
     y, x = np.indices(unknown.shape)
     y, x = y + maps.origin[0], x + maps.origin[1]
     variants = []
@@ -271,13 +270,13 @@ def border_misfit(theta: F64, k: tuple[float, float], good: Mask) -> float:
         values = np.where(good & np.isfinite(part), part, np.nan)
         values = values - np.nanmedian(values[SKIPPED:], axis=0)
         mean = np.nanmedian(values, axis=1)
-        spread = 1.4826 * np.nanmedian(np.abs(values[SKIPPED:] - mean[SKIPPED:, None]))
+        spread = robust_sigma(values[SKIPPED:] - mean[SKIPPED:, None])
         error = spread * np.sqrt(np.pi / 2 / max(int(good[0].sum()), 1))
         if not (error > 0 and np.isfinite(mean).all()):
             continue
         slope, start = np.polyfit(depth, mean[depth], 1)
         # What an effect that is not quite known leaves in lines is no sign of a border.
-        lines_apart = 1.4826 * np.median(np.abs(mean[depth] - start - slope * depth))
+        lines_apart = robust_sigma(mean[depth] - start - slope * depth)
         total += float((mean[0] - start) ** 2 / (error**2 + lines_apart**2))
     return total
 

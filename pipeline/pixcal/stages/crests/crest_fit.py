@@ -9,6 +9,7 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from pixcal.estimators.fringe_fit.models.hyperbolic import prior_errors
 from pixcal.kernels.optics import PARAMETERS, Geometry, phase, phase_jacobian
+from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
 from pixcal.stages.crests.crests import CrestPaths
@@ -117,7 +118,7 @@ def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior | None = None) -
         residual = float(solved.x[0]) + relative_phase(paths, geometry) - paths.k * np.pi
         pull = residual / paths.sigma
         chi2 = float((pull[used] ** 2).sum() / max(used.sum() - unknown, 1))
-        kept = np.abs(pull) <= OUTLIER * max(1.4826 * float(np.median(np.abs(pull))), 1.0)
+        kept = np.abs(pull) <= OUTLIER * max(robust_sigma(pull), 1.0)
         same = np.array_equal(kept, used) and abs(spread - max(1.0, chi2)) < 1e-3 * spread
         used, spread = kept, max(1.0, chi2)
         if same:

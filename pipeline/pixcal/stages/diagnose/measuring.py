@@ -13,7 +13,7 @@ from pixcal.estimators.maps.structure import flattened, smooth_surface
 from pixcal.estimators.test_statistics.look import Look
 from pixcal.estimators.test_statistics.noise import jumping
 from pixcal.kernels.processes import ramp_step
-from pixcal.kernels.robust import median_and_sigma
+from pixcal.kernels.robust import median_and_sigma, robust_sigma
 from pixcal.kernels.rounding import level_before_rounding
 from pixcal.kernels.scene import DetectorMaps
 from pixcal.model.acquisition import Acquisition
@@ -213,7 +213,7 @@ def _dark_rate(evidence: Sequence[Evidence], halves: Sequence[Half]) -> F32:
     own = parted("bias", halves) and parted("dark", halves)
     noise = _rate_variance(evidence[0]) / (len(evidence) if own else 1)
     rest = rate - np.median(rate)
-    spread = 1.4826 * float(np.median(np.abs(rest)))
+    spread = robust_sigma(rest)
     core = np.abs(rest) <= CORE * spread
     true = np.sqrt(max(1 - noise / spread**2, 0.0)) if spread > 0 else 1.0
     centre = rate[core].mean()

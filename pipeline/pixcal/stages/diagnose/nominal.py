@@ -17,6 +17,7 @@ from scipy.ndimage import maximum_filter
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.beams import Light
+from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.scene import DetectorMaps, FrameStates, Rows
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F32, F64, Indices
@@ -248,7 +249,7 @@ class NominalBench:
 def uncoupled(dark: Dark, rng: np.random.Generator) -> Dark:
     """Dark current (y, x) where pixels beside hot ones have that of others, not the median."""
     rest = dark - np.median(dark)
-    spread = 1.4826 * float(np.median(np.abs(rest)))
+    spread = robust_sigma(rest)
     brightest = maximum_filter(rest, size=2 * HOT_REACH + 1, mode="nearest")
     beside = (brightest > HOT * spread) & (rest < SHARED * brightest)
     found = dark.copy()
