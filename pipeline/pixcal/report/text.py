@@ -138,7 +138,7 @@ def not_tested(diagnosis: Mapping[str, Any]) -> str:
     groups = diagnosis.get("not_tested", {})
     parts = [f"{', '.join(names)} (needs {frames})" for frames, names in groups.items()]
     if statistics := diagnosis.get("not_compared"):
-        parts.append(f"{', '.join(statistics)} (the simulations do not show it alike)")
+        parts.append(f"{', '.join(statistics)} (no counterpart in the simulations)")
     return f"not tested: {'; '.join(parts)}" if parts else ""
 
 
