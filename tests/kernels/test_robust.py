@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
-from scipy.stats import kurtosis
+from scipy.stats import kurtosis, median_abs_deviation
 
 from pixcal.kernels.robust import (
     Combination,
     clipped_variance_factor,
     median_and_deviation,
     median_around,
+    robust_sigma,
 )
 
 F32 = NDArray[np.float32]
@@ -180,3 +181,12 @@ def test_medians_around_pixels_are_those_of_scipy() -> None:
     values = np.random.default_rng(16).standard_normal((17, 23)).astype(np.float32)
     expected = median_filter(values, 5, mode="reflect")
     np.testing.assert_array_equal(median_around(values, 5), expected)
+
+
+@pytest.mark.parametrize("count", [1, 6, 1001])
+def test_robust_sigma_is_that_of_scipy_about_zero(count: int) -> None:
+    values = np.random.default_rng(count).standard_normal(count)
+    expected = median_abs_deviation(values, center=lambda v, axis: 0.0, scale="normal")
+    assert robust_sigma(values) == pytest.approx(expected, rel=1e-9)
+    assert robust_sigma(np.append(values, np.nan)) == robust_sigma(values)
+    assert np.isnan(robust_sigma(np.full(count, np.nan)))
