@@ -134,3 +134,13 @@ def test_noise_of_rows_is_whole_where_every_second_row_repeats_it() -> None:
     # A row is as good as independent of two thirds of the others.
     error = np.hypot(error, row**2 * np.sqrt(2 * 1.5 / (DARKS / 2 * rows)))
     assert shared == pytest.approx(row**2, abs=3 * error)
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+def test_pixels_that_share_noise_two_apart_are_no_line(axis: int) -> None:
+    """As of two outputs that read the columns in turn, and settle slowly."""
+    rng = np.random.default_rng(12)
+    noise = READ * rng.standard_normal((12, 514, 258))
+    dark = np.roll(noise, 2, axis) * 0.1 + noise
+    for shared, _ in shared_by_lines(dark_pair_sums(dark.astype(np.float32), READ, 0.0)).values():
+        assert shared == 0

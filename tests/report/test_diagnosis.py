@@ -219,8 +219,8 @@ def test_no_gap_is_said_at_once_and_what_came_nearest_is_shown() -> None:
     found.facts["not_tested"] = {"flat frames": ["nonlinearity", "lag"]}
     last = "Not tested: nonlinearity, lag (needs flat frames)."
     assert diagnosis(contents(found)).marked("p", "advice") == [last]
-    found.facts.update(not_tested={}, not_compared=["photon transfer"])
-    last = "Not tested: photon transfer (no counterpart in the simulations)."
+    found.facts.update(not_tested={}, not_compared=["outliers of A"])
+    last = "Not tested: outliers of A (no counterpart in the simulations)."
     assert diagnosis(contents(found)).marked("p", "advice") == [last]
     nearest = table(shown, "Largest deviations, none of them significant")
     assert [row[1] for row in nearest.rows] == ["title of b", "title of a"]

@@ -35,16 +35,15 @@ def shared_by_lines(dark: F64) -> dict[str, Measure]:
     if not total[0]:
         return {}
     error = total[2] / total[0] / math.sqrt(total[0])
+    covariance = dict(zip(map(tuple, LAGS.tolist()), total[3:] / total[0], strict=True))
     # A coupling reaches the next pixel, and a row that repeats the row after it; not both.
-    lags = [[3 + LAGS.tolist().index(list(lag)) for lag in own] for own in LINES.values()]
-    covariances = total[lags] / total[0]
-    seen = covariances.min(axis=1)
+    seen = np.array([min(covariance[lag] for lag in own) for own in LINES.values()])
     # The mean of its block was taken off: of what the rows share a part, more of it where every
     # second row repeats it, and of what the columns share as much from all that are not the same
-    # column.
+    # column. Diagonal neighbours show a repeat, and no coupling along rows or columns.
     kept, taken = BLOCK / (BLOCK + 1), (BLOCK - 1) / BLOCK**2
-    repeated = np.maximum(covariances[:, 1] - covariances[:, 0], 0)[::-1]
-    seen += 2 * (BLOCK - 2) / (BLOCK**2 - 1) * repeated
+    repeated = [covariance[2, 2] - covariance[near] for near in ((1, 2), (2, 1))]
+    seen += 2 * (BLOCK - 2) / (BLOCK**2 - 1) * np.maximum(repeated, 0)
     shared = np.linalg.solve([[kept, -taken], [-taken, kept]], seen)
     return {
         name: (float(own) if own > _SHARED * error else 0.0, error)

@@ -182,7 +182,10 @@ def pixel_peakedness(look: Look) -> Curve:
 def read_noise(evidence: Evidence) -> Curve | None:
     """Quantiles over the pixels, masked ones if they jump, of variance over the read noise's."""
     stacks = [s for s in evidence.of_kind("bias") if len(s.adu) >= 8]
-    if not stacks or evidence.amplifier_noise < COARSE * evidence.gain * evidence.step_adu:
+    if not stacks or not evidence.dithered:
+        return None
+    rounded = evidence.read_noise > evidence.amplifier_noise
+    if rounded and evidence.amplifier_noise < COARSE * evidence.gain * evidence.step_adu:
         return None
     # Where noise is cut off at code zero, its size tells the level of a pixel.
     if (stacks[0].adu[:, evidence.good] == 0).mean() > CUT_OFF:

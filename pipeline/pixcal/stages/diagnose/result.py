@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import log_ndtr, ndtr
 
 from pixcal import __version__
-from pixcal.estimators.test_statistics import DETECTOR, Curve, Key
+from pixcal.estimators.test_statistics import DETECTOR, Curve, Key, known_statistics
 from pixcal.estimators.test_statistics.expectation import Reference, statistic_named
 from pixcal.estimators.test_statistics.gap import (
     Difference,
@@ -73,10 +73,15 @@ def by_domain(
 
 
 def not_compared(measured: Mapping[Key, Curve], data: Mapping[Key, F64]) -> list[str]:
-    """Titles of statistics that were measured and that the simulations lack, or have otherwise."""
+    """Titles of statistics that were measured and that the simulations lack, or have otherwise.
+
+    Estimates as statistics are left out: some are asked of the simulations only where it matters.
+    """
+    known = known_statistics()
     return [
         statistic_named(name).title + ("" if of == DETECTOR else f" of {of}")
         for name, of in sorted(set(measured) - set(data))
+        if name in known
     ]
 
 

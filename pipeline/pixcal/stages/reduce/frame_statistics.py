@@ -228,8 +228,9 @@ def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined)
         usual = float(np.nanmean(found.variance[seen]))
     usual = max(level, 0) / job.gain + job.read_noise**2 if np.isnan(usual) else usual
     # A brighter pixel has more photon noise, and the same read noise.
-    brighter = np.fmax(signal - level, 0)
-    variance = np.fmax(found.variance, usual + brighter / job.gain) / frames
+    photons = max(usual - float(np.median(column.noise)), 0.0)
+    brighter = np.fmax(signal / level - 1, 0) if level > 0 else 0.0
+    variance = np.fmax(found.variance, usual + photons * brighter) / frames
     if line is not None:
         variance = variance + column.noise * line.variance(exptime)
     column.rungs.append(Rung(group.exptime, frames, signal, variance, usual))

@@ -1,7 +1,7 @@
 """Exact fringes: the difference of the paths from two fibre tips (paper, equation 3).
 
 The phases of tiles, unwrapped, make the fit of the fibres' positions nearly linear (physics note,
-section 4). What a small window cannot tell, the bench's nominal values hold within `PRIOR`.
+section 4). What a small window cannot tell, the bench's nominal values hold within `prior_errors`.
 """
 
 from dataclasses import dataclass, replace
