@@ -87,7 +87,7 @@ def rot(bench: Bench, times: int, seed: int) -> Outcome:
         os.utime(file, ns=(facts.st_atime_ns, facts.st_mtime_ns))
         ended = pixcal(*line("reduce", acquisition, run))
         if ended.code:
-            ended.refused(2, f"{file}: its bytes are not those that were ingested")
+            ended.refused(2, f"{file}: its contents differ from those ingested")
             outcome.ends["refused by name; resumed with the file restored"] += 1
             shutil.copy2(bench.acquisition / name, file)
             pixcal(*line("reduce", acquisition, run)).succeeded()

@@ -122,7 +122,7 @@ def astrometry(
     stars : int
         Number of stars, at random places on the detector.
     positions : int
-        Positions of each star to average.
+        Number of positions of each star to average.
     dither_px : float
         Largest dither from the first position, along x and y.
     seed : int
@@ -228,9 +228,9 @@ def crests(
     frames : int
         Number of frames to use, spread over the run.
     paths : int, optional
-        Outermost crests and valleys to use at each end.
+        Number of outermost crests and valleys to use at each end.
     segment : int, optional
-        Length along a fringe for one point.
+        Length of fringe that gives one point.
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 
@@ -342,7 +342,7 @@ def ingest(
     copy : bool
         Copy all samples into RUN, so that later steps do not need ACQ.
     cubes : str or path, optional
-        Folder or URL (s3://bucket/prefix) for the large cubes, or RUN. [default: the place used before, else RUN]
+        Where to put the large cubes: a folder, a URL (s3://bucket/prefix), or RUN. [default: the place used before, else RUN]
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 
@@ -390,9 +390,9 @@ def reduce(
     nonlinear_share : float
         Deviation from a straight line above which a pixel is ``NONLINEAR``.
     rounding_share : float
-        Share of the variance that rounding may add.
+        Largest share of the variance that rounding may add.
     cubes : str or path, optional
-        Folder or URL (s3://bucket/prefix) for the large cubes, or RUN. [default: the place used before, else RUN]
+        Where to put the large cubes: a folder, a URL (s3://bucket/prefix), or RUN. [default: the place used before, else RUN]
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 
@@ -431,7 +431,7 @@ def run(
     model : str
         Shape of the fringes: hyperbolic, straight (paraxial), or chosen from the data.
     cubes : str or path, optional
-        Folder or URL (s3://bucket/prefix) for the large cubes, or RUN. [default: the place used before, else RUN]
+        Where to put the large cubes: a folder, a URL (s3://bucket/prefix), or RUN. [default: the place used before, else RUN]
     diagnosed : bool
         Find the effects that make the frames differ from a simulation (the longest step).
     runtime : Runtime, optional

@@ -85,7 +85,7 @@ def test_beyond_its_top_the_response_stays_there() -> None:
 def test_a_well_beyond_the_top_is_refused(make_effect_bench: Callable[..., Bench]) -> None:
     bench = make_effect_bench({"detector.full_well_e": 60_000.0})
     Nonlinearity().check(bench)
-    with pytest.raises(InputError, match=r"effects.nonlinearity: .* no longer rises from 3"):
+    with pytest.raises(InputError, match=r"effects.nonlinearity: .* stops rising at 3"):
         Nonlinearity(-0.3, -0.3).check(bench)
 
 

@@ -111,7 +111,7 @@ def test_where_it_shows_must_be_said(tmp_path: Path, written: str) -> None:
     given = 'domains, strengths = ("space", "intensity"), ("rate",)'
     assert given in text
     file.write_text(text.replace(given, f'strengths = ("rate",)\n    {written}'))
-    with pytest.raises(InputError, match="domains is missing or not a tuple out of space, time"):
+    with pytest.raises(InputError, match="domains is missing or not a tuple; choose from space"):
         known_effects([file])
 
 

@@ -316,7 +316,7 @@ def test_no_cause_is_claimed_where_what_differs_most_stays(unknown: float, claim
     """However much of the rest it closes: the main cause is another."""
     found, _ = search({"left": 0.03, "single 5": unknown}, [candidate("left", 0.03)])
     assert found.accepted == (("left",) if claimed else ())
-    assert claimed or "what differs most stays" in found.candidates["left"].reason
+    assert claimed or "the largest difference remains" in found.candidates["left"].reason
 
 
 def test_a_small_remainder_of_what_another_cause_brings_about_is_not_claimed() -> None:

@@ -345,7 +345,7 @@ def test_the_tasks_of_a_killed_worker_are_done_by_others(cluster: Any, tmp_path:
 
 def test_a_task_that_kills_every_worker_ends_the_run(cluster: Any, tmp_path: Path) -> None:
     cluster.pids()
-    with pytest.raises(ClusterError, match=r"2 workers died at the same task, the last was tcp://"):
+    with pytest.raises(ClusterError, match=r"2 workers died on the same task, the last was tcp://"):
         run_tasks(partial(kill, tmp_path), range(4), cluster.runtime, label="squares")
     assert run_tasks(abs, [-1], cluster.runtime, label="again") == [1]
 

@@ -99,7 +99,7 @@ def test_a_header_that_calls_for_too_little_is_refused(
     raw = raw.replace(old, b"%-8s= %20d" % (key.encode(), lie))
     file.write_bytes(gzip.compress(raw) if packed else raw)
     facts = file.stat()
-    with pytest.raises(InputError, match="there are more data"):
+    with pytest.raises(InputError, match="the file holds more"):
         inspect(SourceFile(file, "a", facts.st_size, facts.st_mtime_ns))
 
 

@@ -95,7 +95,7 @@ def test_file_that_changed_since_is_named(acquisition: Path, tmp_path: Path, kin
     with pytest.raises(InputError, match=f"{file}: changed since it was ingested"):
         reduce.run(run, reduce.Config(), SYNC)
     restore(file, body, facts.st_mtime_ns)
-    with pytest.raises(InputError, match=f"{file}: its bytes are not those that were ingested"):
+    with pytest.raises(InputError, match=f"{file}: its contents differ from those ingested"):
         reduce.run(run, reduce.Config(), SYNC)
     assert not (run / "reduce").exists()
     restore(file, whole, facts.st_mtime_ns)

@@ -135,10 +135,10 @@ def _check(effect: type[Effect]) -> None:
             raise InputError(f"{what} names {', '.join(sorted(unknown))}, which is not a field")
     domains = getattr(effect, "domains", None)
     if not isinstance(domains, tuple) or not domains or not set(domains) <= set(DOMAINS):
-        raise InputError(f"domains is missing or not a tuple out of {', '.join(DOMAINS)}")
+        raise InputError(f"domains is missing or not a tuple; choose from {', '.join(DOMAINS)}")
     for name in ("halo", "frames_back"):
         if not 0 <= getattr(default, name) <= MAX_AROUND:
-            raise InputError(f"{name} is not from 0 to {MAX_AROUND}")
+            raise InputError(f"{name} is not between 0 and {MAX_AROUND}")
 
 
 def _told(step: Callable[..., Any], file: Path, gives_back: bool) -> Callable[..., Any]:

@@ -34,7 +34,7 @@ class ContrastNoise(Effect):
     frames_needed = ()
     quick = False
     sources = (
-        "Rousset et al., section 4.2: micro-vibrations within a frame are still to be looked at",
+        "Rousset et al., section 4.2: micro-vibrations within a frame are still to be studied",
         "Colavita 1999, PASP 111, 111: the visibility falls by exp(-s²/2) for a phase of rms s "
         "within the integration; 20 nm of path are 0.2 rad at 633 nm",
         "Stowe, Moore & Priest 1982, IEEE Trans. MTT 30, 1632: polarisation in fibres that do not "

@@ -48,7 +48,7 @@ _BRIGHTEST = 16
 _SKEW = 5.0
 # Hits of parts of the frames on the same pixels, over those by chance, and as a share of all hits
 _AGAIN, _SHARE_AGAIN = 2.0, 0.1
-_NOISY_PIXELS = "the hits come back to the same pixels: these are noisy, as by telegraph noise"
+_NOISY_PIXELS = "the hits recur in the same pixels: these pixels are noisy, as with telegraph noise"
 _STEPS = 300  # of the maximisation
 _FEWEST = 1e-6
 
@@ -84,8 +84,8 @@ class CosmicHits(Effect):
         0.03, unit="/(cm² s)", low=0, high=1e7, doc="flux of particles through the detector"
     )
     readout_cm2: float = quantity(
-        0.0, unit="/cm²", low=0, high=1e7, doc="hits in each frame beside the exposure, while it "
-        "is read out"
+        0.0, unit="/cm²", low=0, high=1e7, doc="hits in each frame during the readout, in addition "
+        "to those of the exposure"
     )  # fmt: skip
     electrons_per_um: float = quantity(
         70.0, unit="e-/um", above=0, high=1e4, doc="most probable charge per length of track"

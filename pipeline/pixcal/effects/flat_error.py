@@ -72,7 +72,7 @@ class FlatError(Effect):
     pixel_rms: float = quantity(0.002, low=0, high=0.5, doc="relative rms from pixel to pixel")
     smooth_rms: float = quantity(0.005, low=0, high=0.5, doc="relative rms of the smooth part")
     scale_px: float = quantity(
-        8.0, unit="px", above=1, high=1e5, doc="scale of the smooth part: its wavelength over 2 pi"
+        8.0, unit="px", above=1, high=1e5, doc="length scale of the smooth part: wavelength / 2 pi"
     )
 
     def ratio(self, detector: SimulatedDetector, rows: Rows) -> F32:

@@ -53,10 +53,10 @@ class GhostWave:
         (0.0, 0.0), low=-0.9, high=0.9, doc="cosine and sine of the pattern of the mean light"
     )
     forward: tuple[float, float] = quantity(
-        (0.0, 0.0), low=-0.9, high=0.9, doc="the same of the fringes at fringe vector plus beat"
+        (0.0, 0.0), low=-0.9, high=0.9, doc="the same for fringes at fringe vector plus beat"
     )
     backward: tuple[float, float] = quantity(
-        (0.0, 0.0), low=-0.9, high=0.9, doc="the same of the fringes at fringe vector minus beat"
+        (0.0, 0.0), low=-0.9, high=0.9, doc="the same for fringes at fringe vector minus beat"
     )
 
     @property

@@ -21,7 +21,7 @@ from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
 
 REPEAT = 0.002  # to what part the visibility of two pairs of fibres is taken to be the same
-SHARED = "the visibility scatters alike in sets of crossed fringes, which widths do not bring about"
+SHARED = "the visibility scatters alike in sets of crossed fringes, which pixel widths do not cause"
 _MIN_PIXELS = 200
 _APART = 1.1
 _TURNS = 60

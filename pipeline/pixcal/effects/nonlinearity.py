@@ -105,8 +105,8 @@ class Nonlinearity(Effect):
         well = bench.detector.full_well_e
         if well is not None and well > self.turns_at * self.level_e:
             raise InputError(
-                f"effects.nonlinearity: the response no longer rises from "
-                f"{self.turns_at * self.level_e:.0f} e- up, below full_well_e ({well:g}); give "
+                f"effects.nonlinearity: the response stops rising at "
+                f"{self.turns_at * self.level_e:.0f} e-, below full_well_e ({well:g} e-); give "
                 "smaller deviations"
             )
 

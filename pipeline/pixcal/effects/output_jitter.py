@@ -106,7 +106,7 @@ class OutputJitter(Effect):
             cls(float(rms[0]), min(float(rms[1]), 1e6), rows, columns),
             dict(zip(cls.strengths, above.tolist(), strict=True)),
             found.sigmas,
-            "means of rows or columns beside an edge part anew in each frame without light",
+            "steps between outputs that change in each frame without light",
             {"white_e2": found.size[0], "walk_e2_s": found.size[1]},
         )
 

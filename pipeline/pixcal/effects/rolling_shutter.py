@@ -72,7 +72,8 @@ class RollingShutter(Effect):
     of_step: str = quantity(
         "last",
         choices=("last", "next"),
-        doc="phase step that settling refers to: the last or the next one",
+        doc="phase step that settling refers to: from the previous frame (last), or to the next "
+        "one (next)",
     )
     origin_rad: float | None = quantity(
         None, unit="rad", low=-10, high=10, doc="start of the modulator's range of 2 pi; default: "
@@ -206,7 +207,7 @@ class RollingShutter(Effect):
             return None
         sets = [sums for sums in many if sums.found.exptime_s > 0]  # not so where unknown (nan)
         settled = find_settling(many)
-        which = "from the last" if settled.way < 0 else "to the next"
+        which = "from the previous" if settled.way < 0 else "to the next"
         law = "phase error of the rows in proportion to the phase step, with any profile"
         effect = cls(
             0.0,
@@ -243,7 +244,7 @@ class RollingShutter(Effect):
                 "delay_us": max(line, error) * ramp.knee_error + error * ramp.knee,
             },
             float(ramp.slope / ramp.error),
-            f"the {'next' if ramp.way > 0 else 'last'} frame's light in the residuals, row by row",
+            f"light of the {'next' if ramp.way > 0 else 'previous'} frame in the residuals, by row",
             {
                 "share_per_row_of_next": sums[0].slope,
                 "share_per_row_of_last": sums[1].slope,

@@ -68,7 +68,7 @@ class RowNoise(Effect):
     column_rms: float = _rms(0.8, doc="white noise from column to column, new in each frame, rms")
     alternate_rms: float = _rms(
         0.0,
-        doc="noise from row to row, rms; half of its variance is shared with the second next row",
+        doc="noise from row to row, rms; half of its variance is shared with the row after next",
     )
 
     def readout(self, adu: F32, shot: Shot) -> F32:

@@ -37,12 +37,12 @@ class MeasuredPixels:
     rows: tuple[int, int] = quantity(doc="first row of the part, and the one after the last")
     columns: tuple[int, int] = quantity(doc="first column, and the one after the last")
     faintest: float = quantity(
-        low=0, doc="difference of the levels from which pixels were measured, over the mean one"
+        low=0, doc="smallest amplitude measured one by one, relative to the mean amplitude"
     )
     row: tuple[int, ...] = quantity(doc="row of each pixel")
     column: tuple[int, ...] = quantity(doc="column of each pixel")
     amplitude: tuple[float, ...] = quantity(
-        doc="difference of its levels, over the mean one of all pixels"
+        doc="difference of its two levels, relative to the mean amplitude"
     )
     upper: tuple[float, ...] = quantity(doc="share of the time in its upper level")
 
@@ -91,7 +91,7 @@ class TelegraphNoise(Effect):
         "exponential, large: equal amplitudes"
     )  # fmt: skip
     switching_decades: float = quantity(
-        0.0, low=0, high=6, doc="range of the times from pixel to pixel, even in the logarithm; "
+        0.0, low=0, high=6, doc="range of the mean times over pixels, uniform in the logarithm; "
         "switching_s is the geometric mean"
     )  # fmt: skip
     upper: float = quantity(0.5, above=0, below=1, doc="share of the time in the upper level")

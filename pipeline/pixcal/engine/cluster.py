@@ -245,9 +245,9 @@ class _Tasks:
         where = f"--cluster {self._address}"
         if isinstance(error, KilledWorker):
             return ClusterError(
-                f"{where}: {error.allowed_failures + 1} workers died at the same task, the last "
-                f"was {error.last_worker.address} (out of memory? see their logs); give them a "
-                "larger --memory-limit, or pixcal fewer --workers"
+                f"{where}: {error.allowed_failures + 1} workers died on the same task, the last "
+                f"was {error.last_worker.address} (out of memory? see their logs); start them with "
+                "a larger --memory-limit, or run pixcal with fewer --workers"
             )
         if isinstance(error, ModuleNotFoundError) and str(error.name).startswith("pixcal"):
             return InputError(f"{where}: a worker has no pixcal; install it wherever workers run")

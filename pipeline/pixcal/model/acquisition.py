@@ -22,7 +22,7 @@ class Detector:
     pitch_um: float = quantity(unit="um", low=0.01, high=1000, doc="pixel pitch")
     read_noise_e: float = quantity(unit="e-", low=0, high=1e6, doc="read noise, rms")
     gain_e_per_adu: float | None = quantity(
-        None, unit="e-/ADU", low=1e-6, high=1e6, doc="conversion gain; else that of the flats"
+        None, unit="e-/ADU", low=1e-6, high=1e6, doc="conversion gain; default: that of the flats"
     )
     name: str = quantity("", doc="free text")
     full_well_e: float | None = quantity(None, unit="e-", low=1, high=1e12, doc="full well")

@@ -95,8 +95,8 @@ class SimulatedDetector:
             first, size, whole = self.origin[axis], self.shape[axis], self.chip_shape[axis]
             if first < 0 or first + size > whole:
                 raise InputError(
-                    f"origin_px: {size} {name} from {first} on exceed the chip of {whole}; see "
-                    "shape, chip"
+                    f"origin_px: {size} {name} from number {first} do not fit on the chip of "
+                    f"{whole}; correct origin_px, shape or chip"
                 )
         if self.saturation_adu is not None and self.saturation_adu > (1 << self.bits) - 1:
             raise InputError(

@@ -71,7 +71,7 @@ class Ingest:
         None,
         metavar="PLACE",
         in_key=False,
-        doc="Folder or URL (s3://bucket/prefix) for the large cubes, or RUN. "
+        doc="Where to put the large cubes: a folder, a URL (s3://bucket/prefix), or RUN. "
         "[default: the place used before, else RUN]",
     )
 
@@ -118,7 +118,7 @@ class Reduce:
         doc="Deviation from a straight line above which a pixel is ``NONLINEAR``.",
     )
     rounding_share: float = _python(
-        1e-3, above=0, high=1, doc="Share of the variance that rounding may add."
+        1e-3, above=0, high=1, doc="Largest share of the variance that rounding may add."
     )
     cubes: StrPath | None = as_in(Ingest, "cubes")
 
@@ -183,14 +183,14 @@ class Crests:
         8, low=1, metavar="N", doc="Number of frames to use, spread over the run."
     )
     paths: int | None = quantity(
-        None, low=2, shown="all", doc="Outermost crests and valleys to use at each end."
+        None, low=2, shown="all", doc="Number of outermost crests and valleys to use at each end."
     )
     segment: int | None = quantity(
         None,
         low=4,
         unit="px",
         shown="an eighth of the window, 8 to 128",
-        doc="Length along a fringe for one point.",
+        doc="Length of fringe that gives one point.",
     )
 
 
@@ -252,7 +252,9 @@ class Astrometry:
     stars: int = quantity(
         1000, low=2, high=100_000, doc="Number of stars, at random places on the detector."
     )
-    positions: int = quantity(16, low=1, high=1024, doc="Positions of each star to average.")
+    positions: int = quantity(
+        16, low=1, high=1024, doc="Number of positions of each star to average."
+    )
     dither_px: float = quantity(
         32.0,
         unit="px",

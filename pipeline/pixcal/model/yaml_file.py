@@ -43,7 +43,7 @@ class _StrictLoader(yaml.SafeLoader):
             if key_node.tag != "tag:yaml.org,2002:str":
                 raise yaml.YAMLError(f"line {line}: keys must be words")
             if key in section:
-                raise yaml.YAMLError(f"line {line}: key {key!r:.80} twice")
+                raise yaml.YAMLError(f"line {line}: key {key!r:.80} is given twice")
             section[key] = self.construct_object(value_node, deep=True)
             section.lines[key] = line
         return section

@@ -136,7 +136,7 @@ def _inspect_stream(source: SourceFile, stream: _Stream, container: Container) -
     offset = stream.tell()
     tiled = _is_tiled(header)
     if tiled and container == "gzip":
-        raise ValueError("compressed by tiles and by gzip as well; unpack it with gunzip")
+        raise ValueError("both tile-compressed and gzip-compressed; unpack it with gunzip")
     prefix = "Z" if tiled else ""
     headers = (header, primary)
     file = FrameFile(
@@ -174,8 +174,8 @@ def _check_rest(stream: _Stream, end: int) -> None:
     # Fill of any one value is no data: zeros by the standard, blanks of some writers.
     if len(set(fill)) > 1 or (len(set(following)) > 1 and not extension):
         raise ValueError(
-            f"its header calls for {end} bytes, but there are more data; correct NAXISn and "
-            "BITPIX, or remove it"
+            f"its header describes {end} bytes, but the file holds more; correct NAXISn and "
+            "BITPIX, or remove the file"
         )
 
 
@@ -242,7 +242,7 @@ def _data_bytes(header: Header) -> int:
 def _frames_shape(axes: list[int]) -> tuple[int, int, int]:
     """(planes, y, x) of a frame or a cube; axes of length 1 after the second are dropped."""
     if 0 in axes:
-        raise ValueError("an axis of no length; copy it again, or remove it")
+        raise ValueError("an axis has length 0; copy the file again, or remove it")
     later = [n for n in axes[2:] if n != 1]
     if len(axes) < 2 or len(later) > 1:
         lengths = " × ".join(map(str, axes))

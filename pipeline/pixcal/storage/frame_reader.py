@@ -114,8 +114,9 @@ class FrameReader:
         first = rows[0] // BAND
         if (found != self._checksums[t, first : first + len(found)]).any():
             raise InputError(
-                f"{file.source.path}: its bytes are not those that were ingested (checksum), "
-                "though size and time are; restore it, or touch it and run 'pixcal ingest' again"
+                f"{file.source.path}: its contents differ from those ingested (checksum), "
+                "although size and time agree; restore it, or touch it and run 'pixcal ingest' "
+                "again"
             )
 
 

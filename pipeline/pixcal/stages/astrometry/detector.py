@@ -167,8 +167,8 @@ def open_components(run_dir: Path, fit: dict[str, Any], truth: Path | None) -> l
     for name, file in files.items():
         if not file.exists():
             raise InputError(
-                f"--truth {truth}: no {file.name} there; give what 'pixcal simulate' left beside "
-                "the acquisition (ACQ-truth)"
+                f"--truth {truth}: no {file.name} there; give the directory that 'pixcal simulate' "
+                "wrote beside the acquisition (ACQ-truth)"
             )
         true[name] = FitsMap.open(file)
     components = []

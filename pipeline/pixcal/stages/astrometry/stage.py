@@ -165,7 +165,7 @@ def _star(
     psf, half = telescope.psf(config.window)
     observed = star(psf, half, config.electrons, config.background_e, acquisition.detector)
     if observed.side > min(shape):
-        by_itself = "" if config.window else ", which a star of --wavelength and --diameter takes,"
+        by_itself = "" if config.window else " (the default for --wavelength and --diameter)"
         raise InputError(
             f"--window: {observed.side} px{by_itself} do not fit maps of {shape[1]} × {shape[0]} "
             f"px (x × y); give an odd number up to {min(shape)}"
@@ -210,7 +210,7 @@ def _warnings(result: Mapping[str, Any]) -> list[str]:
     stars = result["stars"]
     lost = stars["number"] * stars["positions"] - stars["positions_used"]
     if lost:
-        sentences.append(f"{lost} positions are too near to masked pixels and were left out")
+        sentences.append(f"{lost} positions are too close to masked pixels and were left out")
     for name, axis in result["axes"].items():
         gain = axis["floor"]["gain"]["value"]
         if axis["floor"]["perfect"]["px"] is None:

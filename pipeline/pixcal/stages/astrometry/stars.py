@@ -49,7 +49,7 @@ class Telescope:
         if not low <= self.sampling <= high:
             raise InputError(
                 f"--focal-length, --wavelength, --diameter: {self.sampling:.3g} px per "
-                f"lambda/D, not from {low:g} to {high:g}; change one of them"
+                f"lambda/D, not between {low:g} and {high:g}; change one of them"
             )
 
     @property

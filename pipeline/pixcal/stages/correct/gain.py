@@ -110,8 +110,8 @@ def worsened(sets: Mapping[str, Any], pairs: Sequence[Mapping[str, Any]]) -> str
         apart = pair["after_px"] > pair["before_px"]
         if apart and after > max(before, 0.0) + WORSE * chance:
             return (
-                f"the offsets of {' and '.join(pair['sets'])} are {pair['after_px']:.2g} px apart, "
-                f"{pair['before_px']:.2g} px before"
+                f"the offsets of {' and '.join(pair['sets'])} differ by {pair['after_px']:.2g} px, "
+                f"and by {pair['before_px']:.2g} px before the correction"
             )
     return ""
 

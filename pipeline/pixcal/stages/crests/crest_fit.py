@@ -241,7 +241,7 @@ def agreement(
     if facts is None:
         return None, "RUN/fit is not there yet"
     if facts["model"] != "hyperbolic":
-        return None, f"the fit took {facts['model']} fringes, which have no positions of the fibres"
+        return None, f"the fit used {facts['model']} fringes, which give no positions of the fibres"
     fitted = facts["geometry"]
     other = fit.geometry.with_vector([fitted[f"{name}_mm"] for name in PARAMETERS])
     sigma = np.hypot(fit.sigma, [fitted[f"{name}_sigma_mm"] for name in PARAMETERS])

@@ -71,7 +71,7 @@ def pedestal_of(
         raise InputError(
             f"the frames hold real numbers with a read noise of {noise:.2g}, but simulated samples "
             "are whole numbers; multiply all frames so that the noise is 1 or more, and divide "
-            "detector.gain_e_per_adu by the same"
+            "detector.gain_e_per_adu by the same factor"
         )
     signed = all(dtype.kind != "u" for dtype in dtypes.values())
     lifted = _LIFTED * noise - low if signed and low < _LIFTED * noise else 0.0

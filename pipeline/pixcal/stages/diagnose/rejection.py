@@ -44,7 +44,7 @@ def needed_gain(candidate: Candidate) -> float:
 def too_little(gain: float, candidate: Candidate) -> str:
     """Why a candidate that was tried is rejected."""
     if candidate.in_maps_alone and gain < MIN_LOGLIK_GAIN:
-        return "the maps of the held-out frames show no more of it than true offsets may by chance"
+        return "the maps of the held-out frames show no more of it than true offsets can by chance"
     if gain < MIN_LOGLIK_GAIN:
         return "the held-out frames are not fitted better"
     return (
@@ -100,7 +100,7 @@ def doubtful(
     tried = not any(one.reason.startswith(UNTRIED) for one in strong)
     if closed and least is None and tried and comparison.strongest_stays(current):
         least = min(closed, key=lambda name: closed[name])
-        return least, "what differs most stays as it is; it may stand in for an unknown cause"
+        return least, "the largest difference remains; it may stand in for an unknown cause"
     if least is None:
         return None
     closes = f"closes only {max(closed[least], 0):.1%} of the gap"

@@ -28,14 +28,15 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
         assert summary.well is not None
         found.append(
             f"the wells are full at {summary.well[0]:.0f} ADU above bias: {summary.full.sum()} of "
-            f"{len(summary.levels)} levels of flats are that bright, or nearly, and left out of "
-            "gain and linearity"
+            f"{len(summary.levels)} levels of flats reach that level, or nearly, and are left out "
+            "of gain and linearity"
         )
     if summary.linearity is not None and summary.linearity.max_deviation > _LINEARITY:
         found.append(
-            f"the levels of the flats are up to {100 * summary.linearity.max_deviation:.2g} % off "
-            "a straight line over exposure time: the response of all pixels, or the lamp, is "
-            "not linear; no pixel is flagged for it"
+            "the levels of the flats deviate by up to "
+            f"{100 * summary.linearity.max_deviation:.2g} % from a straight line over exposure "
+            "time: the response of all pixels, or the lamp, is not linear; no pixel is flagged for "
+            "this"
         )
     noise = summary.declared.read_noise_e
     measured = summary.noise_measured_e(summary.before_rounding, gain)
@@ -54,16 +55,16 @@ def _of_gain(fit: GainFit, summary: Summary, used: float) -> list[str]:
     found, declared, step = [], summary.declared.gain_e_per_adu, summary.step
     if fit.chi2_reduced > _ROUGH:
         found.append(
-            "the points of the photon-transfer curve are farther off a smooth curve than their "
-            f"noise (reduced chi-square {fit.chi2_reduced:.3g}); the error of the gain, "
-            f"{100 * fit.error / fit.gain:.2g} %, includes it; possible causes: amplifiers of "
-            "different gain, codes that are missing, or a lamp that flickers"
+            "the points of the photon-transfer curve deviate from a smooth curve by more than "
+            f"their noise (reduced chi-square {fit.chi2_reduced:.3g}); the error of the gain, "
+            f"{100 * fit.error / fit.gain:.2g} %, includes this; possible causes: amplifiers of "
+            "different gain, missing codes, or a flickering lamp"
         )
     if fit.step:
         found.append(
-            f"the photon-transfer curve is not smooth above {fit.levels[1]:.0f} ADU, as of a "
-            "camera that reads bright pixels at another gain (dual gain, HDR): the gain is that "
-            "below; gain and noise of brighter pixels are not measured"
+            f"the photon-transfer curve is not smooth above {fit.levels[1]:.0f} ADU, as in a "
+            "camera that reads bright pixels at another gain (dual gain, HDR): the gain given is "
+            "that below this level; gain and noise of brighter pixels are not measured"
         )
     clear = [lag for lag, sigmas in fit.neighbours.items() if sigmas > SHARED]
     if clear:
@@ -89,7 +90,7 @@ def _of_gain(fit: GainFit, summary: Summary, used: float) -> list[str]:
     if declared is None:
         return [
             *found,
-            f"no gain is declared: that of the flats is used, {used:.4g} ± {error:.2g} e-/ADU",
+            f"no gain is declared: the flats give the gain used, {used:.4g} ± {error:.2g} e-/ADU",
         ]
     if abs(value - declared) > max(3 * error, 0.02 * declared):
         found.append(

@@ -161,5 +161,5 @@ def set_warnings(name: str, found: dict[str, Any], declared: bool, share: float)
             "saturates there, declare detector.saturation_adu"
         )
     if found["mean_e"] is None:
-        warnings.append(f"{name}: no sample has weight: all are saturated or missing")
+        warnings.append(f"{name}: no usable samples: all are saturated or missing")
     return warnings
