@@ -137,10 +137,13 @@ def _powers(parts: Sequence[Frames], highest: int) -> tuple[F32, ...]:
     found = np.empty((highest + 1, *parts[0][0].shape[1:], count), np.float32)
     first = 0
     for factor, charge, one in parts:
-        value, ratio = factor * one, charge / np.maximum(one, TINY)
-        for power in found[..., first : first + len(factor)]:
-            power[...] = np.moveaxis(value, 0, -1)
-            value *= ratio
+        # Row by row: of all rows what stands between is half as large as the powers.
+        for y in range(one.shape[1]):
+            value = factor[:, y] * one[:, y]
+            ratio = charge[:, y] / np.maximum(one[:, y], TINY)
+            for power in found[:, y, :, first : first + len(factor)]:
+                power[...] = value.T
+                value *= ratio
         first += len(factor)
     return tuple(found)
 
