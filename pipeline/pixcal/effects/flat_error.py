@@ -106,8 +106,8 @@ class FlatError(Effect):
         """What iota and alpha share, divided by flats, beyond their light's shape.
 
         iota is of some frames over some flats, alpha of the others over the others, and of another
-        set where there is one: their product holds no noise. What neighbours share is smooth,
-        counted from a parabola, which beams make too.
+        set where there is one: their product holds no noise. The part that neighbours
+        share is smooth; a parabola is removed first, because beams cause one as well.
         """
         flats = _two_flats(evidence)
         sets = [f for f in evidence.fringes.values() if len(f.g) >= _MIN_FRAMES]

@@ -195,7 +195,7 @@ class SetDeviations(_Deviations):
 
     @cached_property
     def power(self) -> Deviation:
-        """Power (4, band) of the parameters of the frames over that of noise."""
+        """Power (4, band) of the frame parameters, divided by the power of their noise."""
         series = self._series(self.found.free)
         power = band_power(series / self._frame_noise)
         modes = band_power(np.ones(series.shape), squares=False)

@@ -143,8 +143,8 @@ def frames_of(
 def dense_kernel(parts: Iterable[Evidence], start: Sequence[Coupling]) -> Dense | None:
     """Measure all couplings of the period of a kernel; None for more than `MAX_SHARES`.
 
-    ``parts``: of the same pixels, with different frames. ``start``: as found: they give the period
-    and any coupling beyond `WITHIN`.
+    ``parts``: of the same pixels, with different frames. ``start``: couplings found so
+    far; they set the period and any coupling beyond `WITHIN`.
     """
     far = {(c.dy, c.dx) for c in start} | {(-c.dy, -c.dx) for c in start}
     rows, columns = (lcm(*(getattr(c, n) for c in start)) for n in ("every_rows", "every_columns"))

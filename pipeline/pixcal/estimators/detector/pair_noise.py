@@ -162,7 +162,7 @@ class LineNoise:
             self._rest += dark_pair_sums(frames, read_noise, quantum, self.lines).sum(axis=0)
 
     def put_back(self, sums: F64) -> F64:
-        """Sums without the noise of lines, with it as it is without light."""
+        """Sums with the noise of lines added back, as frames without light have it."""
         if self.lines:
             shared = self._whole[2:] / self._whole[0] - self._rest[2:] / self._rest[0]
             sums[:, 2:] += sums[:, :1] * shared

@@ -99,8 +99,8 @@ class LossFit:
     ) -> tuple[FittedLoss | None, FittedLoss | None]:
         """Shares of bands of the level, or traps that fill up; None for what explains no more.
 
-        ``few``: fewer pixels to search traps on. ``banded, trapped``: as of `fit`. ``share, full``:
-        what stays on the mean, and of full scale, e-.
+        ``few``: fewer pixels to search traps on. ``banded, trapped``: as of `fit`. ``share``:
+        mean share that stays behind; ``full``: full scale, e-.
         """
         even = np.full(len(BANDS), share)
         self.weigh(banded, even)

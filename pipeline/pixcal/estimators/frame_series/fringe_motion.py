@@ -130,8 +130,8 @@ def colour_of(series: FrameSeries) -> F64:
 def find_hops(series: FrameSeries) -> tuple[Hop, ...]:
     """Jumps of the wavelength: along the fringe vector, and sharp among what else moves it.
 
-    Means before and after are held against their own scatter along the run; the narrowest
-    difference that shows a hop places it.
+    Means before and after are compared with their scatter along the run. The narrowest significant
+    difference locates the hop.
     """
     k, along = np.array(series.k), colour_of(series)
     across = series.values @ np.array([-k[1], k[0]]) / (k @ k)

@@ -87,7 +87,7 @@ class RowSums:
         """Normal matrix (y, y) and right-hand side (y,) of the share of a light in each row.
 
         Less what pixels and frames take up of it. ``other``: (t, 3) the light's parameters in the
-        frames inside. ``factors``: (y, 3) of these in each row.
+        frames inside. ``factors``: (y, 3) factors of these parameters in each row.
         """
         g = self.found.g[self.inside]
         own = (other - g @ (np.linalg.pinv(g) @ other))[:, None]

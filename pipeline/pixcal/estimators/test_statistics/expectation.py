@@ -19,7 +19,7 @@ STANDS_OUT = 2.5
 
 
 def signature_key(effect: str, domain: str) -> Key:
-    """Key of the signature of an effect that shows in a domain."""
+    """Key of an effect's signature in one domain."""
     return f"{_PREFIX}{effect}{_INFIX}{domain}", DETECTOR
 
 
