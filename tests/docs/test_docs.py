@@ -120,7 +120,7 @@ def shell(programs: Path) -> Shell:
             start_new_session=True,
         ) as process:
             try:
-                printed, complaints = process.communicate(timeout=300)
+                printed, complaints = process.communicate(timeout=600)
             except subprocess.TimeoutExpired:
                 # With all that it has started, in the background too.
                 os.killpg(process.pid, signal.SIGTERM)

@@ -34,6 +34,10 @@ class DetectorMaps:
     adu_per_e: F32  # the inverse of the gain, ADU/e-
     mask: U8  # `PixelFlag.HOT` and `PixelFlag.DEAD`
 
+    def on(self, rows: Rows) -> "DetectorMaps":
+        """The maps of some of the rows (first, one after the last)."""
+        return DetectorMaps(*(getattr(self, field.name)[slice(*rows)] for field in fields(self)))
+
 
 def detector_maps(detector: SimulatedDetector, rows: Rows) -> DetectorMaps:
     """The detector's maps for rows of the window (first, one after the last)."""

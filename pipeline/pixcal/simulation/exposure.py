@@ -16,7 +16,14 @@ import numpy as np
 from pixcal.kernels import synthesis
 from pixcal.kernels.beams import Beam, Light, LightMaps, with_margin
 from pixcal.kernels.normals import Key, pixel_normals
-from pixcal.kernels.scene import FrameStates, Rows, detector_maps, frame_states, fringe_light
+from pixcal.kernels.scene import (
+    DetectorMaps,
+    FrameStates,
+    Rows,
+    detector_maps,
+    frame_states,
+    fringe_light,
+)
 from pixcal.kernels.synthesis import BLOCK_ROWS
 from pixcal.model.arrays import F32, U16
 from pixcal.model.bench import Bench
@@ -28,10 +35,19 @@ K = TypeVar("K", tuple[int, int], tuple[int, str])
 
 
 class Camera:
-    """Some rows (first, one after the last) of a bench and its effects; any give the same."""
+    """Some rows (first, one after the last) of a bench and its effects; any give the same.
+
+    ``maps``: of the whole window, in place of those of the bench.
+    """
 
     def __init__(
-        self, bench: Bench, rows: Rows, effects: Sequence[ForwardModel] = (), *, noise: bool = True
+        self,
+        bench: Bench,
+        rows: Rows,
+        effects: Sequence[ForwardModel] = (),
+        *,
+        maps: DetectorMaps | None = None,
+        noise: bool = True,
     ) -> None:
         self.bench = bench if noise else replace(bench, shot_noise=False)
         self.noise = noise
@@ -39,7 +55,7 @@ class Camera:
         halo = sum(e.halo for e in self.effects)
         self.inside = rows
         self.rows: Rows = (max(0, rows[0] - halo), min(bench.detector.shape[0], rows[1] + halo))
-        self.maps = detector_maps(bench.detector, self.rows)
+        self.maps = detector_maps(bench.detector, self.rows) if maps is None else maps.on(self.rows)
         for effect in self.effects:
             self.maps = effect.detector(self.maps, bench, self.rows)
 

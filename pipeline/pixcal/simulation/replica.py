@@ -53,10 +53,6 @@ class Fitted(ForwardModel):
         """Never."""
         return False
 
-    def detector(self, maps: DetectorMaps, bench: Bench, rows: Rows) -> DetectorMaps:
-        """As in `ForwardModel.detector`."""
-        return self.maps
-
     def light(self, light: Light, recording: Recording, rows: Rows, maps: DetectorMaps) -> Light:
         """As in `ForwardModel.light`; offsets that were changed change it."""
         if recording.kind != "fringes":
@@ -105,7 +101,8 @@ class Replica:
             model.check(bench)
         recording, frames = self._recordings[of], self._frames[of][:most].tolist()
         rows = (0, bench.detector.shape[0])
-        camera = Camera(bench, rows, [self._fitted, *models], noise=noise)
+        models = [self._fitted, *models]
+        camera = Camera(bench, rows, models, maps=self._fitted.maps, noise=noise)
         out = np.empty((len(frames), *bench.detector.shape), np.float32)
         for n, adu in enumerate(camera.analogue(replace(recording, bench=bench), frames)):
             out[n] = adu

@@ -7,6 +7,7 @@ import numpy as np
 
 from pixcal.kernels.gain_fit import LADDER
 from pixcal.kernels.photon_transfer import LAGS, pair_statistics
+from pixcal.kernels.scene import DetectorMaps
 from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect, Stage
@@ -53,6 +54,7 @@ def photon_transfer_change(
     effects: Sequence[Effect],
     recordings: Sequence[Recording],
     neighbours: Sequence[tuple[int, int]] = (),
+    maps: DetectorMaps | None = None,
 ) -> float:
     """What effects do to the variance of flats over their mean, neighbours at lags counted; or one.
 
@@ -73,7 +75,9 @@ def photon_transfer_change(
     flat = replace(flat, bench=bench)
     dark = [replace(r, bench=bench) for r in recordings if r.kind == "bias" and r.count > 1][:1]
     rows = (0, detector.shape[0])
-    cameras = [Camera(bench, rows, acting) for acting in ([measured], [measured, *effects])]
+    cameras = [
+        Camera(bench, rows, acting, maps=maps) for acting in ([measured], [measured, *effects])
+    ]
     offsets = []
     for camera in cameras:
         some = [_pairs(camera, r, range(min(FRAMES, r.count)), 0.0, neighbours) for r in dark]

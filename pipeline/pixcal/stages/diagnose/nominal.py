@@ -80,14 +80,6 @@ class Measured(Effect):
         """Never."""
         return False
 
-    def detector(self, maps: DetectorMaps, bench: Bench, rows: Rows) -> DetectorMaps:
-        """As in `Effect.detector`."""
-        m, own = self.maps, slice(*rows)
-        return DetectorMaps(
-            m.delta_x[own], m.delta_y[own], m.response[own], m.bias[own], m.dark_rate[own],
-            m.read_noise[own], m.adu_per_e[own], m.mask[own],
-        )  # fmt: skip
-
     def light(self, light: Light, recording: Recording, rows: Rows, maps: DetectorMaps) -> Light:
         """As in `Effect.light`."""
         if recording.kind != "fringes":
@@ -153,10 +145,10 @@ class NominalBench:
         if effects:
             measured = self._of_measured_k(measured, bench, effects)
         change = photon_transfer_change(
-            bench, measured, effects, self.recordings, self.gain.neighbours
+            bench, measured, effects, self.recordings, self.gain.neighbours, measured.maps
         )
         measured = self._electronics(measured, seed, own_seed, change)
-        camera = Camera(bench, rows, [measured, *effects])
+        camera = Camera(bench, rows, [measured, *effects], maps=measured.maps)
         arrays = {
             name: np.empty((len(frames), *bench.detector.shape), self.dtypes[name])
             for name, frames in half.items()
@@ -185,7 +177,10 @@ class NominalBench:
         # So is the phase that all pixels have in common: with fringes that lie elsewhere, the noise
         # of the same seed would be another one.
         rows = (0, bench.detector.shape[0])
-        before, after = Camera(bench, rows, [measured]), Camera(bench, rows, [measured, *effects])
+        before, after = (
+            Camera(bench, rows, acting, maps=measured.maps)
+            for acting in ([measured], [measured, *effects])
+        )
         sets = list(measured.sets)
         for recording in self.recordings:
             if recording.kind == "fringes":
