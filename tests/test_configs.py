@@ -78,7 +78,7 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("detector.shape", [80, 0], "detector.shape[1]: 0 is below 1 px"),
     ("detector.shape", [80.5, 96], "detector.shape[0]: expected a whole number, found 80.5"),
     ("detector.shape", [6000, 96], "detector: origin_px: 6000 rows"),
-    ("detector.origin_px", [10, 8300], "detector: origin_px: 96 columns from 8300"),
+    ("detector.origin_px", [10, 8300], "detector: origin_px: 96 columns from number 8300"),
     ("detector.bits", 24, "detector.bits: 24 is above 16"),
     ("detector.bits", 8, "detector: bias_adu: 500 ADU leaves no room below saturation"),
     ("detector.saturation_adu", 70000, "detector: saturation_adu: 70000 ADU is above the largest"),

@@ -490,7 +490,7 @@ def test_no_place_for_a_star(tmp_path: Path) -> None:
 def test_masked_pixels_take_places_away(results: dict[str, dict[str, Any]]) -> None:
     plan = results["drawn"]["stars"]
     assert 0 < plan["number"] * plan["positions"] - plan["positions_used"] < 100
-    assert any("too near to masked pixels" in w for w in results["drawn"]["warnings"])
+    assert any("too close to masked pixels" in w for w in results["drawn"]["warnings"])
     half = the_star().half
     inside = (SHAPE[0] - 2 * half) * (SHAPE[1] - 2 * half)
     assert inside - 200 < results["drawn"]["detector"]["places"] < inside

@@ -490,7 +490,7 @@ def test_a_correction_that_moves_sets_apart_is_refused() -> None:
     }  # fmt: skip
     assert worsened(sets, [pair]) == ""
     assert worsened(sets, [pair | {"after_px": 1.21e-3}]) == ""
-    assert "apart" in worsened(sets, [pair | {"after_px": 1.3e-3}])
+    assert "differ by 0.0013 px" in worsened(sets, [pair | {"after_px": 1.3e-3}])
     # Closer than before, with errors that have become smaller still.
     closer = {"before_px": 1.3e-3, "after_px": 1.25e-3, "after_expected_px": 0.8e-3}
     assert worsened(sets, [pair | closer]) == ""
