@@ -15,8 +15,8 @@ MIN_RUNGS = 3  # fewest exposure times that tell a straight line from a bent one
 # Variance over the signal, in units of the least at lower levels, below which pixels are full. A
 # response that bends by a fifth lessens it to 0.64.
 COLLAPSED = 0.25
-# Shot noise over the noise without light, in variance, from which a level tells a slope; it has to
-# be this many errors above it as well.
+# Least shot noise, relative to the variance without light, of a level that gives a slope; and by
+# how many errors it has to exceed that variance.
 SHOT, CERTAIN = 0.1, 5.0
 _OUTLYING, _CLIPPINGS = 0.01, 3  # chance of a variance that is left out of the mean; times
 NEARLY = 0.02  # relative distance from a pixel's own full well within which its signal is not used

@@ -25,8 +25,8 @@ of_noise_power = partial(statistic, "noise", power=True)
 
 MIN_DARKS = 5
 CUT_OFF = 1e-3  # share of samples at code zero from which noise is cut off
-# Steps of the converter that the read noise has to span for a pixel's variance to be its own: below
-# it depends on where the pixel's level lies between two codes.
+# Read noise, in steps of the converter, below which the variance of a pixel depends on where its
+# level lies between two codes.
 COARSE = 0.65
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
 STILL = 1e-12  # ADU²: variance of pixels that do not change, whose square float32 still holds
