@@ -137,7 +137,7 @@ def _powers(parts: Sequence[Frames], highest: int) -> tuple[F32, ...]:
     found = np.empty((highest + 1, *parts[0][0].shape[1:], count), np.float32)
     first = 0
     for factor, charge, one in parts:
-        # Row by row: of all rows what stands between is half as large as the powers.
+        # Row by row: of all rows at once the intermediate arrays would need much memory.
         for y in range(one.shape[1]):
             value = factor[:, y] * one[:, y]
             ratio = charge[:, y] / np.maximum(one[:, y], TINY)
@@ -235,7 +235,7 @@ def _variance(part: Residuals) -> tuple[F64, F64]:
     return (terms @ terms.T).astype(float), right.astype(float)
 
 
-# Frames whose charge is the same from frame to frame: one sum of them gives all terms
+# Frames with the same charge in every frame: one sum over them gives all terms
 
 
 @dataclass(frozen=True)
@@ -258,7 +258,7 @@ class _Level:
 
 
 def _add_steady(parts: Sequence[Residuals], links: Indices, right: F32, normal: F32) -> None:
-    """Add to the sums ``right`` and ``normal`` of `covariance.Products` for links (n, 2)."""
+    """Add to the sums ``right`` and ``normal`` of `Products` for links (n, 2)."""
     levels = [_Level.of(part) for part in parts]
     _add(
         np.concatenate([level.e for level in levels]),
@@ -275,10 +275,8 @@ def _add(
 ) -> None:
     """Frames (t, y, x) of level n are those from ``ends[n]`` to ``ends[n + 1]``."""
     _, ny, nx = e.shape
-    terms, sums = (
-        right.shape[1],
-        np.empty((right.shape[1] + normal.shape[1], _STEADY_COLUMNS), np.float32),
-    )
+    terms = right.shape[1]
+    sums = np.empty((terms + normal.shape[1], _STEADY_COLUMNS), np.float32)
     products = np.empty(_STEADY_COLUMNS, np.float32)
     for n in range(len(links)):
         dy, dx = links[n, 0], links[n, 1]
@@ -319,7 +317,7 @@ def _add_terms(
         sums[2, x] += s
         sums[3, x] += s * both
         sums[4, x] += s * squares
-        # In the order of `covariance.NORMAL`.
+        # In the order of `NORMAL`.
         sums[5, x] += w * d * d
         sums[6, x] += w * both
         sums[7, x] += w * other * other

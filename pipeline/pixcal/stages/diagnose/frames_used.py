@@ -63,7 +63,7 @@ class FramesUsed:
     shared: tuple[str, ...]
     kinds: tuple[str, ...]  # of calibration frames
     sets: dict[str, tuple[float, float]]  # baseline of each fringe set, mm
-    missing_frames: dict[str, str]  # `missing_frames`
+    missing_frames: dict[str, str]  # frames that the acquisition lacks, in words, by name
 
     @property
     def on_the_same_pixels(self) -> bool:
