@@ -444,7 +444,9 @@ def test_windows_that_are_tried_do_not_overlap(shape: tuple[int, int]) -> None:
     assert len(tried) == (4 if min(shape) > 288 else 2)
 
 
-@pytest.mark.parametrize("shape", [(512, 640), (1024, 1280), (257, 1000), (3000, 3000)])
+@pytest.mark.parametrize(
+    "shape", [(512, 640), (1024, 1280), (257, 1000), (300, 2000), (641, 823), (3000, 3000)]
+)
 def test_few_frames_without_fringes_are_looked_at_in_more_pixels(shape: tuple[int, int]) -> None:
     plain, tried = chosen_windows(shape)
     wide, also = chosen_windows(shape, 60)

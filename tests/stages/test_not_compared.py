@@ -19,7 +19,7 @@ def test_statistics_without_an_equal_in_the_simulations_are_named() -> None:
     data = Reference.of([curves(4) for _ in range(4)]).on_scale(measured)
     assert set(data) == {("outliers", "A")}
     assert not_compared(measured, data) == [
-        "correlation of neighbours in flat frames",
+        "correlation of adjacent pixels in flat frames",
         "photon transfer: variance of flats against signal",
     ]
     assert not_compared({("outliers", "A"): measured["outliers", "A"]}, {}) == ["outliers of A"]

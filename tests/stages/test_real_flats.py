@@ -334,7 +334,8 @@ def test_row_noise_with_a_repeat_shows_at_its_distance(tmp_path: Path) -> None:
         assert np.abs(plain).max() < 0.4
         assert repeated[1] > 10
         assert np.abs(repeated[[0, 2, 4, 5, 6, 7]]).max() < 0.3 * repeated[1]
-        correlation = after[f"{kind}_neighbours", DETECTOR].value
         # Noise of whole rows is no coupling of their pixels.
+        names = f"{kind}_neighbours", f"{kind}_far_neighbours"
+        correlation = np.concatenate([after[name, DETECTOR].value for name in names])
         for step in ((2, 0), (0, 1)):
             assert abs(correlation[STEPS.index(step)]) < 0.01

@@ -29,6 +29,9 @@ BLOCK = 64  # frames that are taken together
 _CLIP = 6.0
 _MIN_FRAMES = 2
 _TERMS = 4
+# chi-square of terms in proportion to the level, one a direction, from which they are there: by
+# chance one in a hundred
+_CROSSTALK = 13.3
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,9 @@ def _shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
             right[at] += more_right
     if not normal[-1, -1]:
         return None
-    alike = np.eye(n)[:, :-1]
+    if not evidence.fringes:
+        normal, right = _without_crosstalk(normal, right)
+    alike = np.eye(len(right))[:, :-1]
     alike[-1, -1] = 1
     one, covariance = inverse_normal(alike.T @ normal @ alike), inverse_normal(normal)
     return SharedCharge(
@@ -94,6 +99,29 @@ def _shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
         covariance[-2:] @ right,
         covariance[-2:, -2:],
     )
+
+
+def _without_crosstalk(normal: F64, right: F64) -> tuple[F64, F64]:
+    """Sums without the terms in proportion to the level, unless these fit the products as well.
+
+    The levels of flats tell little between them and the square: with both free, neither would be
+    significant.
+    """
+    count = len(right)
+    squares = list(range(2 * len(DIRECTIONS), count))
+    constant = list(range(0, squares[0], 2))
+    linear = [n + 1 for n in constant]
+
+    def fall(terms: list[int]) -> float:
+        own = np.ix_(terms, terms)
+        return float(right[terms] @ inverse_normal(normal[own]) @ right[terms])
+
+    kept = sorted(constant + squares)
+    by_squares, by_level = fall(kept), fall(sorted(constant + linear))
+    fewer = 2 * (len(linear) - len(squares))
+    if by_level - fewer > by_squares or fall(list(range(count))) - by_squares > _CROSSTALK:
+        return normal, right
+    return normal[np.ix_(kept, kept)], right[kept]
 
 
 def _noises(evidence: Evidence) -> Iterator[_Noise]:

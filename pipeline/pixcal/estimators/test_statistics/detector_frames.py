@@ -4,14 +4,14 @@ The difference of two frames holds no fixed pattern, only noise: what neighbours
 share of it, at several distances, and how that grows with the level.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.estimators.test_statistics import Curve, family, statistic
-from pixcal.estimators.test_statistics.look import STEPS, neighbour_sums
+from pixcal.estimators.test_statistics.look import ADJACENT, STEPS, neighbour_sums
 from pixcal.kernels.line_means import without_line_means
 from pixcal.model.arrays import F32, F64, Mask
 
@@ -64,12 +64,13 @@ def repeated(evidence: Evidence, kind: str) -> tuple[Stack, ...]:
     return tuple(s for s in stacks if len(s.adu) >= 2)
 
 
-def _neighbours(rest: Iterable[F32], good: Mask) -> F64:
+def _correlation(evidence: Evidence, stacks: Sequence[Stack]) -> F64:
     """Correlation (step,) of pixels some rows and columns apart; lines have their own statistic."""
+    good = evidence.good
     total, pairs = np.zeros(len(STEPS)), np.zeros(len(STEPS))
     square = count = 0.0
-    for steps in rest:
-        steps = without_line_means(steps, good)
+    for stack in stacks:
+        steps = without_line_means(differences(evidence, stack), good)
         sums, number = neighbour_sums(steps, good, STEPS)
         total += sums.sum(axis=1)
         pairs += number.sum(axis=1)
@@ -97,10 +98,9 @@ def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
     order = np.argsort(levels, kind="stable")
     half = len(order) // 2
     dim, bright = (
-        _neighbours((differences(evidence, stacks[n]) for n in own), evidence.good)
-        for own in (order[:half], order[half:])
+        _correlation(evidence, [stacks[n] for n in own]) for own in (order[:half], order[half:])
     )
-    return Curve.numbered(bright - dim)
+    return Curve.numbered((bright - dim)[:ADJACENT])
 
 
 @statistic(
@@ -131,17 +131,34 @@ def bias_change(evidence: Evidence) -> Curve | None:
 KINDS = (("bias",), ("dark",), ("flat",))
 
 
-@family(
-    "{0}_neighbours", KINDS, "noise", "correlation of neighbours in {0} frames", "correlation",
-    x="neighbour", sets=False,
-)  # fmt: skip
-def neighbours(kind: str, evidence: Evidence) -> Curve | None:
-    """Of the differences of two frames."""
+def _neighbours(evidence: Evidence, kind: str) -> F64 | None:
+    """Correlation (step,) in the differences of two frames of a kind."""
     stacks = repeated(evidence, kind)
     if not stacks:
         return None
-    value = _neighbours((differences(evidence, s) for s in stacks), evidence.good)
-    return Curve.numbered(value)
+    return evidence.once("neighbours", kind, make=lambda: _correlation(evidence, stacks))
+
+
+@family(
+    "{0}_neighbours", KINDS, "noise", "correlation of adjacent pixels in {0} frames",
+    "correlation", x="neighbour", sets=False,
+)  # fmt: skip
+def neighbours(kind: str, evidence: Evidence) -> Curve | None:
+    """Of pixels that touch: by itself, for most crosstalk is there."""
+    value = _neighbours(evidence, kind)
+    return None if value is None else Curve.numbered(value[:ADJACENT])
+
+
+@family(
+    "{0}_far_neighbours", KINDS, "noise", "correlation of pixels further apart in {0} frames",
+    "correlation", x="far neighbour", sets=False,
+)  # fmt: skip
+def far_neighbours(kind: str, evidence: Evidence) -> Curve | None:
+    """Of pixels two to four rows or columns apart."""
+    value = _neighbours(evidence, kind)
+    if value is None:
+        return None
+    return Curve(np.arange(ADJACENT, len(STEPS), dtype=float), value[ADJACENT:])
 
 
 @family(

@@ -34,6 +34,7 @@ def chosen_windows(shape: tuple[int, int], frames: int = 0) -> tuple[Part, tuple
     if max(shape) <= LARGEST or 0 < frames * math.prod(shape) <= SAMPLES:
         return whole_of(shape), (whole_of(shape),)
     widest = math.isqrt(SAMPLES // frames) if frames else SIDE
+    on_chunks = widest <= SIDE
 
     def place(share_y: float, share_x: float, wanted: int = SIDE) -> Part:
         spans = []
@@ -41,30 +42,44 @@ def chosen_windows(shape: tuple[int, int], frames: int = 0) -> tuple[Part, tuple
             if size <= LARGEST:
                 share = 0.5
             side = min(max(SIDE, min(wanted, size // 3)), size)
-            # On chunks of the cube, where there are enough to lie apart on.
-            grid = SIDE if size >= APART * SIDE else 1
-            first = min(round((size - side) * share / grid) * grid, size - side)
-            spans.append((first, first + side))
+            first = (size - side) * share
+            if on_chunks:
+                # Of the cube, where there are enough to lie apart on.
+                grid = SIDE if size >= APART * SIDE else 1
+                first = min(round(first / grid) * grid, size - side)
+            elif share != 0.5:
+                # Leave the third in the middle free.
+                outer = max(size // 3 - side, 0)
+                first = min(first, outer) if share < 0.5 else max(first, size - side - outer)
+            spans.append((round(first), round(first) + side))
         return spans[0], spans[1]
 
-    middle = place(0.5, 0.5)
     corners = ((0.1, 0.1), (0.1, 0.9), (0.9, 0.1), (0.9, 0.9))
     # All of them have as many samples as the one in the middle.
     tried = tuple(sorted({place(y, x, widest // 2) for y, x in corners}))
+    return _widened(place(0.5, 0.5), widest**2, shape, tried), tried
+
+
+def _widened(middle: Part, pixels: int, shape: tuple[int, int], tried: tuple[Part, ...]) -> Part:
+    """The window in the middle, with so many pixels if there is room between the others."""
     rows, columns = (
-        _widened(own, widest, (a[1], b[0]) if a != b else (0, size))
-        for own, size, a, b in zip(middle, shape, tried[0], tried[-1], strict=True)
+        (a[1], b[0]) if a != b else (0, size)
+        for a, b, size in zip(tried[0], tried[-1], shape, strict=True)
     )
-    return (rows, columns), tried
+    high = _grown(middle[0], math.isqrt(pixels), rows)
+    # Between windows above and below, rows are free from end to end.
+    free = tried[0][0][1] <= high[0] and high[1] <= tried[-1][0][0]
+    beside = (0, shape[1]) if free else columns
+    return high, _grown(middle[1], pixels // (high[1] - high[0]), beside)
 
 
-def _widened(span: tuple[int, int], side: int, room: tuple[int, int]) -> tuple[int, int]:
-    """Rows or columns in the middle of some room, of a side, if they are more than these."""
-    side = min(side, room[1] - room[0])
-    if side <= span[1] - span[0]:
+def _grown(span: tuple[int, int], size: int, room: tuple[int, int]) -> tuple[int, int]:
+    """Rows or columns in the middle of some room, of a size, if they are more than these."""
+    size = min(size, room[1] - room[0])
+    if size <= span[1] - span[0]:
         return span
-    first = (room[0] + room[1] - side) // 2
-    return first, first + side
+    first = (room[0] + room[1] - size) // 2
+    return first, first + size
 
 
 def whole_of(shape: tuple[int, int]) -> Part:
