@@ -13,6 +13,7 @@ import numpy as np
 from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.sample_sums import frame_means
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 
@@ -54,15 +55,24 @@ class Ladder:
 
 def light_of(evidence: Evidence, stack: Stack) -> F64:
     """Mean (t,) of the good pixels in each frame without bias and dark signal, e-."""
+    return evidence.once("light", *stack.key, make=lambda: _light_of(evidence, stack))
+
+
+def _light_of(evidence: Evidence, stack: Stack) -> F64:
     good = evidence.good
     dark = evidence.gain * evidence.bias[good].mean()
     if np.isfinite(stack.exptime_s):
         dark += evidence.dark_rate[good].mean() * stack.exptime_s
-    return np.asarray(stack.adu[:, good].mean(axis=1, dtype=float) * evidence.gain - dark)
+    return np.asarray(frame_means(stack.adu, good) * evidence.gain - dark)
 
 
 def level_before(stack: Stack, evidence: Evidence) -> float:
     """Level (e-) of the frame before a series; zero where time stamps do not tell which it is."""
+    own = "level before", *stack.key
+    return evidence.once(*own, make=lambda: _level_before(stack, evidence))
+
+
+def _level_before(stack: Stack, evidence: Evidence) -> float:
     start = stack.start_s + stack.time_s[0]
     earlier = [
         (float(times[times < start].max()), n)
@@ -71,8 +81,8 @@ def level_before(stack: Stack, evidence: Evidence) -> float:
     ]
     if not earlier:
         return 0.0
-    frame = evidence.stacks[max(earlier)[1]].adu[-1]
-    return max(float((frame - evidence.bias)[evidence.good].mean()) * evidence.gain, 0.0)
+    last = frame_means(evidence.stacks[max(earlier)[1]].adu[-1:], evidence.good)[0]
+    return max(float(last - evidence.bias[evidence.good].mean()) * evidence.gain, 0.0)
 
 
 def warming(evidence: Evidence) -> tuple[float, float]:

@@ -29,7 +29,8 @@ _STANDS_IN = (0.5, -0.5, 0.0)  # the next code, the one before, either: threshol
 def missing_codes(counts: F64) -> I64:
     """Codes that never come up in ``counts`` (code,) though some just below and just above do."""
     padded = np.pad(counts, _NEAR)
-    beside = sliding_window_view(padded, _NEAR).max(axis=1)
+    count = len(padded) - _NEAR + 1
+    beside = np.maximum.reduce([padded[n : n + count] for n in range(_NEAR)])
     below, above = beside[: len(counts)], beside[_NEAR + 1 :]
     return np.flatnonzero((counts == 0) & (np.minimum(below, above) > POPULATED))
 

@@ -133,6 +133,11 @@ def _is_enough(stack: Stack) -> bool:
 
 
 def _of_stack(stack: Stack, evidence: Evidence) -> F64 | None:
+    own = "photon transfer of a stack", *stack.key
+    return evidence.once(*own, make=lambda: _products_of(stack, evidence))
+
+
+def _products_of(stack: Stack, evidence: Evidence) -> F64 | None:
     good = evidence.good & (stack.adu < evidence.saturation_adu).all(axis=0)
     pixels = np.count_nonzero(good)
     if pixels < MIN_PIXELS:
@@ -145,12 +150,12 @@ def _of_stack(stack: Stack, evidence: Evidence) -> F64 | None:
     pattern = np.where(good, pattern, 0).astype(np.float32)
     usual = pattern * max(float(level[good].mean() / pattern[good].mean()), 0.0)
     noise = usual + np.float32(evidence.read_noise**2)
-    more = (frames - level) * (pattern / noise)
-    change = more[:, good].sum(axis=1) / (pattern**2 / noise).sum()
-    brighter = change[:, None, None] * pattern
+    frames -= level
+    more = np.einsum("tyx,yx->t", frames, pattern / noise)
+    brighter = (more / (pattern**2 / noise).sum())[:, None, None] * pattern
     ones = np.ones(level.shape)
     # Few frames are no average of what every second row has in common.
-    residual = without_line_means(frames - level - brighter, good)
+    residual = without_line_means(frames - brighter, good)
     return residual_sums(
         residual, usual + brighter, ones, evidence.read_noise**2 * ones, good,
         np.ones((len(frames), 1)), (noise / len(frames))[None], np.full(len(STEPS), 1 / pixels),

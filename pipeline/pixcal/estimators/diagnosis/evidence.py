@@ -126,6 +126,11 @@ class Stack:
         """Exposure time (s, negative when unknown) and step of the lamp."""
         return (float(np.nan_to_num(self.exptime_s, nan=-1.0)), self.step)
 
+    @property
+    def key(self) -> tuple[str, float, int]:
+        """Kind and level, by which the stacks of an acquisition are told apart."""
+        return self.kind, *self.level
+
 
 @dataclass(frozen=True)
 class Evidence:

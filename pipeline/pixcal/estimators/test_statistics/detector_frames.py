@@ -13,6 +13,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.estimators.test_statistics import Curve, family, statistic
 from pixcal.estimators.test_statistics.look import ADJACENT, STEPS, neighbour_sums
 from pixcal.kernels.line_means import without_line_means
+from pixcal.kernels.sample_sums import frame_means
 from pixcal.model.arrays import F32, F64, Mask
 
 of_noise = partial(statistic, "noise")
@@ -24,21 +25,20 @@ BANDS = 4  # of the spectrum, from the size of the window to two pixels
 
 def differences(evidence: Evidence, stack: Stack) -> F32:
     """Differences (t, y, x) of frames 0 and 1, 2 and 3, ..., over their noise; outliers zero."""
-    own = "differences", stack.kind, int(stack.frame[0])
-    return evidence.once(*own, make=lambda: _differences(evidence, stack))
+    return evidence.once("differences", *stack.key, make=lambda: _differences(evidence, stack))
 
 
 def _differences(evidence: Evidence, stack: Stack) -> F32:
     light = stack.adu - evidence.bias.astype(np.float32)
     good = evidence.good
     if stack.kind == "flat":
-        means = light[:, good].mean(axis=1)
-        light = light * (means.mean() / means)[:, None, None].astype(np.float32)
+        means = frame_means(light, good)
+        light *= (means.mean() / means)[:, None, None].astype(np.float32)
     count = len(light) // 2 * 2
     steps = light[1:count:2] - light[:count:2]
     if stack.kind == "flat":
         steps = _without_gradient(steps, evidence)
-    steps -= steps[:, good].mean(axis=1)[:, None, None]
+    steps -= frame_means(steps, good)[:, None, None].astype(np.float32)
     # Root mean squares: medians of whole numbers jump.
     rest = steps / np.sqrt((steps[:, good] ** 2).mean())
     rest[np.abs(rest) > WILD] = 0
@@ -48,12 +48,18 @@ def _differences(evidence: Evidence, stack: Stack) -> F32:
 def _without_gradient(steps: F32, evidence: Evidence) -> F32:
     """Differences (t, y, x) of flats without what a change of the light's gradient does."""
     # Of the sky it turns from frame to frame; the lamp is no part of the detector.
+    basis = evidence.once("gradient of the light", make=lambda: _gradient(evidence))
+    flat = steps.reshape(len(steps), -1)
+    return np.asarray((flat - flat @ basis @ basis.T).reshape(steps.shape))
+
+
+def _gradient(evidence: Evidence) -> F32:
+    """Light and its gradient, orthonormal (pixel, 3)."""
     ny, nx = evidence.good.shape
     y, x = np.linspace(-1, 1, ny)[:, None], np.linspace(-1, 1, nx)
     lit = np.where(evidence.good, evidence.flat, 0)
-    basis = np.linalg.qr(np.stack([lit, lit * y, lit * x]).reshape(3, -1).T)[0].astype(np.float32)
-    flat = steps.reshape(len(steps), -1)
-    return np.asarray((flat - flat @ basis @ basis.T).reshape(steps.shape))
+    terms = np.stack([lit, lit * y, lit * x]).reshape(3, -1)
+    return np.asarray(np.linalg.qr(terms.T)[0], np.float32)
 
 
 def repeated(evidence: Evidence, kind: str) -> tuple[Stack, ...]:
@@ -66,17 +72,23 @@ def repeated(evidence: Evidence, kind: str) -> tuple[Stack, ...]:
 
 def _correlation(evidence: Evidence, stacks: Sequence[Stack]) -> F64:
     """Correlation (step,) of pixels some rows and columns apart; lines have their own statistic."""
+
+    def sums(stack: Stack) -> F64:
+        own = "neighbours", *stack.key
+        return evidence.once(*own, make=lambda: _neighbour_sums(evidence, stack))
+
+    total, pairs, square, count = sum(map(sums, stacks), np.zeros((4, len(STEPS))))
+    return np.asarray(total / np.maximum(pairs, 1) / (square / np.maximum(count, 1)))
+
+
+def _neighbour_sums(evidence: Evidence, stack: Stack) -> F64:
+    """Sums (4, step): of products with neighbours, their number; of squares, and theirs."""
     good = evidence.good
-    total, pairs = np.zeros(len(STEPS)), np.zeros(len(STEPS))
-    square = count = 0.0
-    for stack in stacks:
-        steps = without_line_means(differences(evidence, stack), good)
-        sums, number = neighbour_sums(steps, good, STEPS)
-        total += sums.sum(axis=1)
-        pairs += number.sum(axis=1)
-        square += float((steps.astype(float) ** 2).sum())
-        count += len(steps) * np.count_nonzero(good)
-    return np.asarray(total / np.maximum(pairs, 1) / (square / max(count, 1)))
+    steps = without_line_means(differences(evidence, stack), good)
+    sums, number = neighbour_sums(steps, good, STEPS)
+    square = np.full(len(STEPS), np.einsum("tyx,tyx->", steps, steps, dtype=float))
+    count = np.full(len(STEPS), len(steps) * np.count_nonzero(good))
+    return np.stack([sums.sum(axis=1), number.sum(axis=1), square, count])
 
 
 def _repeats(rest: F32, good: Mask, axis: int) -> F64:
@@ -134,9 +146,7 @@ KINDS = (("bias",), ("dark",), ("flat",))
 def _neighbours(evidence: Evidence, kind: str) -> F64 | None:
     """Correlation (step,) in the differences of two frames of a kind."""
     stacks = repeated(evidence, kind)
-    if not stacks:
-        return None
-    return evidence.once("neighbours", kind, make=lambda: _correlation(evidence, stacks))
+    return _correlation(evidence, stacks) if stacks else None
 
 
 @family(

@@ -53,6 +53,10 @@ def photon_transfer(evidence: Evidence) -> Curve:
 
 
 def _noise_of_flats(evidence: Evidence) -> F64:
+    return evidence.once("noise of the flats", make=lambda: _measured_noise_of_flats(evidence))
+
+
+def _measured_noise_of_flats(evidence: Evidence) -> F64:
     values = []
     for stack in evidence.ladder if evidence.has_level else ():
         if len(stack.adu) < 2:

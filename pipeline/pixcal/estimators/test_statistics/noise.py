@@ -17,7 +17,7 @@ from pixcal.estimators.test_statistics.look import (
     neighbour_sums_by_level,
 )
 from pixcal.kernels.robust import robust_sigma
-from pixcal.kernels.sample_sums import count_beyond
+from pixcal.kernels.sample_sums import count_beyond, frame_means
 from pixcal.model.arrays import F32, F64, Mask
 
 of_noise = partial(statistic, "noise")
@@ -124,7 +124,7 @@ def lines(look: Look) -> Curve:
 def _calm(frames: F32, good: Mask) -> F32:
     """Frames less the mean of each pixel and of each frame, over the noise; outliers zero."""
     rest = frames - frames.mean(axis=0)
-    rest -= rest[:, good].mean(axis=1)[:, None, None]
+    rest -= frame_means(rest, good)[:, None, None].astype(np.float32)
     spread = robust_sigma(rest[:, good]) or 1.0
     rest = rest / np.float32(spread)
     rest[np.abs(rest) > 8] = 0
@@ -191,7 +191,8 @@ def read_noise(evidence: Evidence) -> Curve | None:
     if (stacks[0].adu[:, evidence.good] == 0).mean() > CUT_OFF:
         return None
     # Of whole numbers a median jumps by a code.
-    frames = stacks[0].adu - stacks[0].adu[:, evidence.good].mean(axis=1)[:, None, None]
+    level = frame_means(stacks[0].adu, evidence.good).astype(np.float32)
+    frames = stacks[0].adu - level[:, None, None]
     variance = np.var(frames, axis=0, ddof=1) * (evidence.gain / evidence.read_noise) ** 2
     counted = evidence.good | jumping(frames)
     return Curve(np.array(QUANTILES), ranges_about(variance[counted], QUANTILES))
@@ -200,9 +201,12 @@ def read_noise(evidence: Evidence) -> Curve | None:
 def jumping(frames: F32) -> Mask:
     """Pixels (y, x) of frames (t, y, x) that stay at a level, or whose noise has a flat top."""
     off = frames - frames.mean(axis=0)
-    square = np.maximum((off**2).mean(axis=0), STILL)
-    steps = (np.diff(off, axis=0) ** 2).mean(axis=0) / (2 * square)
-    peak = (off**4).mean(axis=0) / square**2 - 3
+    steps = (np.diff(off, axis=0) ** 2).mean(axis=0)
+    off *= off
+    square = np.maximum(off.mean(axis=0), STILL)
+    steps /= 2 * square
+    off *= off  # numpy takes a fourth power by logarithms
+    peak = off.mean(axis=0) / square**2 - 3
     error = 1 / np.sqrt(len(frames))
     return np.asarray((steps < 1 - 2 * error) | (peak < -2 * np.sqrt(24) * error))
 
