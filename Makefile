@@ -104,6 +104,9 @@ sensors: $(INSTALLED) ## all kinds of simulated cameras without fringes, diagnos
 power: $(INSTALLED) ## from which strength on the diagnosis names each effect, and false causes, into work/ (hours)
 	$(BIN)/python benchmarks/power.py
 
+errors: $(INSTALLED) ## measured parameters of every effect against the truth, over their errors, into work/ (an hour)
+	$(BIN)/python benchmarks/errors.py --draws 40
+
 effect-pictures: $(INSTALLED) ## what every effect does to the offsets, for docs/reference/effects (two minutes)
 	$(BIN)/python benchmarks/effect_pictures.py
 

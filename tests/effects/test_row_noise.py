@@ -69,7 +69,7 @@ def test_rows_and_columns_move_as_a_whole(make_effect_bench: Callable[..., Bench
         ((0.6, 0.0, 0.0, 0.6, 0.0), (0.3, 0.2, 0.2, 0.2, 0.5)),
         ((0.0, 1.0, 1.0, 0.0, 0.0), (0.5, 0.06, 0.15, 0.4, 0.6)),
         ((8.0, 3.0, 5.0, 4.0, 0.0), (0.6, 0.3, 0.8, 0.2, 2.0)),
-        ((0.0, 0.0, 0.0, 0.0, 3.0), (0.5, 0.2, 0.2, 0.4, 0.2)),
+        ((0.0, 0.0, 0.0, 0.0, 3.0), (0.5, 0.25, 0.2, 0.4, 0.2)),
     ],
 )
 def test_sizes_are_found(
@@ -83,9 +83,9 @@ def test_sizes_are_found(
     assert found.significance > 5
     for name, value, error in zip(NAMES, given, errors, strict=True):
         assert found.errors[name] < error, name
-        # Of variances the errors are alike on both sides, near zero too.
-        size = getattr(found.effect, name)
-        error = (size + found.errors[name]) ** 2 - size**2
+        # Of variances the errors are alike on both sides; of their roots the longer side is given.
+        size, longer = getattr(found.effect, name), found.errors[name]
+        error = longer * (2 * size - longer if longer < size else 2 * size + longer)
         assert abs(size**2 - value**2) < 4 * error, name
 
 

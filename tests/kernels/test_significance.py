@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pixcal.kernels.significance import sigmas_of_best, sigmas_of_chi2, sigmas_of_count
+from pixcal.kernels.significance import (
+    root_with_error,
+    sigmas_of_best,
+    sigmas_of_chi2,
+    sigmas_of_count,
+)
 
 RNG = np.random.default_rng(4)
 
@@ -35,3 +40,21 @@ def test_of_counts() -> None:
     assert sigmas_of_count(0, 1e-4) == pytest.approx(0, abs=1e-3)
     assert sigmas_of_count(1, 1e-3) < 4 < sigmas_of_count(2, 1e-3)
     assert np.isfinite(sigmas_of_count(5000, 1e-6))
+
+
+@pytest.mark.parametrize("true", [0.0, 0.5, 3.0, 300.0])
+def test_root_of_a_variance_lies_within_its_error_two_times_in_three(true: float) -> None:
+    """Near zero more often: the interval has a longer side."""
+    root, error = root_with_error(true + RNG.standard_normal(20_000), 1.0)
+    within = float(np.mean(np.abs(root - np.sqrt(true)) <= error))
+    assert 0.68 - 0.01 < within < 0.95
+    if true > 100:
+        assert within == pytest.approx(0.683, abs=0.015)
+        assert error.mean() == pytest.approx(1 / (2 * np.sqrt(true)), rel=0.01)
+
+
+def test_error_of_a_root_downwards_may_differ() -> None:
+    root, error = root_with_error(9.0, 7.0, 8.0)
+    assert (root, error) == (3.0, 2.0)
+    assert root_with_error(9.0, 16.0, 5.0)[1] == pytest.approx(2.0)
+    assert root_with_error(-1.0, 4.0) == (0.0, 2.0)

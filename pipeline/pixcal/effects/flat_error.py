@@ -22,6 +22,7 @@ from pixcal.estimators.maps.map_fit import (
 from pixcal.kernels.beams import LightMaps
 from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.scene import TILE, DetectorMaps, Rows, chip_map
+from pixcal.kernels.significance import root_with_error
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.bench import SimulatedDetector
 from pixcal.model.config import quantity
@@ -40,6 +41,9 @@ WIDEST = 4
 STEP = 0.1  # of the logarithm of the scales that are tried
 # windows are this many times as wide as scales of which a parabola takes nothing that matters
 NARROW = 12
+# error of the radians of a wave over the window; larger where the window is less than so many times
+# as wide as the scale: there it depends on where few crests lie, and a parabola takes much
+APART, FEW_APART, FEW = 0.5, 2.0, 10
 DIRECTIONS = 16  # of longer waves, whose ring has no more places
 EDGE = 0.02  # of the template's highest power, beyond which the ring ends
 _PARABOLA = 2
@@ -124,7 +128,7 @@ class FlatError(Effect):
         all_of_it, neighbours = near[0][good], ((4 * near[1] - near[2]) / 3)[good]
         alone = float((all_of_it - neighbours).std() / np.sqrt(weight))
         smooth, noise, smooth_error = _smooth(neighbours, ring)
-        rms, errors = _roots(
+        rms, errors = root_with_error(
             np.array([all_of_it.mean() - smooth, smooth]),
             np.array([np.hypot(alone, noise), smooth_error]),
         )
@@ -192,12 +196,6 @@ def _smooth(neighbours: F64, ring: "Ring") -> tuple[float, float, float]:
     return variance, noise, float(np.hypot(noise, ring.error))
 
 
-def _roots(variances: F64, errors: F64) -> tuple[F64, F64]:
-    """Standard deviations and their errors from variances and theirs."""
-    rms = np.sqrt(np.maximum(variances, 0))
-    return rms, errors / (2 * np.maximum(rms, np.sqrt(errors)))
-
-
 @dataclass(frozen=True)
 class Ring:
     """Waves of one length that two maps share."""
@@ -235,10 +233,17 @@ def ring_power(power: F64) -> Ring:
     # is longer or shorter than the window tells.
     width = float(np.sqrt(2 * ((rows[2] * (data - design @ projected)) ** 2).sum()))
     scale = float(scales[best] * np.exp(np.clip(projected[2], -STEP, STEP)))
-    width = float(np.hypot(width, scale / (2 * min(shape))))
+    apart = FEW_APART if scale * FEW > min(shape) else APART
+    width = min(float(np.hypot(width, apart * scale / min(shape))), 0.75)
+    # Of the wavelength; longer ones are further away than shorter ones.
+    width /= 1 - width
     # Of the variance that there should be, and that may well be the larger.
     draws = min(float(np.sqrt(2 / modes)), 0.75)
     error = float(np.hypot(noise, variance * draws / (1 - draws)))
+    # Of longer waves a parabola takes more.
+    places = np.clip([best - width / STEP, best + width / STEP], 0, len(scales) - 1)
+    ends = [_sum_of_ring(data, templates[int(n)])[0] for n in np.rint(places)]
+    error = float(np.hypot(error, np.mean(np.abs(np.array(ends) - variance))))
     return Ring(variance, noise, error, scale, scale * width)
 
 

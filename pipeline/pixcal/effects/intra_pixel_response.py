@@ -14,7 +14,7 @@ from pixcal.kernels import optics
 from pixcal.kernels.beams import LightMaps
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.scene import TILE, DetectorMaps, Rows, chip_map, geometry
-from pixcal.kernels.significance import SIGNIFICANT
+from pixcal.kernels.significance import SIGNIFICANT, root_with_error
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
@@ -95,16 +95,15 @@ class IntraPixelResponse(Effect):
             return None
         k = np.array([f.k for f in sets])
         square, error = _width(k, np.array([_log_visibility(f) for f in sets]))
-        width = float(np.sqrt(np.clip(square, 0, 9)))
+        width, width_error = map(float, root_with_error(min(square, 9.0), error))
         scatter, its_error, shared = _scatter(sets, max(width, 0.5), _bias_variance(evidence))
-        rms = float(np.sqrt(max(scatter, 0.0)))
-        width_error = error / (2 * max(width, np.sqrt(error)))
+        rms, rms_error = map(float, root_with_error(scatter, its_error))
         return Estimate(
             cls((width, width), min(rms, 0.5)),
             {
-                "width_px[0]": float(width_error),
-                "width_px[1]": float(width_error),
-                "width_rms_px": float(its_error / (2 * max(rms, np.sqrt(its_error)))),
+                "width_px[0]": width_error,
+                "width_px[1]": width_error,
+                "width_rms_px": rms_error,
             },
             # Pairs of fibres of other powers have another visibility, which is nominal.
             float(scatter / its_error),

@@ -14,7 +14,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.variance_components import walk_modes
 from pixcal.kernels.processes import brownian
 from pixcal.kernels.robust import robust_sigma
-from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best, sigmas_of_chi2
+from pixcal.kernels.significance import SIGNIFICANT, root_with_error, sigmas_of_best, sigmas_of_chi2
 from pixcal.kernels.synthesis import walk_normals
 from pixcal.model.arrays import F32, F64, Indices, Mask
 from pixcal.model.config import quantity
@@ -94,8 +94,7 @@ class OutputJitter(Effect):
         if found is None:
             return None
         size, error = np.array([found.size, found.error]) * [1.0, HOUR_S]
-        rms = np.sqrt(np.maximum(size, 0))
-        above = np.sqrt(np.maximum(size, 0) + error) - rms
+        rms, rms_error = root_with_error(size, error)
         rows, columns = (
             tuple(int(edge) + first for edge in edges)
             for edges, first in zip(
@@ -104,7 +103,7 @@ class OutputJitter(Effect):
         )
         return Estimate(
             cls(float(rms[0]), min(float(rms[1]), 1e6), rows, columns),
-            dict(zip(cls.strengths, above.tolist(), strict=True)),
+            dict(zip(cls.strengths, rms_error.tolist(), strict=True)),
             found.sigmas,
             "steps between outputs that change in each frame without light",
             {"white_e2": found.size[0], "walk_e2_s": found.size[1]},

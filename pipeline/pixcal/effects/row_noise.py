@@ -13,7 +13,7 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.processes import flicker, flicker_power
-from pixcal.kernels.significance import sigmas_of_best
+from pixcal.kernels.significance import root_with_error, sigmas_of_best
 from pixcal.model.arrays import F32, F64, I64, Mask
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
@@ -233,10 +233,8 @@ class LineVariances:
 
     @property
     def roots(self) -> tuple[F64, F64]:
-        """Standard deviations, and their errors: upwards, for near zero the two sides differ."""
-        size = np.maximum(self.size, 0.0)
-        above = np.sqrt(size + np.sqrt(np.diag(self.covariance)))
-        return np.sqrt(size), above - np.sqrt(size)
+        """Standard deviations, and their errors."""
+        return root_with_error(self.size, np.sqrt(np.diag(self.covariance)))
 
 
 def fit_lines(spectra: Sequence[LineSpectrum], shapes: Sequence[F64]) -> LineVariances:

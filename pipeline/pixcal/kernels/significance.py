@@ -3,11 +3,28 @@
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import chdtrc, gammainc, gammaln, log_ndtr, ndtri_exp, xlogy
+
+from pixcal.model.arrays import F64
 
 # standard deviations from which an estimate or a part of its law is taken for real
 SIGNIFICANT = 4.0
 _LARGE = 1000.0
+
+
+def root_with_error(
+    variance: ArrayLike, error: ArrayLike, below: ArrayLike | None = None
+) -> tuple[F64, F64]:
+    """Standard deviations, and the longer side of their one-sigma intervals.
+
+    ``variance``: as measured, below zero where little is there. ``error``: of it; downwards
+    ``below``, if that differs.
+    """
+    there = np.maximum(variance, 0.0)
+    root = np.sqrt(there)
+    low = np.sqrt(np.maximum(there - (error if below is None else below), 0.0))
+    return root, np.maximum(np.sqrt(there + error) - root, root - low)
 
 
 def sigmas_of_chi2(value: float, dof: int) -> float:

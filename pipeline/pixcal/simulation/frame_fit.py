@@ -364,7 +364,10 @@ class _Fit:
             else:
                 size = max(float(found.size[n]), 0.0)
                 rough = size * self.basis.rough(s, self.shapes.get(s.field), found)
-                error = s.value(size + float(np.hypot(found.above(n), rough))) - s.value(size)
+                more = size + float(np.hypot(found.above(n), rough))
+                less = size - float(np.hypot(np.sqrt(found.covariance[n, n]), rough))
+                here = s.value(size)
+                error = max(s.value(more) - here, here - s.value(max(less, 0.0)))
             # What it owes to shape parameters that it was found with.
             owed = [
                 profile.slope([self._value(s, side) for side in profile.sides])

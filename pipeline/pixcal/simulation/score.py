@@ -20,6 +20,7 @@ from scipy.special import log_ndtr
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.variance_components import log_chance, log_chance_of_any, sigmas
 from pixcal.kernels.normal_matrix import inverse_normal
+from pixcal.kernels.significance import root_with_error
 from pixcal.model.arrays import F64
 from pixcal.simulation.changes import LINEAR, Changes, Key, Template, Way
 from pixcal.simulation.forward import ForwardModel, field_of, numbers, with_numbers
@@ -202,8 +203,8 @@ class _Fit:
         values, errors, usual = {}, {}, numbers(shape)
         for name, a, da in zip(self.strengths, size, error, strict=True):
             values[name] = float(usual[name] * np.sign(a) * abs(a) ** power)
-            above = (max(a, 0.0) + da) ** power - max(a, 0.0) ** power
-            errors[name] = float(abs(usual[name]) * (above if self.way.random else da))
+            error = root_with_error(a, da)[1] if self.way.random else da
+            errors[name] = float(abs(usual[name]) * error)
         return with_numbers(shape, values), {n: e for n, e in errors.items() if e > 0}
 
     def _fitted(

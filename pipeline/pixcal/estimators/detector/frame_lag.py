@@ -16,6 +16,7 @@ from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.frame_order import follows
 from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.significance import root_with_error
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 # of the phase that pixels are free to have, so that a bent response is not taken for lag
@@ -69,10 +70,10 @@ class Uneven:
         """Relative spread of the shares about the mean one, and its error."""
         if share <= 0:
             return 0.0, 1.0
-        rms, scale = self.rms(keep, share), self._scale(keep, share)
-        spread = rms / share
-        error = self.error * scale**2 / (2 * max(rms, np.sqrt(self.error) * scale))
-        return spread, float(np.hypot(error, spread * share_error) / share)
+        rms, error = root_with_error(self.square, self.error)
+        relative = self._scale(keep, share) / share
+        spread = float(rms * relative)
+        return spread, float(np.hypot(error * relative, spread * share_error / share))
 
     @staticmethod
     def _scale(keep: float, share: float) -> float:

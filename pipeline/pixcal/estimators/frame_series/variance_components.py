@@ -17,6 +17,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtri_exp
 
 from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
+from pixcal.kernels.significance import root_with_error
 from pixcal.model.arrays import F64, Mask
 
 MAX_STEPS = 60
@@ -101,8 +102,9 @@ class Components:
 
     def root(self, part: int) -> tuple[float, float]:
         """Standard deviation of a part, and its error by `above`."""
-        value = max(float(self.size[part]), 0.0)
-        return float(np.sqrt(value)), float(np.sqrt(value + self.above(part)) - np.sqrt(value))
+        below = float(np.sqrt(self.covariance[part, part]))
+        root, error = root_with_error(self.size[part], self.above(part), below)
+        return float(root), float(error)
 
     def shape_covariance(self, uncertain: Sequence[int]) -> F64:
         """Covariance (p, p) of ``beta``: by simulation, a third at the limits of the sizes."""
