@@ -6,9 +6,9 @@ search::
 
     python benchmarks/errors.py --draws 8 --out errors.jsonl [EFFECT ...]
 
-Prints by effect how many parameters lie within one error (68 % of true ones), and the largest
-deviation. ``--out`` keeps a line of JSON for each acquisition; an interrupted study goes on where
-it stopped.
+Prints by kind of effect how many parameters lie within one error (68 % of true ones), and the
+largest deviation. ``--out`` keeps a line of JSON for each acquisition; an interrupted study goes on
+where it stopped.
 """
 
 import argparse
@@ -32,9 +32,9 @@ from pixcal.model.config import to_plain
 from pixcal.stages.evidence import load_evidence
 from power import bench
 
+PAGE = Path(__file__).parents[1] / "docs/appendix/errors.md"
 # words in the names of parameters that are roots of measured variances
 ROOTS = ("rms", "walk", "jitter", "vibration", "polarisation", "spread", "width_px", "amplitude")
-FAR = 5.0  # errors beyond which no parameter should be
 Case = tuple[int, float, int]  # number of the variant, strength over its threshold, draw
 
 
@@ -55,52 +55,52 @@ def examine(case: Case) -> dict[str, Any]:
             step(run)
         found = known_effects()[variant.effect].estimate(load_evidence(run))
     if found is None:
-        return marks | {"sigmas": None, "parameters": {}}
+        return marks | {"sigmas": None, "by_law": False, "parameters": {}}
     checks = check_parameters(variant.effect, true, to_plain(found.effect), found.errors)
     parameters = {c.name: [c.true, c.estimate, c.error] for c in checks if c.error > 0}
-    return marks | {"sigmas": found.significance, "parameters": parameters}
+    marks |= {"sigmas": found.significance, "by_law": bool(found.law)}
+    return marks | {"parameters": parameters}
 
 
 def deviation(name: str, true: float, estimate: float, error: float) -> float:
-    """Of a parameter, over its error; of standard deviations that of the variance."""
-    if not any(word in name for word in ROOTS):
+    """Of a parameter, over its error; of a variance that is nothing, not of its root."""
+    if true or not any(word in name for word in ROOTS):
         return (estimate - true) / error
     # The error is the longer side of the root of the variance's interval.
-    ends = (estimate - error, estimate) if error < estimate else (estimate, estimate + error)
-    return (estimate**2 - true**2) / (ends[1] ** 2 - ends[0] ** 2)
+    low, high = (estimate - error, estimate) if error < estimate else (estimate, estimate + error)
+    return estimate**2 / (high**2 - low**2)
 
 
-def deviations(results: Sequence[dict[str, Any]]) -> dict[str, list[float]]:
-    """By parameter; without those that are at zero and measured there."""
-    found: dict[str, list[float]] = {}
-    for one in results:
-        for name, (true, estimate, error) in one["parameters"].items():
-            if true or estimate:
-                found.setdefault(name, []).append(deviation(name, true, estimate, error))
-    return found
+def deviations(results: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
+    """Of all parameters, with their names; without those that are at zero and measured there.
+
+    Nor those that another law describes, whose own parameters differ from zero.
+    """
+    return [
+        (deviation(name, true, estimate, error), name)
+        for one in results
+        for name, (true, estimate, error) in one["parameters"].items()
+        if estimate or (true and not one["by_law"])
+    ]
 
 
 def table(results: Sequence[dict[str, Any]]) -> str:
-    """Markdown, by variant."""
-    lines = ["| effect | parameter | values | within one error | rms | largest, errors |"]
-    lines.append("|---" * 6 + "|")
-    every: list[float] = []
+    """Markdown, by kind of effect."""
+    lines = ["| effect | values | within one error | rms | largest, errors |"]
+    lines.append("|---" * 5 + "|")
     for number in sorted({r["variant"] for r in results}):
         own = [r for r in results if r["variant"] == number]
-        title = f"{own[0]['effect']}: {own[0]['strength']}"
-        for name, off in deviations(own).items():
-            every += off
-            lines.append(f"| {title} | {name} | {_cells(off)} |")
-    far = sum(abs(d) > FAR for d in every)
-    return "\n".join([*lines, f"| all | {far} beyond {FAR:g} | {_cells(every)} |"])
+        lines.append(_row(f"{own[0]['effect']}: {own[0]['strength']}", deviations(own)))
+    return "\n".join([*lines, _row("all", deviations(results))])
 
 
-def _cells(off: Sequence[float]) -> str:
-    size = np.abs(off)
-    if not size.size:
-        return "0 | | |"
+def _row(title: str, off: Sequence[tuple[float, str]]) -> str:
+    if not off:
+        return f"| {title} | 0 | | | |"
+    size = np.abs([value for value, _ in off])
+    largest = off[int(np.argmax(size))][1]
     within, rms = 100 * (size <= 1).mean(), np.sqrt((size**2).mean())
-    return f"{size.size} | {within:.0f} % | {rms:.2f} | {size.max():.1f}"
+    return f"| {title} | {len(off)} | {within:.0f} % | {rms:.2f} | {size.max():.1f} (`{largest}`) |"
 
 
 def main() -> None:
@@ -112,6 +112,7 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=8, help="of each variant")
     parser.add_argument("--times", type=float, default=5.0, help="strength over the threshold")
     parser.add_argument("--out", type=Path, default=Path("work", "errors.jsonl"))
+    parser.add_argument("--write", action="store_true", help="write docs/appendix/errors.md")
     options = parser.parse_args()
     cases: list[Case] = [
         (n, options.times, draw)
@@ -133,6 +134,11 @@ def main() -> None:
         runtime = Runtime(cluster="processes", quiet=False)
         run_tasks(examine, pending, runtime, label="acquisitions", done=keep)
     print(table(results))
+    if options.write:
+        text = PAGE.read_text(encoding="utf-8")
+        head, rest = text[: text.index("| effect |")], text[text.index("| all |") :]
+        rest = rest.partition("\n")[2]
+        PAGE.write_text(f"{head}{table(results)}\n{rest}", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -2,27 +2,28 @@
 
 import json
 
-import numpy as np
 import pytest
 
 import errors
 from pixcal.kernels.significance import root_with_error
 
 
-def test_deviation_of_a_root_is_that_of_its_variance() -> None:
-    for variance, true in ((9.0, 1.0), (2.0, 0.0), (400.0, 390.0)):
+def test_deviation_of_nothing_is_that_of_the_variance() -> None:
+    for variance in (1.5, 9.0, 400.0):
         root, error = map(float, root_with_error(variance, 1.0))
-        found = errors.deviation("row_rms", np.sqrt(true), root, error)
-        assert found == pytest.approx(variance - true)
+        assert errors.deviation("row_rms", 0.0, root, error) == pytest.approx(variance)
     assert errors.deviation("quadratic", 1.0, 1.5, 0.25) == pytest.approx(2.0)
 
 
 def test_table_counts_values_and_the_largest_deviation() -> None:
-    marks = {"variant": 0, "effect": "lag", "strength": "share"}
+    marks = {"variant": 0, "effect": "lag", "strength": "share", "by_law": False}
     off = [{"share": [1.0, 1.0 + n / 20, 0.1], "decay_frames": [0, 0, 1]} for n in (0, 1, 12)]
     printed = errors.table([{**marks, "parameters": one} for one in off])
-    assert "| lag: share | share | 3 | 67 % | 3.48 | 6.0 |" in printed
-    assert printed.endswith("| all | 1 beyond 5 | 3 | 67 % | 3.48 | 6.0 |")
+    assert "| lag: share | 3 | 67 % | 3.48 | 6.0 (`share`) |" in printed
+    assert printed.endswith("| all | 3 | 67 % | 3.48 | 6.0 (`share`) |")
+    # What another law describes is not at nothing.
+    other = {**marks, "by_law": True, "parameters": {"share": [1.0, 0.0, 0.1]}}
+    assert errors.table([other]).endswith("| all | 0 | | | |")
 
 
 @pytest.mark.long

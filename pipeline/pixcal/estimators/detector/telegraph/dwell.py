@@ -96,8 +96,12 @@ def find_stays(
     decades, chi2, (_, log_time), (_, error) = best
     if not np.isfinite(chi2):
         return None
+    # Another range of the times may be the true one: it has another mean.
+    chi2s, times = (np.array([one[n] for one in tried]) for n in (1, 2))
+    chance = np.exp((chi2 - chi2s) / 2) * np.where(np.array(DECADES) > 0, 1 / len(DECADES), 1)
+    other = float(chance @ (times[:, 1] - log_time) ** 2 / chance.sum())
     time = float(np.exp(log_time))
-    return Stays(time, decades, upper), float(min(error, 1.0)) * time
+    return Stays(time, decades, upper), float(min(np.hypot(error, other**0.5), 1.0)) * time
 
 
 def _products(series: LitSeries) -> tuple[F64, F64]:
