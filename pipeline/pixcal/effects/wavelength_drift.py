@@ -133,8 +133,11 @@ def _hops(
     levels = find_hopping(colours, times, slopes, hop, rate)
     alike = 0.5 < levels.size / hop < 2
     if alike and all(n < LEVEL * scatter_of(c) for n, c in zip(levels.noise, colours, strict=True)):
-        found = replace(levels, size=hop, error=own_error) if walks else levels
-    return (
-        {"hop": found.size, "hops_per_h": found.rate * HOUR_S},
-        {"hop": found.error, "hops_per_h": found.rate_error * HOUR_S},
-    )
+        found = levels
+    if walks:
+        found = replace(found, size=hop, error=own_error, ramp_error=np.inf)
+    values = {"hop": found.size, "hops_per_h": found.rate * HOUR_S}
+    errors = {"hop": found.error, "hops_per_h": found.rate_error * HOUR_S}
+    if np.isfinite(found.ramp_error):
+        values["ramp"], errors["ramp"] = found.ramp * HOUR_S, float(found.ramp_error * HOUR_S)
+    return values, errors

@@ -32,8 +32,11 @@ class Hopping:
     error: float
     rate: float  # rate, rate_error: of hops, 1/s
     rate_error: float
-    # standard deviation of each series about its levels, where these were looked at
+    # standard deviation of each series about its levels, where these were looked at; and the ramp
+    # that their bases have in common, 1/s
     noise: tuple[float, ...] = ()
+    ramp: float = 0.0
+    ramp_error: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,14 @@ class _Series:
         second, changes, growth = likely_states(odds, _change(rate, self.time_s))
         first = -len(off) * np.log(self.noise) - float(off @ off) / (2 * self.noise**2)
         return replace(self, second=second, changes=changes, likelihood=first + growth)
+
+    def ramp(self, size: float) -> tuple[float, float]:
+        """Slope of the base and its error, in which hops that may or may not be there count."""
+        time = self.time_s - self.time_s.mean()
+        unsure = size**2 * float(np.sum(time**2 * self.second * (1 - self.second)))
+        square = float(time @ time)
+        slope = float(time @ self.base) / square
+        return slope, float(np.sqrt(self.noise**2 / square + unsure / square**2))
 
 
 def find_hopping(
@@ -88,9 +99,11 @@ def find_hopping(
         return sum(s.weighed(size, rate * np.exp(step)).likelihood for s in every)
 
     step = STEP * min(s.noise for s in every) / size
+    ramps, errors = np.array([s.ramp(size) for s in every]).T
+    weight = errors**-2
     return Hopping(
         size, abs(size) * _error(of_size, step), rate, rate * _error(of_rate, STEP),
-        tuple(s.noise for s in every),
+        tuple(s.noise for s in every), float(ramps @ weight / weight.sum()), weight.sum() ** -0.5,
     )  # fmt: skip
 
 
