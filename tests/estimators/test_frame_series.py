@@ -183,6 +183,18 @@ def test_a_line_is_found_with_its_frequency_and_amplitude(frame: np.ndarray) -> 
     assert not again.sure
 
 
+@pytest.mark.parametrize("phase", np.linspace(0, 3, 7))
+def test_a_strong_slow_line_leaves_no_power_behind(phase: float) -> None:
+    frame = np.arange(298)
+    swing = 12 * np.sin(2 * np.pi * 0.88 * 0.14 * frame + phase)[:, None] * [1.0, 1.0]
+    series = series_of(swing + np.random.default_rng(8).standard_normal(swing.shape))
+    line, (cleared,) = cleared_of_line([series], white)
+    assert line is not None
+    assert line.sure
+    # 298 values: their standard deviation is known to a twenty-fourth.
+    np.testing.assert_allclose(cleared.values.std(axis=0), 1.0, atol=0.13)
+
+
 def test_no_line_is_found_in_noise_nor_in_a_walk_of_known_power() -> None:
     rng, power = np.random.default_rng(5), 1 + 4 * EVEN.walk
     for _ in range(20):

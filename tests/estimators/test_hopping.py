@@ -38,7 +38,10 @@ def test_size_and_rate_are_found_within_their_errors(
         series = [hopping(rng, n, size, rate, s, slope) for n, s in ((311, 1.0), (173, 1.7))]
         found = find_hopping(series, times(series), [slope / STEP_S] * 2, 0.8 * size, 0.4 * rate)
         np.testing.assert_allclose(found.noise, (1.0, 1.7), rtol=0.25)
-        pulls.append(((found.size - size) / found.error, (found.rate - rate) / found.rate_error))
+        ramp = (found.ramp - slope / STEP_S) / found.ramp_error
+        pulls.append(
+            ((found.size - size) / found.error, (found.rate - rate) / found.rate_error, ramp)
+        )
         rates.append(found.rate)
     pull = np.array(pulls)
     assert np.all(np.abs(pull.mean(axis=0)) < 4 * 1.1 / np.sqrt(60))

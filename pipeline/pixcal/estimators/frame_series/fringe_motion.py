@@ -58,9 +58,6 @@ def _motion_of(evidence: Evidence) -> Motion | None:
     if not found:
         return None
     hops = {s.name: find_hops(s) for s in found}
-    if any(hops.values()):
-        # A slow vibration goes up and down as hops do.
-        hops = {s.name: find_hops(s) for s in cleared_of_line(found, _level)[1]}
     # A hop is in all modes: what follows the phase is sought where none is left.
     still = [_with_hops(s, hops[s.name], -1.0).cleaned() for s in found]
     line, cleared = cleared_of_line(still, _level)
