@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 import pixcal.effects
 from blind_examination.draw import draw_examination
 from doc_pages import effect_table
-from pixcal.effects import effect_of_file, effects, known_effects, parse_effects
+from pixcal.effects import effects, known_effects, parse_effects
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps, Stage
 from pixcal.simulation.exposure import Camera, frames_of, states_of
+from pixcal.simulation.own_effect import effect_of_file
 from pixcal.simulation.recording import Recording, recordings
 from pixcal.stages.diagnose.nominal import Measured
 

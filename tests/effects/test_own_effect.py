@@ -8,9 +8,10 @@ from astropy.io import fits
 from click.testing import CliRunner
 
 import pixcal
-from pixcal.effects import effect_of_file, effects, known_effects
+from pixcal.effects import effects, known_effects
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import InputError, PixcalError
+from pixcal.simulation.own_effect import effect_of_file
 from pixcal.stages.evidence import load_evidence
 from pixcal_cli.main import cli
 

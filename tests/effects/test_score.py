@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import yaml
 
-from pixcal.effects import effect_of_file
 from pixcal.engine.run import Runtime
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
 from pixcal.simulation.deviations import common_precision, pair_sums, pair_variance
 from pixcal.simulation.effect import Estimate
+from pixcal.simulation.own_effect import effect_of_file
 from pixcal.simulation.replica import Replica
 from pixcal.stages import diagnose, fit, ingest, reduce, simulate
 from pixcal.stages.diagnose.trial import estimate

@@ -8,9 +8,9 @@ import pytest
 
 from fuzzing.laws import LAST_MESSAGE, calibrate
 from fuzzing.night import Night
-from pixcal.effects import effect_of_file
 from pixcal.model.acquisition import Frames
 from pixcal.model.errors import InputError
+from pixcal.simulation.own_effect import effect_of_file
 from pixcal.storage.sources import find_sources
 
 ONE = {"vertical": (1.18, 0.02)}
