@@ -1,5 +1,6 @@
 """An effect from outside pixcal: one file, through the commands, simulated and measured."""
 
+import inspect
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ import pixcal
 from pixcal.effects import effects, known_effects
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import InputError, PixcalError
-from pixcal.simulation.own_effect import effect_of_file
+from pixcal.simulation.forward import ForwardModel
+from pixcal.simulation.own_effect import STEPS, effect_of_file
 from pixcal.stages.evidence import load_evidence
 from pixcal_cli.main import cli
 
@@ -132,3 +134,25 @@ def test_starts_that_cannot_be_used_name_the_file(tmp_path: Path, starts: str, r
     )
     with pytest.raises(PixcalError, match=rf"mine.py: starts: {reason}.*; fix the file"):
         known_effects([file])["glow"].starts(None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_a_step_that_fails_names_the_file(tmp_path: Path, step: str) -> None:
+    """Of every step of the forward model, that of the pixels included."""
+    (tmp_path / "mine.py").write_text(
+        f"{GLOW.read_text()}\n    def {step}(self, *given):\n        return 1 / 0\n"
+    )
+    effect = effect_of_file(tmp_path / "mine.py")
+    with pytest.raises(InputError, match=rf"mine.py: {step}: ZeroDivisionError.*; fix the file"):
+        getattr(effect(), step)(np.zeros(3))
+
+
+def test_every_step_of_the_forward_model_is_checked() -> None:
+    """Those that give back what they are given, changed."""
+    steps = set()
+    for name, method in inspect.getmembers(ForwardModel, inspect.isfunction):
+        signature = inspect.signature(method)
+        _, *given = signature.parameters.values()
+        if name[0] != "_" and given and given[0].annotation is signature.return_annotation:
+            steps.add(name)
+    assert steps == set(STEPS)
