@@ -1,7 +1,7 @@
-"""How wide the codes of a converter are, by how often each comes up.
+"""Widths of a converter's codes, from how often each occurs.
 
-Noise of a code or more makes the light that falls on a code a smooth function of the code. So what
-changes quickly from code to code is the converter: the counts against a local fit of themselves.
+Noise of a code or more makes the expected count a smooth function of the code. Rapid changes from
+code to code are due to the converter: the counts are compared with a local fit to them.
 """
 
 from collections.abc import Callable, Iterable
@@ -20,11 +20,11 @@ from scipy.special import log_ndtr
 from pixcal.model.arrays import F64, I64, Mask
 
 MAX_CODES = 1 << 17
-FEWEST_COUNTS = 5.0  # expected counts of a code that counts
+FEWEST_COUNTS = 5.0  # least expected counts of a usable code
 FEWEST_CODES = 24
-CARRY = 32  # codes whose multiples turn over so many bits that their sum may be off by several
-POPULATED = 20.0  # counts of codes around from which an empty one is a gap
-NEAR = 0.1  # how far the share of codes that come up may be from one over the step
+CARRY = 32  # codes; at its multiples so many bits change that their sum may be off by several
+POPULATED = 20.0  # mean counts of codes around an empty one above which it is a gap
+NEAR = 0.1  # largest relative difference between the share of occupied codes and one over the step
 MIN_AGREEMENT = 0.5
 TIE = 0.01  # of a code: multiples of the step this near half-way may be rounded up or down
 _ORDER = 3
@@ -32,29 +32,29 @@ _MIN_HALF, _MAX_HALF = 4, 12
 _CALM = 101
 _NO_CHANGE = 1e-6
 _MISSED = 3.0
-# scatter of counts that light brings about: levels of pixels do not lie evenly on codes
+# relative scatter of counts from pixel levels that lie unevenly on codes
 _UNEVEN = 2e-3
-# fits of the weights of bits, until the misfit falls by less than
+# most fits of the weights of bits; fall of the misfit that ends them
 _BIT_FITS, _SETTLED = 12, 0.1
-# how far apart levels may be where a bit turns over, of its weight; codes up to which this is
-# tried, in steps of so many
+# largest error of the step between levels at a bit's change, over its weight; ranges and steps
+# (codes) in which it is searched
 _WRONG, _TRIED = 0.05, ((40.0, 0.25), (0.5, 0.05))
-_SMALL = 0.25  # changes (codes) for derivatives, where levels change places
-_CLEARLY = 25.0  # chi-square by which levels in an order of their own must fit better
+_SMALL = 0.25  # changes (codes) for derivatives, where the order of levels may change
+_CLEARLY = 25.0  # chi-square by which reordered levels must fit better
 # codes of noise below which the peak of dark frames is too narrow for a local fit
 MIN_NOISE = 1.4
-# shares of the codes below which they may be even and above which they may not; how much larger
-# than chance the squares of the widths are then, and how many codes below may be as uneven
+# shares of the codes at which unevenness may begin; least squared widths above, over chance; and
+# largest share of codes below that may be as uneven
 _SPLITS, _CLEAR, _EVEN = (0.03, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75), 25.0, 0.05
-_WIDTH_FITS = 12  # of widths whose variances are found by the fit before
+_WIDTH_FITS = 12  # fits of widths, with variances from the fit before
 _FEW = 0.15  # median over mean square of the widths (0.45 if normal) below which few are uneven
-_FLOOR = 0.01  # least variance of a width, of that of chance, for how likely it is
-_TOLD = 4.0  # median square of the widths over that of chance, above which most are uneven
-LOWEST_RIPPLE = 1 / 16  # turns a code
+_FLOOR = 0.01  # least variance of a width, over that by chance, in the likelihood
+_TOLD = 4.0  # median square of the widths over chance, above which most are uneven
+LOWEST_RIPPLE = 1 / 16  # cycles per code
 
 
 def histogram(frames: Iterable[NDArray[np.generic]], good: Mask) -> F64 | None:
-    """Counts of the codes 0, 1, ... of frames (t, y, x); None where samples are no codes.
+    """Counts of the codes 0, 1, ... of frames (t, y, x); None unless samples are codes.
 
     Samples at either end may have been clipped, so they do not count.
     """
@@ -76,13 +76,13 @@ def histogram(frames: Iterable[NDArray[np.generic]], good: Mask) -> F64 | None:
 
 
 def step_of(counts: F64) -> tuple[float, float]:
-    """Step of the converter in codes of the file, by the codes that never come; and its error."""
+    """Step of the converter in codes of the file, from the codes that never occur; its error."""
     there = np.flatnonzero(counts)
     if len(there) < FEWEST_CODES:
         return 1.0, 1.0
     half = max(16, int(4 * np.ptp(there) / len(there)))
     around = uniform_filter1d(counts, 2 * half + 1, mode="constant")
-    # Within the runs of populated codes, not at their ends.
+    # Only inside runs of populated codes, not at their ends.
     codes = np.flatnonzero(minimum_filter1d(around, 2 * half + 1, mode="constant") > POPULATED)
     if len(codes) < FEWEST_CODES:
         return 1.0, 1.0
@@ -91,7 +91,7 @@ def step_of(counts: F64) -> tuple[float, float]:
     if taken.all():
         return none
     found = _period(codes, taken)
-    # A whole number of steps often makes a whole number of codes: of that the spectrum is not sure.
+    # The step is often a simple fraction, which the spectrum does not give exactly.
     simple = [float(Fraction(found).limit_denominator(n)) for n in (1, 2, 4, 16, 128, 1024)]
     trials = [t for t in (*simple, found) if t >= 1]
     agreed = [_agreement(codes, taken, trial) for trial in trials]
@@ -108,7 +108,7 @@ def converter_counts(counts: F64, step: float) -> F64:
 
 
 def _period(codes: I64, there: Mask) -> float:
-    """Step of a comb, by its spectrum about the frequency that the share of its teeth tells."""
+    """Step of a comb, from its spectrum near a frequency equal to the share of occupied codes."""
     share = float(there.mean())
     value = there - share
 
@@ -118,7 +118,7 @@ def _period(codes: I64, there: Mask) -> float:
     spread = np.zeros(codes[-1] + 1)
     spread[codes] = value
     spectrum = np.abs(np.fft.fft(spread, 4 * 2 ** int(np.ceil(np.log2(len(spread))))))
-    # Of steps below two the frequency is above half a turn a code: the other side of the spectrum.
+    # For steps below two the frequency exceeds half a cycle per code: the upper half of the FFT.
     frequency = np.arange(len(spectrum)) / len(spectrum)
     near = np.abs(frequency - share) < min(NEAR * share, (1 - share) / 2)
     best = float(frequency[near][np.argmax(spectrum[near])])
@@ -136,10 +136,10 @@ def _highest(power: Callable[[float], float], start: float, width: float) -> flo
 
 
 def _agreement(codes: I64, there: Mask, step: float) -> float:
-    """Share of the gaps that a step foresees, less that of codes it says cannot come."""
+    """Share of the gaps that a step predicts, less that of occupied codes it excludes."""
     multiple = np.rint(codes / step)
     distance = np.abs(codes - multiple * step)
-    # Half-way the next multiple rounds up or down: of two such codes one comes, and one does not.
+    # A multiple half-way between two codes is rounded up or down: exactly one of the two occurs.
     tie = np.abs(distance - 0.5) <= TIE
     two = tie[1:] & tie[:-1] & (multiple[1:] == multiple[:-1])
     neither = np.count_nonzero(two & ~there[1:] & ~there[:-1])
@@ -158,34 +158,34 @@ class Ripple:
     amplitude: float
     amplitude_error: float
     phase: float  # at code zero, rad
-    log_chance: float  # logarithm of the chance of one as strong anywhere
+    log_chance: float  # logarithm of the probability of one as strong at any period
 
 
 class Law(NamedTuple):
-    """Where a code begins, by the levels that the weights of its bits make."""
+    """Where a code begins, given the levels that the weights of its bits make."""
 
-    below: float  # share of a threshold that the level of the code below sets
+    below: float  # weight of the level of the code below in a threshold
     any_code: bool = False  # whether that is the code of the next lower level, whatever its number
 
 
-# By successive approximation a bit is taken if it fits; or the nearest of the levels is taken, that
-# of the code itself or of the next, or of all levels.
+# Successive approximation sets a bit if it fits; other converters take the nearest level, of two
+# consecutive codes or of all.
 FITS, NEAREST, NEAREST_OF_ALL = Law(0.0), Law(0.5), Law(0.5, any_code=True)
 
 
 @dataclass(frozen=True)
 class WrongBits:
-    """Weights of bits that are off, and how sure that is."""
+    """Errors of the weights of bits, and their significance."""
 
-    bits: F64  # (n,) by how much, codes, the least bit first
+    bits: F64  # (n,) errors, codes, lowest bit first
     law: Law
     covariance: F64  # (n, n)
     chi2: float  # of the bits
-    misfit: float  # chi-square of the widths, once they are taken out
+    misfit: float  # chi-square of the widths after correction
 
 
 def level_errors(bits: F64, codes: int) -> F64:
-    """By how much (codes) wrong weights of bits move the levels of codes 0 to ``codes - 1``."""
+    """Shifts (codes) of the levels of codes 0 to ``codes - 1`` by errors of bit weights."""
     errors = np.zeros(1)
     for bit in bits:
         errors = np.concatenate([errors, errors + bit])
@@ -193,9 +193,9 @@ def level_errors(bits: F64, codes: int) -> F64:
 
 
 def code_cells(bits: F64, law: Law, codes: int) -> tuple[F64, I64]:
-    """Where each code begins, and the codes in this order; those never reached are left out.
+    """Where each code begins, and the codes in this order.
 
-    ``bits``: (n,) by how much (codes) the weight of each bit is off, lowest bit first.
+    ``bits``: (n,) error (codes) of the weight of each bit, lowest bit first.
     """
     level = np.arange(codes) + level_errors(bits, codes)
     order = np.argsort(level, kind="stable") if law.any_code else np.arange(codes)
@@ -206,21 +206,21 @@ def code_cells(bits: F64, law: Law, codes: int) -> tuple[F64, I64]:
 
 @dataclass(frozen=True)
 class CodeWidths:
-    """Relative widths of codes, less one and less what a local fit takes."""
+    """Relative widths of codes, less one and less what a local fit absorbs."""
 
     number: I64  # (n,) of the converter's codes
     width: F64  # (n,)
     variance: F64  # (n,) of the counts by chance, relative
-    kernel: F64  # (m,) what multiplies the true widths: one less the local fit
-    gap: Mask  # of every code, whether the local fit does without it
+    kernel: F64  # (m,) filter on the true widths: one less the local fit
+    gap: Mask  # for every code, whether the local fit excludes it
 
     def kept(self, frequency: float) -> float:
-        """Share of a line's amplitude that the local fit leaves; frequency in turns a code."""
+        """Share of a line's amplitude that the local fit leaves; frequency in cycles per code."""
         at = np.arange(len(self.kernel)) - len(self.kernel) // 2
         return float(self.kernel @ np.cos(2 * np.pi * frequency * at))
 
     def scatter(self) -> tuple[float, float, float]:
-        """Variance of the widths by independent thresholds, its error, and its significance."""
+        """Variance of the widths for independent thresholds, its error, and its significance."""
         square = float(self.kernel @ self.kernel)
         more = (square - float(self.kernel[1:] @ self.kernel[:-1])) / square
         there = ~self.gap[self.number]
@@ -230,7 +230,7 @@ class CodeWidths:
         for _ in range(4):
             weight = 1 / (2 * (variance + max(size, 0.0)) ** 2 + variance**3)
             size = float(weight @ excess / weight.sum())
-        # Neighbours' squares are related by up to a quarter.
+        # Squares of neighbours are correlated by up to a quarter.
         error = float(np.sqrt(1.5 / weight.sum()))
         chance = 1 / (2 * variance**2 + variance**3)
         sigmas = float(chance @ excess / np.sqrt(chance.sum()))
@@ -240,11 +240,10 @@ class CodeWidths:
     def measured(self) -> F64:
         """The true width of every code from 0 on, less one.
 
-        What a local fit takes of the widths is given back as far as codes explain it that are wide
-        or narrow, each by itself, or thresholds that are displaced, which leave the response where
-        it is: such as those beside codes that are left out. Where few codes are uneven, both are
-        tried and the likelier is taken: a reference that is off widens one code, and displaces all
-        thresholds up to the next one.
+        What the local fit absorbed is restored, under one of two models: single codes are wide or
+        narrow, or thresholds are displaced, which leaves the response elsewhere unchanged, as
+        beside missing codes. Where few codes are uneven, the likelier model is taken: a wrong
+        reference widens one code and displaces all thresholds up to the next reference.
         """
         square = self.width**2
         few = float(np.median(square)) < _FEW * float(np.mean(square))
@@ -264,15 +263,15 @@ class CodeWidths:
         return np.diff(ends, prepend=0) - 1
 
     def _measured(self, displaced: bool, few: bool) -> tuple[F64, float]:
-        """Widths of all codes, less one, and how unlikely such are (-2 log marginal likelihood).
+        """Widths of all codes, less one, and -2 log marginal likelihood of their model.
 
-        By thresholds that are ``displaced``, or by codes that are wide or narrow; ``few`` of these
-        have a variance each (Tipping 2001, sparse Bayesian learning, without posterior variances).
+        The model has ``displaced`` thresholds, or wide and narrow codes; if ``few``, each has its
+        own variance (Tipping 2001, sparse Bayesian learning, without posterior variances).
         """
         top = int(self.number[-1]) + 1
         half = len(self.kernel) // 2
         bands = [self.kernel[half + k] * np.ones(top) for k in range(-half, half + 1)]
-        # The local fit does without codes that are left out.
+        # The local fit excludes gaps.
         there = diags_array(np.where(self.gap[:top], 0.0, 1.0))
         gaps = diags_array(np.where(self.gap[:top], 1.0, 0.0))
         design = diags_array(bands, offsets=range(-half, half + 1), shape=(top, top)) @ there + gaps
@@ -292,7 +291,7 @@ class CodeWidths:
             raised = self._raised(np.where(self.gap[:top], 0.0, found))
             raised = np.where(self.gap[:top], 1.0, raised)[self.number]
             data = self.width * raised
-        # Of the counts, which were raised to make the data.
+        # Likelihood of the counts: the data were scaled by ``raised``.
         own = solved**2 + _FLOOR * chance
         weight = diags_array(1 / (self.variance * raised**2))
         evidence = design.T @ weight
@@ -304,9 +303,9 @@ class CodeWidths:
 
     @property
     def uneven_above(self) -> bool:
-        """Whether codes are uneven from some code on, and even below.
+        """Whether codes are uneven above some code, and even below.
 
-        So it is in files of cameras that read bright pixels at another gain, in coarser steps.
+        This occurs in cameras that read bright pixels at another gain, in coarser steps.
         """
         square = self.width**2
         for share in _SPLITS:
@@ -320,12 +319,12 @@ class CodeWidths:
         return False
 
     def wrong_bits(self, scatter: float) -> WrongBits:
-        """Errors of the bits' weights (codes), and which level is taken, of nearby ones."""
+        """Errors of the bits' weights (codes) under the better of `FITS` and `NEAREST`."""
         tried = [self._wrong_bits(scatter, law) for law in (FITS, NEAREST)]
         return min(tried, key=lambda one: one.misfit)
 
     def far_bits(self, near: Law) -> WrongBits | None:
-        """The nearest of all levels; None unless it explains clearly more than the law ``near``."""
+        """Errors under `NEAREST_OF_ALL`; None unless it fits clearly better than ``near``."""
         start = self._far(NEAREST_OF_ALL)
         scatter = 2 * self.without(start, NEAREST_OF_ALL).scatter()[0]
         far = self._wrong_bits(scatter, NEAREST_OF_ALL, start)
@@ -340,17 +339,17 @@ class CodeWidths:
         return WrongBits(bits, law, covariance, float(bits @ inverse @ bits), misfit)
 
     def bits(self, scatter: float, law: Law = FITS, start: F64 | None = None) -> tuple[F64, F64]:
-        """By how much each bit's weight is off, in codes, the least first; and the covariance.
+        """Errors of the bits' weights, in codes, lowest bit first, and their covariance.
 
-        A bit that does not change within the codes at hand gets nothing. The common factor of all
-        weights, a gain, does not change the local widths: the smallest errors are given (`level`
-        gives others). A weight that is more than a code too small leaves several codes out, which
-        is no linear change, so the fit is repeated about what was found, by changes of a code;
-        where levels change places, by small ones.
+        A bit that does not change within the measured codes has zero error. A factor common to all
+        weights, a gain, does not change local widths: the smallest errors are given (`level` gives
+        others). A weight more than a code too small skips several codes. As this is nonlinear, the
+        fit is iterated, with derivatives from changes of one code, or of less where the order of
+        levels may change.
 
-        scatter : variance of the widths beside
+        scatter : variance of the widths by other causes
         law : of the converter
-        start : (n,) errors of the weights from where the fit begins
+        start : (n,) errors of the weights at which the fit begins
         """
         number = self._bits
         change = _SMALL if law.any_code else 1.0
@@ -382,7 +381,7 @@ class CodeWidths:
         return bits, covariance
 
     def _far(self, law: Law) -> F64:
-        """Wrong bits, from the highest down, by how far apart levels are where each turns over."""
+        """Errors of bits, highest first, from the step between levels where each bit changes."""
         bits, place = np.zeros(self._bits), np.arange(self._bits)
         turning = np.isin(2**place, (self.number & -self.number)[1:])
         for reach, step in _TRIED:
@@ -399,7 +398,7 @@ class CodeWidths:
         return (len(self.gap) - 1).bit_length()
 
     def level(self, bits: F64) -> F64:
-        """Bits with a common factor by which the response has no slope over the codes at hand."""
+        """Bits plus a gain, so that the response error has no slope over the measured codes."""
         changing = np.ptp(self.number[:, None] >> np.arange(len(bits)) & 1, axis=0) > 0
         gain = np.where(changing, 2.0 ** np.arange(len(bits)), 0.0)
         of_bits, of_gain = (
@@ -409,7 +408,7 @@ class CodeWidths:
         return np.asarray(bits - of_bits / of_gain * gain)
 
     def _left_out(self, bits: F64, law: Law) -> F64:
-        """Widths (n,) that wrong weights of bits bring about, less what the local fit takes."""
+        """Widths (n,) caused by errors of bit weights, less what the local fit absorbs."""
         begins, order = code_cells(bits, law, len(self.gap))
         # A code that begins after a higher one is never reached.
         begins = np.minimum.accumulate(begins[::-1])[::-1]
@@ -418,23 +417,23 @@ class CodeWidths:
         return self._after_fit(width[:-1] - 1)[self.number]
 
     def _after_fit(self, width: F64) -> F64:
-        """Widths of codes 0, 1, ..., less one, as they come out relative to a local fit."""
+        """Widths of codes 0, 1, ..., less one, relative to a local fit."""
         gap = self.gap[: len(width)]
         there = np.where(gap, 0.0, width)
         left = np.convolve(there, self.kernel, "same")
         return np.asarray(np.where(gap, left + width, left / self._raised(there)))
 
     def _raised(self, width: F64) -> F64:
-        """By what factor widths, less one, raise the counts that a local fit expects."""
+        """Factor by which widths, less one, raise the expected counts of a local fit."""
         taken = width - np.convolve(width, self.kernel, "same")
         return np.asarray(np.maximum(1 + uniform_filter1d(taken, len(self.kernel)), 0.1))
 
     def without(self, bits: F64, law: Law = FITS) -> "CodeWidths":
-        """The rest, once the wrong weights of bits (codes) are taken out."""
+        """Widths corrected for errors of bit weights (codes)."""
         return replace(self, width=self.width - self._left_out(bits, law))
 
     def ripple(self, scatter: float) -> Ripple:
-        """The strongest line, over chance and a scatter of the widths (variance)."""
+        """The strongest line above noise and a scatter of the widths (variance)."""
         weight = ~self.gap[self.number] / (self.variance + max(scatter, 0.0))
         value = weight * self.width
         total, noise = float(weight.sum()), float(weight**2 @ self.variance)
@@ -448,7 +447,7 @@ class CodeWidths:
             return float(np.abs(line(frequency)) ** 2 / level(frequency))
 
         def level(frequency: float) -> float:
-            """Mean power without a line: of displaced thresholds it rises with the frequency."""
+            """Mean power without a line: for displaced thresholds it rises with frequency."""
             return noise + own * 2 * float(np.sin(np.pi * frequency)) ** 2
 
         count = int(np.ptp(self.number)) + 1
@@ -456,12 +455,12 @@ class CodeWidths:
         spread[self.number - self.number[0]] = value
         spectrum = np.abs(np.fft.rfft(spread)) ** 2
         frequency = np.arange(len(spectrum)) / len(spread)
-        # Below, the local fit takes it; close to the end it cannot be told from the end.
+        # The local fit absorbs lower lines; those close to 0.5 cannot be separated from 0.5.
         seen = (frequency > LOWEST_RIPPLE) & (frequency < 0.5 - 2 / count)
         levels = noise + own * 2 * np.sin(np.pi * frequency[seen]) ** 2
         best = float(frequency[seen][np.argmax(spectrum[seen] / levels)])
         best = _highest(power, best, 1 / len(spread))
-        # Even and odd codes have a cosine alone.
+        # At 0.5 (even and odd codes) there is only a cosine.
         ends = float(np.real(line(0.5)))
         top = float(np.log(2) + log_ndtr(-abs(ends) * self.kept(0.5) / np.sqrt(level(0.5))))
         free = np.log(2 * count) - power(best) * self.kept(best) ** 2
@@ -502,7 +501,7 @@ def code_widths(
     kernel = -savgol_coeffs(length, _ORDER)
     kernel[half] += 1
     width = (counts - expected)[used] / calm[used]
-    # What another fit still changes, beyond what uneven codes do to it, the first one missed.
+    # What a second fit still changes, beyond the effect of uneven codes, the first one missed.
     again = np.convolve(kernel, savgol_coeffs(length, _ORDER))
     share = 2 * float(again @ again) / float(kernel @ kernel)
     change = uniform_filter1d((expected - savgol_filter(expected, length, _ORDER)) ** 2, length)
@@ -514,7 +513,7 @@ def code_widths(
 
 
 def _carried_over(counts: F64) -> Mask:
-    """Codes below a multiple of `CARRY` that never come among some that do, and the one before."""
+    """Empty codes just below a multiple of `CARRY`, where others occur, and the code before."""
     gap = np.zeros(len(counts), bool)
     around = uniform_filter1d(counts, 2 * _MAX_HALF + 1)
     for first in range(CARRY, len(counts), CARRY):

@@ -1,4 +1,4 @@
-"""Lag: of all pixels, by contrast of fringes or first frames of flats; and how pixels differ."""
+"""Lag of all pixels, from fringe contrast or first frames of flats; its variation over pixels."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -19,41 +19,41 @@ from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.significance import root_with_error
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
-# of the phase that pixels are free to have, so that a bent response is not taken for lag
+# of the phase, free in each pixel so that a nonlinear response is not taken for lag
 HARMONICS = 5
-CONTROLS = 8  # frames after a frame that are compared with the one before it
-PIXEL_CLIP = 7.0  # standard deviations of a share that particles go beyond
+CONTROLS = 8  # later frames that serve as controls for the frame before
+PIXEL_CLIP = 7.0  # standard deviations beyond which a pixel's share is clipped (particles)
 MIN_FRAMES = 20
 CLIP = 5.0  # standard deviations of a frame's contrast
-LAGS = 6  # frames back that are looked at
-ROUNDS = 2  # of the fit of flats
-CONTRAST_ROUNDS = 8  # of that of the contrast at most, each about the lag of the one before
-CONVERGED = 0.1  # step of the share, in its errors, after which there are no more
+LAGS = 6  # longest lag, frames
+ROUNDS = 2  # iterations of the fit to flats
+CONTRAST_ROUNDS = 8  # most iterations for the contrast, each linearised about the last lag
+CONVERGED = 0.1  # step of the share, in its errors, that ends the iteration
 MAX_DECAY = 3.0
 _SERIES = 8
-_MANY_FLATS = 5  # series that tell the flicker of the lamp beside the lag
+_MANY_FLATS = 5  # fewest series that constrain lamp flicker as well as lag
 _STEADIEST = 1e-4
 CLEAR = 4.0
-_NOT_EXPONENTIAL = 40.0  # chi-square from which releases are taken as they come
+_NOT_EXPONENTIAL = 40.0  # chi-square from which releases are free in each frame
 
 
 @dataclass(frozen=True)
 class Uneven:
-    """How much the pixels' shares of the frame before differ: mean square, and its error."""
+    """Scatter of the pixels' shares of the frame before: mean square and its error."""
 
     square: float
     error: float
 
     @classmethod
     def of(cls, sets: Iterable[FringeEvidence]) -> "Uneven":
-        """Of all sets together; without any it says nothing."""
+        """Weighted mean of all sets; 0 ± 1 without any."""
         found = [(*one, f.good.sum()) for f in sets if (one := uneven_pixels(f)) is not None]
         if not found:
             return cls(0.0, 1.0)
         value, error, pixels = np.array(found).T
         weight = error**-2
         square = float(weight @ value / weight.sum())
-        # All sets have the same pixels.
+        # All sets share the same pixels and their sampling error.
         drawn = (1 - 1 / len(found)) * 2 * square**2 / pixels.min()
         return cls(square, float(np.sqrt(1 / weight.sum() + drawn)))
 
@@ -63,11 +63,11 @@ class Uneven:
         return self.square / self.error
 
     def rms(self, keep: float, share: float) -> float:
-        """Of shares about the mean ``share``, where a part of what is held stays another frame."""
+        """Of shares about the mean ``share``; ``keep``: part of held charge kept per frame."""
         return float(np.sqrt(max(self.square, 0.0))) * self._scale(keep, share)
 
     def spread(self, keep: float, share: float, share_error: float) -> tuple[float, float]:
-        """Relative spread of the shares about the mean one, and its error."""
+        """Relative spread of the shares about their mean, and its error."""
         if share <= 0:
             return 0.0, 1.0
         rms, error = root_with_error(self.square, self.error)
@@ -77,16 +77,16 @@ class Uneven:
 
     @staticmethod
     def _scale(keep: float, share: float) -> float:
-        """Of a pixel's share s less the mean one, over what is seen of it.
+        """Ratio of a pixel's deviation s - share to the deviation as measured.
 
-        Beside maps and frames that were fitted with the lag, (s - share) / (1 - s) of the light
-        before is left. The frame before, as fitted, has 1 - share of it, and light from earlier on.
+        Maps and frames were fitted to frames with lag, so (s - share) / (1 - s) of the light before
+        remains. The frame before, as fitted, holds 1 - share of it, and earlier light.
         """
         return ((1 - share) ** 2 + share**2 * (1 - keep) / (1 + keep)) / (1 - keep)
 
 
 def seen_share(fringes: FringeEvidence, share: float, rms: float) -> float:
-    """Share that the contrast of frames shows where pixels with a larger one count for less."""
+    """Share measured from frame contrast, where pixels with a larger share have less weight."""
     mean, cosine, sine = fringes.theta[:, fringes.good]
     frames = fringes.free[:, 0].mean()
     contrast = np.hypot(*fringes.free[:, 1:3].T).mean() / frames
@@ -108,7 +108,7 @@ def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
     if len(fringes.g) < MIN_FRAMES + CONTROLS:
         return None
     before = _squares_of_shares(fringes, Freedom(fringes, HARMONICS), (1,))[0]
-    # Frames are no more than nearly independent: without what the frame before explains.
+    # Frames are only nearly independent: what the frame before explains is removed.
     free = Freedom(fringes, HARMONICS, before=True)
     after = _squares_of_shares(fringes, free, range(-1, -CONTROLS - 1, -1))
     value, error = np.array(after).T
@@ -120,7 +120,7 @@ def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
 def _squares_of_shares(
     fringes: FringeEvidence, freedom: Freedom, steps: Sequence[int]
 ) -> list[tuple[float, float]]:
-    """Mean square, above noise, of pixels' shares of the frames some steps back, with errors."""
+    """Mean square, above noise, of pixels' shares of the frames ``steps`` back, with errors."""
     weighted = freedom.weight * freedom.left_over(freedom.of_good(fringes.residual))
     others = np.zeros((len(steps), *fringes.g.T.shape), np.float32)
     for other, step in zip(others, steps, strict=True):
@@ -131,7 +131,7 @@ def _squares_of_shares(
     upper = np.triu_indices(3)
 
     def summed(products: F32, samples: F32) -> F32:
-        """Sums over time (..., n) of products (..., t) with samples (t, n); all in one product."""
+        """Sums over time (..., n) of products (..., t) with samples (t, n): one matrix product."""
         found = products.reshape(-1, products.shape[-1]) @ samples
         return found.reshape(*products.shape[:-1], count)
 
@@ -143,8 +143,8 @@ def _squares_of_shares(
     ):
         squares = np.empty((3, 3, count))
         squares[upper] = squares[upper[::-1]] = own_squares
-        # The other frame is a sum of the pixel's maps, less what the pixel can have of its own; of
-        # that nothing is left in the residuals.
+        # The other frame is a sum of the pixel's maps. The part that the pixel's own parameters
+        # absorb is subtracted: residuals retain none of it.
         along = np.einsum("kin,in->kn", own_mixed, theta)
         taken = np.einsum("nij,jn->in", freedom.pixel_inverse, along)
         information = np.einsum("in,ijn,jn->n", theta, squares, theta)
@@ -159,7 +159,7 @@ def _mean_square(right: F64, information: F64) -> tuple[float, float]:
     share, variance = right[told] / information[told], 1 / information[told]
     square = share**2 - variance
     trust = 1 / (variance**2 + np.median(variance) ** 2)
-    # Particles leave wild values in a few pixels.
+    # Particles leave outliers in a few pixels.
     trust *= np.abs(square) < PIXEL_CLIP**2 * np.median(np.abs(square))
     total = trust.sum()
     mean = float(trust @ square / total)
@@ -167,10 +167,10 @@ def _mean_square(right: F64, information: F64) -> tuple[float, float]:
 
 
 def _contrast_steps(frames: F64, numbers: Indices) -> tuple[F64, F64] | None:
-    """Shares (lag,) that come out 1, 2, ... frames later, and their information (lag, lag).
+    """Shares (lag,) released 1, 2, ... frames later, and their information (lag, lag).
 
-    From (B, A cos phi, A sin phi) of the frames (t, 3) of some numbers; None where they do not
-    tell.
+    ``frames``: (t, 3) B, A cos phi, A sin phi; ``numbers``: (t,) of frames. None where these do
+    not constrain the shares.
     """
     b, a_cos, a_sin = frames.T
     count = len(b)
@@ -185,7 +185,7 @@ def _contrast_steps(frames: F64, numbers: Indices) -> tuple[F64, F64] | None:
         light = b[own - back] / b[own]
         terms[back - 1, own] = light * (np.cos(phase[own - back] - phase[own]) - 1)
     time = numbers / numbers[-1]
-    # What a wrong gauge of the fit and slow changes do to the contrast.
+    # Changes of contrast by the fit's gauge freedom and by drift.
     other = [np.ones(count), time, time**2]
     for n in (1, 2):
         other += [np.cos(n * phase), np.sin(n * phase)]
@@ -209,18 +209,18 @@ def _contrast_steps(frames: F64, numbers: Indices) -> tuple[F64, F64] | None:
 
 @dataclass(frozen=True)
 class CommonLag:
-    """Lag of all pixels alike, as the contrast of the frames shows it."""
+    """Lag common to all pixels, from the contrast of the frames."""
 
     share: float  # that stays behind
     share_error: float
-    keep: float  # part of what is held that stays for another frame
+    keep: float  # part of held charge that is kept for another frame
     keep_error: float
     sigmas: float  # significance of the share
-    later: tuple[float, ...] = ()  # parts that come out later, where they are not exponential
+    later: tuple[float, ...] = ()  # parts released in later frames, if not exponential
 
     @property
     def decay_frames(self) -> float:
-        """Frames in which what comes out falls by a factor e."""
+        """Frames in which the released charge falls by a factor e."""
         return float(-1 / np.log(self.keep)) if self.keep else 0.0
 
     @property
@@ -236,16 +236,16 @@ def common_lag(
     numbers: Sequence[Indices],
     undone: Callable[[float, float, F32], tuple[F32, F64]],
 ) -> CommonLag | None:
-    """Lag by the contrast of frames (t, 3) against the phase step; None: no evidence.
+    """Lag from the contrast of frames (t, 3) against the phase step; None: no evidence.
 
-    ``numbers``: (t,) of the frames in their set. ``undone``: frames without a lag of a share and a
-    decay, and the shares that come out later.
+    ``numbers``: (t,) of the frames in their set. ``undone``: corrects frames for a lag of given
+    share and decay; gives also the shares released later.
     """
     found = CommonLag(0.0, 0.0, 0.0, 0.0, 0.0)
     for _ in range(CONTRAST_ROUNDS):
         steps = []
         for own, which in zip(frames, numbers, strict=True):
-            # Linear about a lag that is known in part, which is taken out of the frames first.
+            # Linearised about the current lag, which is removed from the frames first.
             share = float(np.clip(found.share, 0, 0.5))
             rest, known = undone(share, found.decay_frames, own.astype(np.float32))
             told = _contrast_steps(rest.astype(float), which)
@@ -276,7 +276,7 @@ def _exponential(information: F64, right: F64) -> CommonLag:
 
     highest = float(np.exp(-1 / MAX_DECAY))
     best = float(minimize_scalar(lambda k: -gain(k), bounds=(0, highest), method="bounded").x)
-    # Without lag the decay has no meaning; it must show.
+    # Without lag the decay has no meaning: it must be significant.
     if gain(best) ** 2 < gain(0.0) ** 2 + CLEAR**2:
         best = 0.0
     u = release(best)
@@ -291,7 +291,7 @@ def _exponential(information: F64, right: F64) -> CommonLag:
 
 
 def _freely(found: CommonLag, information: F64, right: F64) -> CommonLag:
-    """The same with what comes out in each frame, where an exponential does not describe it."""
+    """The lag with a free release in each frame, where an exponential does not describe it."""
     free = np.linalg.solve(information, right)
     away = free - found.share * (1 - found.keep) * found.keep ** np.arange(LAGS)
     unlike = float(away @ information @ away) >= _NOT_EXPONENTIAL
@@ -305,18 +305,18 @@ def _freely(found: CommonLag, information: F64, right: F64) -> CommonLag:
 
 @dataclass(frozen=True)
 class LagOfFlats:
-    """Lag as the first frames of flats show it."""
+    """Lag from the first frames of flats."""
 
     share: float  # that stays behind
     error: float
-    carried: float  # one where the frame before a series adds its charge to it, zero after a clear
+    carried: float  # 1 if the frame before a series adds its charge, 0 after a clear
 
 
 def lag_of_flats(evidence: Evidence) -> LagOfFlats | None:
     """Share by which the first frame of each series of flats is fainter than the rest, or None.
 
-    It lacks a share of its own level, and has one of the frame before unless the detector was
-    cleared: the levels tell which.
+    It lacks a share of its own level, and gains one of the frame before unless the detector was
+    cleared: the levels decide which.
     """
     found = [(s, f) for s in evidence.stacks if (f := _first_frame(s, evidence)) is not None]
     if len(found) <= 2:
@@ -342,15 +342,15 @@ def _fit_steps(
 ) -> tuple[float, float, float]:
     """Share of what first frames lack, its error, and the chi-square of the steps.
 
-    ``lamp``: what a rise of the light by one a frame changes, the rise, and its error.
+    ``lamp``: change of the steps per unit rise of the light, the rise, and its error.
     """
     later, rise, of_rise = lamp
     step = step + rise * later
-    # The lamp's flicker is that which the fit leaves: before it, lag passes for flicker too.
+    # Flicker is measured from the fit's residuals: before the fit it includes lag.
     design = np.stack([-lacking, np.ones_like(step)])
     scale = np.ones_like(step)
     for _ in range(ROUNDS):
-        # The error of the rise is the same in all levels.
+        # The error of the rise is common to all levels.
         variance = np.diag((error * scale) ** 2) + of_rise**2 * np.outer(later, later)
         weighted = np.linalg.solve(variance, design.T).T
         covariance = np.linalg.inv(weighted @ design.T)
@@ -371,6 +371,6 @@ def _first_frame(stack: Stack, evidence: Evidence) -> tuple[float, float, float]
     means = light.mean(axis=1)
     rest = means[1:]
     level = float(rest.mean())
-    # What the lamp did from frame to frame is measured by the frames themselves.
+    # Long series measure the lamp's flicker themselves.
     scatter = level * max(lamp, _STEADIEST) if count < _SERIES else float(rest.std(ddof=2))
     return level, float(means[0] - level), scatter * float(np.sqrt(1 + 1 / len(rest)))

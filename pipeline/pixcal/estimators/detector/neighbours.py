@@ -1,10 +1,10 @@
 """Noise that neighbouring pixels share because collected charge moves their boundary.
 
-The covariance of neighbours has parts that are constant (rows, columns, electronics), in proportion
-to the level (crosstalk: a share of the shot noise), and to its square (brighter-fatter). They are
-told apart by weighted least squares on products of neighbouring residuals of fringe frames and
-flats; the first two are free for each direction. Before that the residuals lose outliers, and what
-is the same function of the phase in every frame: a nonlinear response cannot pass for noise.
+The covariance of neighbours has a constant part (rows, columns, electronics), a part proportional
+to the level (crosstalk: a share of the shot noise), and one to its square (brighter-fatter).
+Weighted least squares on products of neighbouring residuals of fringe frames and flats separates
+them; the first two are free in each direction. Outliers, and any function of the phase common to
+all frames, are removed first: a nonlinear response cannot pass for noise.
 """
 
 from collections.abc import Iterator
@@ -24,45 +24,45 @@ from pixcal.model.arrays import F32, F64
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows and columns from a pixel to its neighbours
 
 HARMONICS = 5
-BLOCK = 64  # frames that are taken together
+BLOCK = 64  # frames processed at a time
 
 _CLIP = 6.0
 _MIN_FRAMES = 2
 _TERMS = 4
-# chi-square of terms in proportion to the level, one a direction, from which they are there: by
-# chance one in a hundred
+# chi-square above which terms proportional to the level (one per direction) are significant:
+# 1 % by chance
 _CROSSTALK = 13.3
 
 
 @dataclass(frozen=True)
 class _Noise:
-    """Some frames less what they should be; all (t, y, x) or (y, x), e- before the flat."""
+    """Residuals of a block of frames; all (t, y, x) or (y, x), e- before the flat."""
 
-    residual: F32  # zero where a sample is not to be used
+    residual: F32  # zero where a sample is not used
     variance: F32
     charge: F32  # mean charge
-    # (t, j, j), (j, y, x): functions of place that the frames were free to have, and the covariance
-    # of their shares
+    # (t, j, j), (j, y, x): covariance of each frame's coefficients, and the functions of place
+    # that were fitted with them
     covariance: F32
     of_place: F32
-    kept: float  # share of the covariance that is left where each pixel was fitted
+    kept: float  # share of the covariance that remains after each pixel was fitted
 
 
 @dataclass(frozen=True)
 class SharedCharge:
-    """Size of the brighter-fatter effect as the covariance of neighbours shows it."""
+    """Size of the brighter-fatter effect from the covariance of neighbours."""
 
-    size: float  # size, variance: of the shift by an electron, px
+    size: float  # size, variance: shift per electron, px
     variance: float
-    axes: F64  # (2,), (2, 2) the same of boundaries between columns and of those between rows
+    axes: F64  # (2,), (2, 2) the same for boundaries between columns and between rows
     covariance: F64
 
 
 def shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
     """Size of the brighter-fatter effect from the covariance of neighbours.
 
-    ``shifts``: `pixcal.kernels.boundaries.boundary_shifts`, of size one. None where there are
-    neither fringe frames nor flats.
+    ``shifts``: `pixcal.kernels.boundaries.boundary_shifts`, of size one. None without fringe
+    frames and flats.
     """
     given = shifts.shape, shifts.tobytes()
     return evidence.once("shared_charge", *given, make=lambda: _shared_charge(evidence, shifts))
@@ -83,7 +83,7 @@ def _shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
                 noise.residual, noise.variance, noise.charge, shared, noise.covariance,
                 noise.of_place, step, REACH,
             )  # fmt: skip
-            # Independent products are as many as degrees of freedom: one of a pair, not two.
+            # Only as many products are independent as degrees of freedom: one for two frames.
             normal[np.ix_(at, at)] += noise.kept * more
             right[at] += more_right
     if not normal[-1, -1]:
@@ -102,10 +102,9 @@ def _shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
 
 
 def _without_crosstalk(normal: F64, right: F64) -> tuple[F64, F64]:
-    """Sums without the terms in proportion to the level, unless these fit the products as well.
+    """Sums without the terms proportional to the level, unless the products need these.
 
-    The levels of flats tell little between them and the square: with both free, neither would be
-    significant.
+    Flats hardly separate the level from its square: with both free, neither would be significant.
     """
     count = len(right)
     squares = list(range(2 * len(DIRECTIONS), count))
@@ -139,7 +138,7 @@ def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Iterator[_Noise]
     freedom = Freedom(fringes, HARMONICS)
     left = freedom.left_over(freedom.of_good(fringes.residual))
     left[np.abs(left) * np.sqrt(freedom.weight) > _CLIP] = 0
-    # Shot noise and what moves it are those of the charge, before the flat is divided out.
+    # Shot noise and boundary shifts depend on the charge before the flat is divided out.
     flat = evidence.flat.astype(np.float32)
     of_place = np.zeros((len(freedom.of_place), *good.shape), np.float32)
     of_place[:, good] = freedom.of_place
@@ -191,13 +190,13 @@ def pair_sums(
 ) -> tuple[F64, F64]:
     """Normal matrix (4, 4) and right-hand side (4,) for products of pixels at a step.
 
-    The terms are a constant, the sum of the two charges, and what is ``shared`` in two ways. A
-    product has the weight of one over the product of the two variances.
+    The terms are a constant, the sum of the two charges, and the two ``shared`` noises. The weight
+    of a product is one over the product of the two variances.
 
-    residual, variance, charge : (t, y, x) float32; pairs of which a residual is zero have no weight
+    residual, variance, charge : (t, y, x) float32; pairs with a zero residual have no weight
     shared : two (t, y, x) float32, at the first pixel of each pair
-    covariance, of_place : (t, j, j), (j, y, x) float32 of the functions of place that each frame
-        was free to have: what they took off the product of two residuals is put back
+    covariance, of_place : (t, j, j), (j, y, x) float32 of the functions of place fitted to each
+        frame: what the fit removed from the product of two residuals is added back
     step : rows (not negative) and columns to the second pixel
     margin : pixels along the edges that are not used
     """
@@ -208,7 +207,7 @@ def pair_sums(
     return normal + np.triu(normal, 1).T, sums[:, _TERMS]
 
 
-# Sums of a row in any order. Views of rows have no negative index: only then loops are vectorised.
+# Loops vectorise only if sums may be reordered and row views have no negative indices.
 @kernel(fastmath={"reassoc", "contract"})
 def _sum(
     residual: Any, variance: Any, charge: Any, shared1: Any, shared2: Any, covariance: Any,
