@@ -1,17 +1,17 @@
 """Couplings from the noise: neighbours that share charge share its shot noise.
 
-With the variance D of the charge of a pixel and k the share that it gives to a partner, primes for
-the partner,
+With D the variance of a pixel's charge and k the share that it gives to a partner (primes: the
+partner's),
 
     cov(p, p') = k D + k' D' + constant + b D D' + c (D² + D'²)
 
-The constant takes up noise that neighbours have in common without light (of a row, a column, the
-whole frame); bias frames measure it. Covariance that rises with the square of the level is what
-brighter-fatter makes (b and c are free, the same for all pixels). Flats give k + k' only; in
-fringes D and D' differ, and the two are told apart.
+The constant is noise that neighbours share without light (of a row, a column, the whole frame);
+bias frames measure it. Brighter-fatter makes a covariance that rises with the square of the level
+(b and c are free, the same for all pixels). Flats give k + k' only; in fringes D and D' differ,
+which separates the two.
 
-The products of residuals are summed pixel by pixel, so that they can be joined to classes of any
-period later.
+The products of residuals are summed pixel by pixel, so that they can be combined into classes of
+any period later.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -29,17 +29,17 @@ from pixcal.model.arrays import F32, F64, Indices
 
 Frames = tuple[F32, F32, F32]  # factor, charge over sigma, and one over sigma, all (t, y, x)
 
-# charge (10⁴ e-) of the least light whose noise can tell; less where the variance of that noise is
-# so many times that without light
+# least charge (10⁴ e-) of usable light; less is enough where its shot noise variance is this many
+# times that without light
 MIN_CHARGE, ABOVE_READ = 0.1, 4.0
 TINY = np.float32(1e-20)
 TERMS = 5  # D, D', 1, D D', D² + D'²
-# place of each normal sum; terms 2 and 3 meet in the same sum as 0 and 1
+# index of each normal sum; terms 2 and 3 share their sum with 0 and 1
 NORMAL = {(0, 0): 0, (0, 1): 1, (1, 1): 2, (0, 2): 3, (1, 2): 4, (2, 2): 5, (0, 3): 6,
           (1, 3): 7, (3, 3): 8, (2, 3): 1, (0, 4): 9, (1, 4): 10, (2, 4): 11, (3, 4): 12,
           (4, 4): 13}  # fmt: skip
 NORMALS = 14
-_STEADY_COLUMNS = 256  # columns whose sums are kept at once
+_STEADY_COLUMNS = 256  # columns processed at a time
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,7 @@ class Products:
 
     right: F32  # (link, 5, y, x) products of residuals with each of the `TERMS`; charge in 10⁴ e-
     normal: F32  # (link, 14, y, x) of the terms with each other, in the order of `NORMAL`
-    # shot, shot_error: variance of a pixel over what its charge gives, as measured: 1 for the
-    # right gain
+    # shot, shot_error: measured variance of a pixel over its shot noise: 1 for the right gain
     shot: float
     shot_error: float
     # curve, curve_error: relative change of that variance with the charge, 1/(10⁴ e-)
@@ -75,7 +74,7 @@ def products(
             line, line_right = line + own, line_right + own_right
         add = _add_steady if parts[0].steady else _add_changing
         add(parts, steps, right, normal)
-        # Not beside the next ones: they are large.
+        # Freed before the next ones, as they are large.
         del parts, part
     if brightest < min(MIN_CHARGE, ABOVE_READ * evidence.read_noise**2 / UNIT):
         return None
@@ -95,12 +94,12 @@ def _add_changing(parts: Sequence[Residuals], steps: Indices, right: F32, normal
 
 
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
-_LONG = 128  # frames of sequences that are gathered
-_COLUMNS = 16  # columns that are gone through at once: with their partners they stay in the cache
+_LONG = 128  # frames up to which sequences are gathered
+_COLUMNS = 16  # columns processed at a time: with their partners they stay in the cache
 
 
 def _gathered(parts: Iterable[Residuals]) -> Iterator[list[Residuals]]:
-    """Short sequences together, for sums over few frames cost as much; long ones one by one."""
+    """Short sequences together, as sums over few frames cost as much; long ones one by one."""
     some: list[Residuals] = []
     for part in parts:
         joined = [*some, part]
@@ -109,7 +108,7 @@ def _gathered(parts: Iterable[Residuals]) -> Iterator[list[Residuals]]:
             some = []
         some.append(part)
         if len(part.e) >= _LONG:
-            # Before the next one is made, which is as large.
+            # Freed before the next one, which is as large.
             del part
             yield some
             some = []
@@ -118,7 +117,7 @@ def _gathered(parts: Iterable[Residuals]) -> Iterator[list[Residuals]]:
 
 
 def _pieces(parts: Sequence[Frames]) -> Iterator[Sequence[Frames]]:
-    """Short sequences together and long ones in pieces: powers of all frames would be large."""
+    """Short sequences together and long ones in pieces, to limit the memory for powers."""
     if short := [part for part in parts if len(part[0]) <= _LONG]:
         yield short
     for e, charge, one in parts:
@@ -137,7 +136,7 @@ def _powers(parts: Sequence[Frames], highest: int) -> tuple[F32, ...]:
     found = np.empty((highest + 1, *parts[0][0].shape[1:], count), np.float32)
     first = 0
     for factor, charge, one in parts:
-        # Row by row: of all rows at once the intermediate arrays would need much memory.
+        # Row by row, to limit the memory for intermediate arrays.
         for y in range(one.shape[1]):
             value = factor[:, y] * one[:, y]
             ratio = charge[:, y] / np.maximum(one[:, y], TINY)
@@ -150,7 +149,7 @@ def _powers(parts: Sequence[Frames], highest: int) -> tuple[F32, ...]:
 
 @inner()
 def _add_pixels(sums: F32, y: int, first: int, out: F32) -> None:
-    """Add sums (pixel, link, n) of pixels of a row, from a column on, to all (link, n, y, x)."""
+    """Add sums (pixel, link, n) of a row, from column ``first`` on, to all (link, n, y, x)."""
     count = min(len(sums), out.shape[3] - first)
     for n in range(out.shape[0]):
         for i in range(out.shape[1]):
@@ -227,7 +226,7 @@ def _add_normal_sums(w0: F32, w1: F32, w2: F32, w3: F32, w4: F32, links: Any, no
 
 def _variance(part: Residuals) -> tuple[F64, F64]:
     """Sums of the variance of single pixels against shot noise, a constant and its square."""
-    # The modes' own squares are what the residuals were robbed of.
+    # The squares of the modes are the variance that was removed from the residuals.
     terms = np.stack([part.shot * part.one, part.one**2, part.shot**2]).reshape(3, -1)
     some = terms.reshape(3, *part.one.shape)[:, ::STRIDE].reshape(3, -1)
     robbed = (part.modes**2).sum(axis=0).ravel()
@@ -240,18 +239,17 @@ def _variance(part: Residuals) -> tuple[F64, F64]:
 
 @dataclass(frozen=True)
 class _Level:
-    """One sequence of frames and the modes that were taken off it."""
+    """One sequence of frames and the modes that were removed from it."""
 
     e: F32  # (t, y, x) residuals over their variance
     charge: F32  # (y, x) 10⁴ e-
-    weight: F32  # (y, x) such that a product of two is the sum of the frames' weights
+    weight: F32  # (y, x); the product of two pixels' values is the sum of the frames' weights
 
     @classmethod
     def of(cls, part: Residuals) -> "_Level":
         one = part.one.max(axis=0)
         at_one = np.divide(part.charge.max(axis=0), one, out=np.zeros_like(one), where=one > 0)
-        # Both pixels of a pair count in a share of the frames; where neither is ever clipped, in
-        # all of them.
+        # Both pixels of a pair count in a share of the frames; in all if neither is ever clipped.
         weight = (part.one**2).sum(axis=0) / np.float32(np.sqrt(len(part.one)))
         modes, _, of_modes = part.taken
         return cls(np.concatenate([part.e * part.one, modes * of_modes]), at_one, weight)

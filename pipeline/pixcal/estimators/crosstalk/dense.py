@@ -1,10 +1,9 @@
 """A whole kernel: every coupling within two pixels, shrunk by its error instead of dropped.
 
 Shared noise, hot pixels and the pattern of the maps are joined as least-squares sums of the shares.
-A share is what all classes have in common both ways, what they have in common there rather than
-back, and what is its own; the sizes of these parts are learnt from all couplings of a kind
-(empirical Bayes, by expectation and maximisation). Parts that the data do not show are small by
-that.
+A share is a sum of a part common to all classes and both directions, a part common to all classes
+in one direction, and its own part. The sizes of these parts are learnt from all couplings of a kind
+(empirical Bayes, by expectation and maximisation), which makes undetected parts small.
 """
 
 from collections.abc import Callable, Collection, Iterable, Sequence
@@ -26,14 +25,14 @@ from pixcal.model.arrays import F64, Indices
 
 Sums = tuple[F64, F64]
 
-WITHIN = 2  # rows and columns of the kernel about its middle
-ROUNDS = 3  # of the shares, each with the second order of those before
-MAX_SHARES = 480  # that are measured together: time goes with the third power of their number
-NEGLIGIBLE = 1e-4  # share whose products with others do not count
-TURNS = 60  # of expectation and maximisation
-# size of a part of a share, and of a true pattern (px), that one value more is taken to have
+WITHIN = 2  # rows and columns of the kernel on either side of its centre
+ROUNDS = 3  # iterations of the shares, each with the second order of the last ones
+MAX_SHARES = 480  # most shares measured together: time goes with the third power of their number
+NEGLIGIBLE = 1e-4  # share below which products with others are neglected
+TURNS = 60  # iterations of expectation and maximisation
+# prior size of a part of a share, and of a true pattern (px), with the weight of one value
 USUAL, PATTERN = 4e-4, 1e-4
-START = (1e-2, 1e-3)  # sizes of these to start from
+START = (1e-2, 1e-3)  # start values of these sizes
 
 
 @dataclass(frozen=True)
@@ -42,9 +41,9 @@ class Dense:
 
     couplings: tuple[Coupling, ...]
     covariance: F64  # (n, n) of their shares
-    # rms of the true pattern of offsets that the data ask for beside the couplings
+    # rms of the true pattern of offsets that the data require in addition to the couplings
     pattern_px: float
-    ways: tuple[str, ...]  # of measuring
+    ways: tuple[str, ...]  # methods of measurement
 
     @property
     def shares(self) -> F64:
@@ -54,7 +53,7 @@ class Dense:
 
 @dataclass(frozen=True)
 class CouplingFrames:
-    """What frames tell of the couplings of some steps, before it is joined to classes."""
+    """What frames measure of the couplings of some steps, before pixels are joined in classes."""
 
     evidence: Evidence
     noise: Products | None
@@ -67,7 +66,7 @@ class CouplingFrames:
         return self.evidence.good.shape[0], self.evidence.good.shape[1]
 
     def measured(self, known: Sequence[Coupling], per_ke: float = 0.0) -> MeasuredLinks:
-        """The same to the first order of shares, those known giving the second."""
+        """The same to first order in the shares; known shares give the second order."""
         large = [replace(c, per_ke=per_ke) for c in known if abs(c.share) > NEGLIGIBLE]
         first = self.evidence.origin
         noise, hot = self.noise, self.hot
@@ -82,8 +81,8 @@ class CouplingFrames:
     ) -> "Dense | None":
         """All couplings of the steps for the classes of a period; None for more than `MAX_SHARES`.
 
-        Known couplings are started from. With ``per_ke``, a relative change of the shares with the
-        signal (1/ke-), maps do not count, which are those of one level.
+        Known couplings are the start values. With ``per_ke``, a relative change of the shares with
+        the signal (1/ke-), maps are not used, as they are of one level.
         """
         every = tuple(
             coupling_of(classes, *divmod(u, 2), step)
@@ -121,10 +120,10 @@ def frames_of(
     steps_in: Callable[[Place], tuple[Place, ...]],
     known: Sequence[Coupling] = (),
 ) -> CouplingFrames | None:
-    """What some parts of the frames tell together; None without light and dark signal.
+    """What several parts of the frames measure together; None without light and dark signal.
 
     ``parts``: of the same pixels, each needed once. ``steps_in``: steps (dy, dx) in a window of
-    some rows and columns. ``known``: couplings by which the charge follows from what is read.
+    given rows and columns. ``known``: couplings by which the charge follows from the signal.
     """
     noise: list[Products | None] = []
     first: Evidence | None = None
@@ -155,12 +154,12 @@ def dense_kernel(parts: Iterable[Evidence], start: Sequence[Coupling]) -> Dense 
 
 
 def within(shape: Place, far: Collection[Place] = ()) -> tuple[Place, ...]:
-    """Steps to partners within `WITHIN` pixels, and those of some others."""
+    """Steps to partners within `WITHIN` pixels, and those in ``far``."""
     return tuple(s for s in links(shape) if max(map(abs, s)) <= WITHIN or s in far)
 
 
 def _any_gain(sums: Sums, noise: Products, shares: F64) -> Sums:
-    """Sums where all shares may be wrong by the error of the shot noise they are measured in."""
+    """Sums that allow all shares a common factor, with the error of the shot noise."""
     normal, right = sums
     slope = normal @ shares
     inner = shares @ slope + (noise.shot / noise.shot_error) ** 2
@@ -168,7 +167,7 @@ def _any_gain(sums: Sums, noise: Products, shares: F64) -> Sums:
 
 
 def _sum(found: Sequence[Products | None]) -> Products | None:
-    """Of several parts of the frames."""
+    """Sum over several parts of the frames."""
     some = [one for one in found if one is not None]
     if len(some) < 2:
         return some[0] if some else None
@@ -186,7 +185,7 @@ def _sum(found: Sequence[Products | None]) -> Products | None:
 
 
 def _mean(found: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Mean of values by their errors, and its error."""
+    """Weighted mean of values, and its error."""
     values, errors = np.array(found).T
     weight = errors**-2
     return float(weight @ values / weight.sum()), float(weight.sum() ** -0.5)
@@ -205,7 +204,7 @@ def _shares_of(every: Sequence[Coupling], known: Sequence[Coupling]) -> F64:
 
 @dataclass(frozen=True)
 class ShareShrinkage:
-    """Parts of shares, and which of them are of one size."""
+    """Parts of shares, and which of them have a common size."""
 
     basis: F64  # (share, part) shares are this times their parts
     group: Indices  # (part,)
@@ -259,7 +258,7 @@ class ShareShrinkage:
 
 
 def _kind(step: Place) -> tuple[int, int]:
-    """Couplings that may well be of one size: along rows, along columns, or aslant, by distance."""
+    """Couplings of similar size: along rows, along columns, or diagonal, by distance."""
     dy, dx = abs(step[0]), abs(step[1])
     if dy and dx:
         return (1, 1) if dy == dx == 1 else (2, 2)

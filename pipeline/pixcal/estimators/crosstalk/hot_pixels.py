@@ -1,9 +1,9 @@
-"""Couplings from hot pixels in darks, the way of the paper: what their neighbours show.
+"""Couplings from the neighbours of hot pixels in darks, the method of the paper.
 
-The dark signal of a hot pixel is there whether or not light falls on it, and that of its neighbours
-is low: what they show is a share of it. Each direction is measured by itself, so this is the
-measurement that tells a coupling from its opposite. A neighbour may be warm by itself; so a share
-counts only where several hot pixels of a class agree.
+A hot pixel has dark signal without light, and its neighbours have little of their own: their signal
+is a share of it. Each direction is measured separately, so this method separates a coupling from
+its opposite. A neighbour may itself be warm; so a share counts only where several hot pixels of a
+class agree.
 """
 
 from collections.abc import Sequence
@@ -19,21 +19,21 @@ from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.arrays import F64, Indices, Mask
 
 MIN_SIGMAS = 40.0  # dark signal of a hot pixel over the noise of the others
-OVERLAP = 0.01  # another hot pixel near the receiver, of this share of the source, spoils it
-OVERLAP_KNOWN = 0.5  # the same where what it gives is known and taken off
-UNSURE = 0.3  # error of what is taken off, as a share of it
-OWN_RING = 0.1  # a pixel below this share of a neighbour may be read from it: no source
-# values beyond so many errors from the median of their class are left out, if they are few
+OVERLAP = 0.01  # signal of another hot pixel near a receiver, over the source, that spoils it
+OVERLAP_KNOWN = 0.5  # the same where its contribution is known and subtracted
+UNSURE = 0.3  # relative error of the subtracted contribution
+OWN_RING = 0.1  # a pixel below this share of a neighbour may be due to it: no source
+# values beyond this many errors from the median of their class are excluded, if they are few
 CLIP = 5.0
-RISE = 1e-4  # how much brighter-fatter may well make a share rise with the charge, 1/ke-
-ENOUGH = 4  # values beyond the first that tell a rise with the charge from disagreement
-MIN_LEVELS = 3  # hot pixels of a coupling that tell whether its share changes with the signal
+RISE = 1e-4  # typical rise of a share with the charge by brighter-fatter, 1/ke-
+ENOUGH = 4  # values beyond the first that separate a rise with the charge from disagreement
+MIN_LEVELS = 3  # fewest hot pixels of a coupling for a change of its share with the signal
 MAX_PIXELS = 4000  # hot pixels used, the brightest
 
 
 @dataclass(frozen=True)
 class HotPixels:
-    """What each hot pixel shows of each link, both ways."""
+    """Shares that each hot pixel measures for each link, in both directions."""
 
     y: Indices  # y, x: (h,)
     x: Indices
@@ -45,10 +45,10 @@ class HotPixels:
     shape: Place  # rows and columns of the maps
 
     def corrected(self, outflow: F64, per_ke: float) -> "HotPixels":
-        """Shares of what a hot pixel had, at small signals; they were measured of what it kept.
+        """Shares of a hot pixel's original charge, at small signals, from those of what it kept.
 
-        Each pixel gives away the share ``outflow`` (y, x), which changes with the charge by
-        ``per_ke``, 1/ke-.
+        Each pixel loses the share ``outflow`` (y, x), which changes with the charge by ``per_ke``,
+        1/ke-.
         """
         lost = outflow[self.y, self.x]
         charge = self.charge / (1 - lost * (1 + per_ke * self.charge))
@@ -59,7 +59,7 @@ class HotPixels:
     def by_class(
         self, classes: PixelClasses, links: tuple[Place, ...], doubt: float = 0.0
     ) -> "ClassShares":
-        """What the hot pixels of each class show together; ``doubt``: relative error of each."""
+        """Combined hot pixels of each class; ``doubt``: relative error of each."""
         step = np.array(links)
         y = np.stack([np.broadcast_to(self.y[:, None], (len(self.y), len(step)))] * 2, -1)
         x = np.stack([np.broadcast_to(self.x[:, None], (len(self.x), len(step)))] * 2, -1)
@@ -97,7 +97,7 @@ class HotPixels:
 
 @dataclass(frozen=True)
 class ClassShares:
-    """Shares that hot pixels show, (link, class, 2) each: there and back."""
+    """Shares from hot pixels, (link, class, 2) each: there and back."""
 
     # weight, value, charge: information (1 / sigma²), weighted means of the share and of the
     # charge (10³ e-)
@@ -111,7 +111,7 @@ class ClassShares:
     count: F64  # hot pixels used
 
     def without(self, some: Mask) -> "ClassShares":
-        """The same with some of no weight."""
+        """The same with zero weight for ``some``."""
         return replace(
             self,
             weight=np.where(some, 0.0, self.weight),
@@ -135,7 +135,7 @@ class ClassShares:
 def hot_pixels(
     evidence: Evidence, links: tuple[Place, ...], known: Sequence[Coupling] = ()
 ) -> HotPixels | None:
-    """Find hot pixels and what their neighbours show; None where no dark signal was measured."""
+    """Find hot pixels and shares in their neighbours; None where no dark signal was measured."""
     exposures = [s.exptime_s for s in evidence.of_kind("dark") if np.isfinite(s.exptime_s)]
     if not exposures or not np.any(evidence.dark_rate):
         return None
@@ -154,7 +154,7 @@ def hot_pixels(
     warm = np.where((rest > least) & highest, rest, 0.0)
     got, shares = _given(warm, y, x, links, known, evidence.origin)
     if known:
-        # Pixels that show much more than what they are given are warm by themselves.
+        # Pixels with much more signal than they receive are warm themselves.
         warm = np.where((warm > 0) | (rest - got > np.maximum(least, got)), rest, 0.0)
         got, shares = _given(warm, y, x, links, known, evidence.origin)
     rest = rest - got
@@ -179,7 +179,7 @@ def _given(
     known: Sequence[Coupling],
     first: Place,
 ) -> tuple[F64, F64]:
-    """What pixels (y, x) get of all hot ones, e-, and the share (h, link, 2) of each in it."""
+    """Charge (y, x) received from all hot pixels, e-, and the share (h, link, 2) of each in it."""
     shape = (warm.shape[0], warm.shape[1])
     kept = 1 - outflow(known, shape, first)
     collected = warm / kept
@@ -203,7 +203,7 @@ def _unsaturated(evidence: Evidence) -> Mask:
 
 
 def _patches(rest: F64, warm: F64, y: Indices, x: Indices, overlap: float) -> tuple[F64, Mask]:
-    """Surroundings (h, row, column) of hot pixels, and where no other hot pixel spoils them."""
+    """Surroundings (h, row, column) of hot pixels, and where no other hot pixel disturbs them."""
     size = 2 * REACH
     near = _surroundings(rest, y, x, REACH)
     others = np.nan_to_num(_surroundings(warm, y, x, size))
@@ -239,11 +239,11 @@ def _agreed(v: F64, s: F64, q: F64) -> F64:
         for a, b in ((q - charge, q - charge), (q - charge, v - mean), (v - mean, v - mean))
     )
     freedom = kept.sum(axis=0) - 1
-    # What rises with the charge is told apart later.
+    # A rise with the charge is handled later.
     rising = (freedom >= ENOUGH) & (square > 0)
     rest = rest - np.where(rising, product**2 / np.where(rising, square, 1), 0)
     freedom = np.maximum(freedom - rising, 0)
-    # Reduced chi-square that chance passes once in a thousand (Wilson and Hilferty's cube).
+    # Reduced chi-square exceeded by chance once in a thousand (Wilson and Hilferty's cube).
     some = np.maximum(freedom, 1)
     usual = (1 - 2 / (9 * some) + 3.09 * np.sqrt(2 / (9 * some))) ** 3
     apart = (freedom > 0) & (rest > usual * freedom)

@@ -1,8 +1,7 @@
-"""What is known of the shares of every link, for classes of pixels of any period.
+"""Information on the shares of every link, for classes of pixels of any period.
 
-Each class of pixels has two unknown shares for a link, there and back. Noise, freed of what is
-beyond the first order of the shares, and hot pixels are joined here as least-squares sums of the
-same unknowns.
+Each class of pixels has two unknown shares for a link, there and back. Noise, reduced to first
+order in the shares, and hot pixels are combined here as least-squares sums of the same unknowns.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,24 +18,24 @@ from pixcal.kernels.crosstalk import Coupling, outflow
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F32, F64, Mask
 
-# how large the covariance of neighbours over the square of their charge may well be, 1/e-
+# prior 1-sigma of the covariance of neighbours over the square of their charge, 1/e-
 BRIGHTER_FATTER = 1e-6
-ONE_WAY = 0.01  # how much the shares there and back may well differ
-LARGEST = 0.1  # how large a share may well be
-# error of what a single hot pixel shows, as a share of it: a neighbour may be warm by itself
+ONE_WAY = 0.01  # prior 1-sigma of the difference of the shares there and back
+LARGEST = 0.1  # prior 1-sigma of a share
+# relative error of the share from a single hot pixel: its neighbour may itself be warm
 DOUBT = 0.25
 MARKED = 4.0  # sigmas beyond which two numbers differ, or one is not zero
-BACKED = 2.5  # sigmas of the noise's own share that back a single hot pixel
+BACKED = 2.5  # sigmas of the share from noise that confirm a single hot pixel
 _ONE_LAW = (0, 1, 2, 4)  # `TERMS` without brighter-fatter's own
 
 
 @dataclass(frozen=True)
 class Information:
-    """Least-squares sums of shares, by way of measuring."""
+    """Least-squares sums of shares, by method of measurement."""
 
-    # normal, right: (..., u, u), (..., u): unknown `2 c` is what
-    # pixels of class c give over the link, `2 c + 1` what their partners give back. With a
-    # leading axis for many links
+    # normal, right: (..., u, u), (..., u): unknown `2 c` is the share that pixels of class c give
+    # over the link, `2 c + 1` the share that their partners give back. With a leading axis for
+    # many links
     normal: dict[str, F64]
     right: dict[str, F64]
 
@@ -49,13 +48,13 @@ class Information:
 
     @property
     def total(self) -> tuple[F64, F64]:
-        """All ways together."""
+        """Sum over all methods."""
         return np.sum([*self.normal.values()], axis=0), np.sum([*self.right.values()], axis=0)
 
 
 @dataclass(frozen=True)
 class MeasuredLinks:
-    """What was measured of some links, freed of what is known already (second order)."""
+    """Measurements of some links, corrected for known terms of second order."""
 
     products: Products | None
     hot: HotPixels | None
@@ -73,7 +72,7 @@ class MeasuredLinks:
         return replace(self, products=products, hot=hot, links=tuple(self.links[n] for n in at))
 
     def level_dependence(self, couplings: Sequence[Coupling]) -> tuple[float, float]:
-        """Relative change of the shares with the signal beside theirs, 1/ke-, and its error."""
+        """Further relative change of the shares with the signal, 1/ke-, and its error."""
         found = []
         if self.hot is not None:
             found.append(self.hot.level_dependence(couplings, self.links, self.first))
@@ -102,8 +101,8 @@ class MeasuredLinks:
             yield classes, Information(normal, right)
 
     def of_period(self, classes: PixelClasses) -> Information:
-        """All links for one period, hot pixels taken at their word where they agree."""
-        # A hot pixel that is alone in its class counts where the noise says the same.
+        """All links for one period, without `DOUBT` for hot pixels that agree."""
+        # A single hot pixel of a class counts where the noise confirms it.
         normal, right = self._of_noise(*(sums_of(sums, classes) for sums in self._sums))
         if self.hot is not None:
             shown = self.hot.by_class(classes, self.links)
@@ -155,10 +154,10 @@ def _shares(right: F64, normal: F64, read: float) -> tuple[F64, F64]:
 def to_first_order(
     found: Products, couplings: Sequence[Coupling], links: Sequence[Place], first: Place
 ) -> Products:
-    """Products from which shares follow to first order, from those that are measured.
+    """Products that are first order in the shares, from the measured products.
 
     A pixel keeps only a part of its charge; third pixels give to both partners; shares may change
-    with the charge; and all are measured in the shot noise of a pixel.
+    with the charge; and the unit of all is the shot noise of a pixel.
     """
     shape = (found.right.shape[-2], found.right.shape[-1])
     right = found.right / np.float32(found.shot)
@@ -173,7 +172,7 @@ def to_first_order(
                 there[here] += c.share
             elif (-c.dy, -c.dx) == step:
                 back[receiver] += c.share
-        # Beyond the border there are no products, so that what rolls over does not count.
+        # There are no products beyond the border, so wrapped values do not count.
         partner = np.roll(kept, (-step[0], -step[1]), (0, 1))
         shared = third.get(step, np.zeros(shape)) / 2
         offsets = {0: there * (kept - 1) + shared, 1: back * (partner - 1) + shared}
@@ -190,9 +189,9 @@ def to_first_order(
 def level_dependence(
     found: Products, couplings: Sequence[Coupling], links: Sequence[Place]
 ) -> tuple[float, float]:
-    """Relative change of the shares with the source's charge, 1/ke-, beside theirs, and its error.
+    """Further relative change of the shares with the source's charge, 1/ke-, and its error.
 
-    From covariance that rises with the square of the charge otherwise than the variance does.
+    From covariance whose rise with the square of the charge differs from that of the variance.
     """
     sizes = {(c.dy, c.dx): 0.0 for c in couplings}
     lost = got = 0.0
@@ -215,7 +214,7 @@ def level_dependence(
         weight += slope**2 / float(covariance[-1, -1])
     if not weight:
         return 0.0, np.inf
-    # The slope of the variance of a pixel that loses less at high charge, beside what others give.
+    # Slope of the variance of a pixel that loses less at high charge, and receives from others.
     own = 4 * _per_unit(couplings) * (got - lost * (1 - lost)) / ((1 - lost) ** 2 + got)
     per_ke = 1 / (2 * UNIT * 1e-3)
     more = right / weight - (found.curve - own) * per_ke
@@ -225,12 +224,12 @@ def level_dependence(
 
 
 def _per_unit(couplings: Sequence[Coupling]) -> float:
-    """Relative change of the shares, which all have in common, 1/(10⁴ e-)."""
+    """Relative change common to all shares, 1/(10⁴ e-)."""
     return couplings[0].per_ke * UNIT * 1e-3 if couplings else 0.0
 
 
 def _third_pixels(couplings: Sequence[Coupling], shape: Place, first: Place) -> dict[Place, F64]:
-    """By step, at a link's first pixel: product of what both partners get of a third."""
+    """By step, at a link's first pixel: product of the shares of both partners from a third."""
     period = lcm(*(c.every_rows for c in couplings)), lcm(*(c.every_columns for c in couplings))
     given: dict[Place, F64] = {}
     for c in couplings:

@@ -1,4 +1,4 @@
-"""The kernel: what darks, noise and maps say together, and each by itself."""
+"""The kernel from darks, noise and maps together, and from each alone."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,13 +15,13 @@ from pixcal.kernels.crosstalk import Coupling
 from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
 
-LEVEL_STEPS = 10  # steps of a level dependence
-CERTAIN = 5.0  # sigmas beyond which a level dependence is taken
-# sigmas beyond which a coupling is told of: of a hundred that are none, one in twenty kernels
+LEVEL_STEPS = 10  # most iterations of a level dependence
+CERTAIN = 5.0  # sigmas beyond which a level dependence is accepted
+# sigmas beyond which a coupling is reported: with a hundred tested, one false in twenty kernels
 THERE = 3.5
-# pixels of flats that are looked at: the sums of pairs up to `links.REACH` apart fill 600 MB
+# most pixels of flats: their sums of pairs up to `links.REACH` apart fill 600 MB
 MOST_PIXELS = 1 << 17
-ALIKE = 0.05  # chance from which shares of all classes are taken to be one
+ALIKE = 0.05  # p-value from which the shares of all classes are taken as equal
 
 
 @dataclass(frozen=True)
@@ -30,20 +30,20 @@ class Kernel:
 
     couplings: tuple[Coupling, ...]
     covariance: F64  # (n, n) of their shares
-    significance: float  # of the strongest, in sigmas, corrected for all that was tried
-    by: tuple[str, ...]  # ways of measuring
+    significance: float  # of the strongest, in sigmas, corrected for the number of trials
+    by: tuple[str, ...]  # methods of measurement
     # per_ke, per_ke_error: relative change of the shares with the source's signal, 1/ke-, where
-    # they fall; the error infinite where nothing tells
+    # they fall; the error is infinite where it is not constrained
     per_ke: float
     per_ke_error: float
     whole: tuple[Coupling, ...] = ()  # all that were measured, significant or not
 
 
 def measure(evidence: Evidence) -> Kernel | None:
-    """Couplings of an acquisition; None where it has neither light nor dark signal to tell.
+    """Couplings of an acquisition; None where it has neither light nor dark signal.
 
-    What stands out gives the period; then all within two pixels are measured together. Raises
-    InputError if so many stand out that it is no kernel.
+    Significant couplings give the period; then all within two pixels are measured together. Raises
+    InputError if too many are significant for a kernel.
     """
     stands_out = _standing_out(evidence)
     if stands_out is None:
@@ -56,7 +56,7 @@ def measure(evidence: Evidence) -> Kernel | None:
     known: tuple[Coupling, ...] = ()
     per_ke, error = 0.0, np.inf
     for _ in range(2):
-        # The second time with the charge as it was collected, and all hot pixels.
+        # The second pass uses the charge as collected, and all hot pixels.
         own = frames_of([evidence], lambda _: near, known)
         dense = None if own is None else own.kernel(found.classes, known, per_ke)
         if own is None or dense is None:
@@ -76,7 +76,7 @@ def significance(evidence: Evidence) -> float | None:
 
 
 def _standing_out(evidence: Evidence) -> tuple[Evidence, tuple[Place, ...], Choice] | None:
-    """The pixels that are looked at, all links of theirs, and which of these stand out."""
+    """The pixels examined, all their links, and which of these are significant."""
     if not evidence.fringes:
         evidence = central_crop(evidence, MOST_PIXELS)
     every = links(_shape(evidence))
@@ -93,8 +93,8 @@ def _shape(evidence: Evidence) -> Place:
 def _level(
     frames: CouplingFrames, dense: Dense, found: Choice, per_ke: float
 ) -> tuple[Dense, float, float]:
-    """By how much (1/ke-) shares fall with the signal, zero if they may not, and its error."""
-    # Shares that rise may be brighter-fatter; those that fall cannot.
+    """Relative fall (1/ke-) of shares with the signal, zero if not significant, and its error."""
+    # Shares that rise may be due to brighter-fatter; those that fall are not.
     error = np.inf
     for _ in range(LEVEL_STEPS):
         there = np.abs(dense.shares) > THERE * np.sqrt(np.diag(dense.covariance))
@@ -112,14 +112,14 @@ def _level(
 
 
 def _told(dense: Dense, about: Kernel) -> Kernel:
-    """The couplings that are there, those that all classes have alike as one."""
+    """The significant couplings; those equal in all classes as one."""
     basis, couplings = _plain(dense)
     if not couplings:
         return about
     precision = np.linalg.inv(dense.covariance)
     covariance = np.asarray(np.linalg.inv(basis.T @ precision @ basis), float)
     shares = covariance @ basis.T @ precision @ dense.shares
-    # Of several shares that may well be one, each has the error that it has by itself.
+    # Shares that may be equal keep their individual errors.
     for n, (column, own) in enumerate(zip(basis.T > 0, np.diag(covariance), strict=True)):
         each = float(np.diag(dense.covariance)[column].mean())
         covariance[n, n] = max(own, each) if column.sum() > 1 else own
@@ -134,8 +134,8 @@ def _told(dense: Dense, about: Kernel) -> Kernel:
 
 def _plain(dense: Dense) -> tuple[F64, list[Coupling]]:
     """Basis (share, number) of the significant couplings of a kernel, and these couplings."""
-    # Where noise alone tells, it tells the sum of the shares there and back: a pair of pixels whose
-    # sum is significant has both, even if neither is by itself, or one of them only just is.
+    # Noise alone measures the sum of the shares there and back: a pair whose sum is significant has
+    # both, even if neither is significant alone, or only one of them just is.
     columns: list[F64] = []
     couplings: list[Coupling] = []
     steps = dict.fromkeys((c.dy, c.dx) for c in dense.couplings)
@@ -151,12 +151,12 @@ def _plain(dense: Dense) -> tuple[F64, list[Coupling]]:
     return np.array(columns).T, couplings
 
 
-# which shares of a kernel are one number, and the coupling that they are
+# which shares of a kernel are one number, and their coupling
 Part = tuple[F64, Coupling]
 
 
 def _of_step(dense: Dense, step: tuple[int, int]) -> list[Part]:
-    """The shares of all classes over a step, each by itself."""
+    """The shares of all classes over a step, one by one."""
     every = np.eye(len(dense.couplings))
     return [(every[n], c) for n, c in enumerate(dense.couplings) if (c.dy, c.dx) == step]
 
@@ -168,7 +168,7 @@ def _alike(group: Sequence[Part]) -> Part:
 
 
 def _significant(dense: Dense, group: Sequence[Part]) -> list[Part]:
-    """Of the classes' shares over a step those that are significant; one, where all are alike."""
+    """The significant shares of classes over a step; a single one where all are equal."""
     at = np.flatnonzero(np.sum([column for column, _ in group], axis=0))
     precision = np.linalg.inv(dense.covariance[np.ix_(at, at)])
     shares, weight = dense.shares[at], float(precision.sum())

@@ -10,8 +10,8 @@ from pixcal.model.arrays import F32, F64, Indices
 
 Place = tuple[int, int]
 
-REACH = 5  # rows and columns within which couplings are looked for
-MAX_PERIOD = 8  # longest period of a kernel that is looked for, rows and columns
+REACH = 5  # rows and columns within which couplings are sought
+MAX_PERIOD = 8  # longest period of a kernel, rows and columns
 MAX_CLASSES = 16  # most classes of pixels that a period in both directions may make
 MIN_REPEATS = 4  # periods that the window must hold at least
 
@@ -29,7 +29,7 @@ def links(shape: Place, reach: int = REACH) -> tuple[Place, ...]:
 
 @dataclass(frozen=True)
 class PixelClasses:
-    """Pixels whose row and column leave the same rest by the period."""
+    """Pixels whose row and column have the same remainder modulo the period."""
 
     rows: int  # rows, columns: period
     columns: int
@@ -46,7 +46,7 @@ class PixelClasses:
         return np.asarray(row * self.columns + column)
 
     def shifted(self, number: int, by: Place) -> int:
-        """Class of the pixel so many rows and columns from one of class ``number``."""
+        """Class of the pixel ``by`` rows and columns from one of class ``number``."""
         row, column = divmod(number, self.columns)
         return (row + by[0]) % self.rows * self.columns + (column + by[1]) % self.columns
 
@@ -66,13 +66,13 @@ class PixelClasses:
         return np.asarray(row % self.rows * self.columns + column % self.columns)
 
     def coupling(self, number: int, step: Place, share: float) -> Coupling:
-        """Of the pixels of a class, with those a step away."""
+        """Coupling of the pixels of a class with those a step away."""
         row, column = divmod(number, self.columns)
         return Coupling(*step, share, self.rows, row, self.columns, column)
 
 
 def periods(shape: Place) -> list[Place]:
-    """Periods (rows, columns) that a window can tell, the shortest first."""
+    """Periods (rows, columns) that fit a window, the shortest first."""
     rows = range(1, max(1, min(MAX_PERIOD, shape[0] // MIN_REPEATS)) + 1)
     columns = range(1, max(1, min(MAX_PERIOD, shape[1] // MIN_REPEATS)) + 1)
     both = ((n, m) for n in rows for m in columns if n * m <= MAX_CLASSES)
@@ -81,11 +81,11 @@ def periods(shape: Place) -> list[Place]:
 
 def class_sums(values: F32 | F64, first: Place) -> Iterator[tuple[PixelClasses, F64]]:
     """Sums (..., class) of maps (..., y, x) over the pixels of each class, for every period."""
-    # Rows first, then columns of those sums: the cost is that of the row periods.
+    # Rows first, then columns of those sums: row periods dominate the cost.
     wanted = periods((values.shape[-2], values.shape[-1]))
     by_rows: dict[int, F32 | F64] = {}
     for n in sorted({n for n, _ in wanted}, reverse=True):
-        # Of a multiple's sums there are few.
+        # Sums for a multiple of the period are fewer to add up.
         multiple = next((sums for longer, sums in by_rows.items() if longer % n == 0), None)
         source, start = (values, first[0]) if multiple is None else (multiple, 0)
         sums = [source[..., (a - start) % n :: n, :].sum(-2, dtype=float) for a in range(n)]

@@ -1,13 +1,13 @@
 """Couplings from the maps of a fit, class by class of pixels: visibility, and offsets.
 
-A pixel that gets the share k of one a step n away, and keeps the share o, has its fringe multiplied
-by ``(o + sum k exp(-i K n)) / (o + sum k)``, whatever the flat. Its size shows in the visibility,
-its angle in the offset, as a shift of ``arg / |K|``. A true displacement is the same at every K; so
-of the offsets only what differs between sets counts, which needs more sets than the two axes. The
-visibility tells with one set, up to pixels of a class being wider than those of another (`WIDTH`).
+A pixel that receives the share k from one a step n away, and keeps the share o, has its fringe
+multiplied by ``(o + sum k exp(-i K n)) / (o + sum k)``, whatever the flat. The modulus changes the
+visibility, the angle shifts the offset by ``arg / |K|``. A true displacement is the same at every
+K, so only differences of offsets between sets count, which needs more sets than the two axes. The
+visibility needs one set, if pixels of all classes are equally wide (to within `WIDTH`).
 
-True offsets have a pattern of classes by chance; or a real one, whose size is learnt beside the
-couplings (`dense`). Known couplings are undone on the maps; what is left is linear in the rest.
+True offsets have a pattern of classes by chance, or a real one, whose size is learnt together with
+the couplings (`dense`). Maps are corrected for known couplings; the others then act linearly.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,18 +24,18 @@ from pixcal.kernels.crosstalk import Coupling, filled, outflow, uncouple_fringes
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.arrays import C128, F64, Mask
 
-CLIP = 5.0  # offsets and visibilities beyond so many robust deviations do not count
-ROUNDS = 4  # in which these are found: without them, what is smooth is known better
-WIDTH = 0.01  # how much the pixels of a class may well be wider than others, px
-DEGREE = 3  # of the polynomial that takes up what is smooth
+CLIP = 5.0  # offsets and visibilities beyond this many robust deviations are outliers
+ROUNDS = 4  # iterations of clipping: smooth modes are fitted better without outliers
+WIDTH = 0.01  # prior 1-sigma of the width of a class of pixels relative to others, px
+DEGREE = 3  # of the polynomial that absorbs smooth variation
 MIN_PIXELS = 100
 
 
 @dataclass(frozen=True)
 class _Pattern:
-    """A set's maps by class, smooth modes taken off."""
+    """A set's maps by class, without smooth modes."""
 
-    axis: F64  # (2,) that the offsets are along
+    axis: F64  # (2,) direction of the offsets
     # delta, visibility: (class,) sums of the offsets (px) and of the logarithm of the
     # visibility, without the couplings
     delta: F64
@@ -105,7 +105,7 @@ def _of_set(
     smooth: F64,
     members: F64,
 ) -> _Pattern:
-    # Flagged pixels were fitted too: what they give to others is known.
+    # Flagged pixels were fitted too, so their contribution to others is known.
     read = filled(found.theta / found.shot_factor, found.k)
     theta = uncouple_fringes(read, couplings, found.origin)
     k = float(np.hypot(*found.k))
@@ -120,8 +120,8 @@ def _of_set(
 
 
 def _clipped(values: F64, modes: F64) -> tuple[F64, float]:
-    """Values freed of modes, zero where they are outliers, and their robust scatter."""
-    # Outliers would move all modes, and those of fringes look like a period of rows.
+    """Values without modes, zero where they are outliers, and their robust scatter."""
+    # Outliers would move all modes, and fringe modes resemble a period of rows.
     for _ in range(ROUNDS):
         rest = without(values, modes)
         sigma = float(median_and_sigma(rest)[1])
@@ -165,7 +165,7 @@ def _offsets(found: Sequence[_Pattern], gram: F64) -> tuple[F64, F64]:
 
 
 def good_in_all(evidence: Evidence) -> Mask:
-    """Pixels, except at the border, that every fringe set has an offset of; none without sets."""
+    """Pixels off the border with an offset in every fringe set; none without sets."""
     sets = evidence.fringes.values()
     good: Mask = np.zeros(evidence.good.shape, bool)
     rows, columns = good.shape
@@ -183,7 +183,7 @@ def log_visibility(theta: F64, good: Mask) -> F64:
 
 
 def smooth_modes(sets: Sequence[FringeEvidence], good: Mask) -> F64:
-    """Orthonormal (mode, pixel): what is smooth, and the fringes left by free light."""
+    """Orthonormal (mode, pixel): smooth variation, and the fringes left by free light."""
     shape = (good.shape[0], good.shape[1])
     y, x = grid(shape)
     modes = [polynomial_basis(shape, DEGREE)[good.ravel()].T]
@@ -195,7 +195,7 @@ def smooth_modes(sets: Sequence[FringeEvidence], good: Mask) -> F64:
 
 
 def without(values: F64, modes: F64) -> F64:
-    """Values (..., pixel) freed of modes."""
+    """Values (..., pixel) without modes."""
     return np.asarray(values - (values @ modes.T) @ modes)
 
 
@@ -221,7 +221,7 @@ def _slope_at(
 def response_slopes(
     k: tuple[float, float], couplings: Sequence[Coupling], classes: PixelClasses
 ) -> C128:
-    """Derivative (n, class) of the log of what couplings multiply a fringe k (rad/px) by."""
+    """Derivative (n, class) of the log of the factor of couplings on a fringe k (rad/px)."""
     reach = max(max(abs(c.dy), abs(c.dx)) for c in couplings)
     rows, columns = (period * -(-reach // period) for period in (classes.rows, classes.columns))
     shape = (2 * rows + classes.rows, 2 * columns + classes.columns)

@@ -1,10 +1,10 @@
-"""Frames less what they should be, as noise that can be correlated between pixels.
+"""Residuals of frames, as noise to be correlated between pixels.
 
-Taken off are what is common to the pixels of a frame (offset; light, contrast and phase, the same
-over the window or growing along it) and what is common to the frames of a pixel (its level; its
-light and fringe, and the harmonics that a curved response makes). The first correlates what is
-left, with the negative of the modes' products; the modes are kept, so that this can be made good.
-The second makes it smaller, which is made good here.
+Two parts are removed: what is common to the pixels of a frame (offset; light, contrast and phase,
+constant over the window or linear along it), and what is common to the frames of a pixel (its
+level; its light and fringe, and the harmonics of a nonlinear response). Removing the first
+correlates residuals by minus the products of the modes, which are kept to correct for that.
+Removing the second makes residuals smaller, which is corrected here.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,20 +19,20 @@ from pixcal.kernels.crosstalk import Coupling, filled, noise_shares, uncouple, u
 from pixcal.kernels.line_means import without_line_means
 from pixcal.model.arrays import F32, F64, Indices
 
-UNIT = 1e4  # electrons that charge is counted in; variances are in 10⁴ e-²
-CLIP = 6.0  # residuals beyond so many sigmas (particles, telegraph noise) do not count
-# samples of one sequence that are used at most; of longer ones frames spread over it
+UNIT = 1e4  # unit of charge, electrons; variances are in 10⁴ e-²
+CLIP = 6.0  # residuals beyond this many sigmas (particles, telegraph noise) are excluded
+# most samples of a sequence; longer ones are thinned to frames spread over them
 MAX_SAMPLES = 6_000_000
-MIN_FRAMES = 16  # fewest frames of a fringe set that leave residuals
-# every so many frames the modes are kept; they change little, and only their products count
+MIN_FRAMES = 16  # fewest frames of a fringe set for residuals
+# modes are kept at this interval of frames; they change little, and only their products count
 STRIDE = 16
-LEVELS = 128  # of the response, which all pixels have in common
-MIN_NOISE_SHARE = 0.1  # least share of a sample's noise that is left, of those that count
+LEVELS = 128  # of the response common to all pixels
+MIN_NOISE_SHARE = 0.1  # least share of its noise that a usable sample retains
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Some frames in units of their noise; zero where a sample has no weight."""
+    """Residuals in units of their noise; zero where a sample has no weight."""
 
     e: F32  # (t, y, x) residual over its sigma
     charge: F32  # (t, y, x) mean charge as collected, which is its variance, over sigma (10⁴ e-)

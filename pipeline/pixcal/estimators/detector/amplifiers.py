@@ -1,9 +1,9 @@
 """Amplifiers of slightly different gain: steps in the flat that the noise has as well.
 
-A step of the response between two blocks of columns or rows is one of the gain if the shot noise
-steps with it: of two amplifiers the one with more e-/ADU gives fewer ADU for the same light, and
-its noise, counted with the common gain, is smaller by the same factor. Where the pixels
-themselves respond differently the noise follows the light, and does not step.
+A response step between two blocks of columns or rows is a gain step if the shot noise steps with
+it. The amplifier with more e-/ADU gives fewer ADU for the same light, and its noise, computed with
+the common gain, is smaller by the same factor. Where the pixels themselves respond differently,
+the noise follows the light and has no step.
 """
 
 import numpy as np
@@ -12,10 +12,10 @@ from numpy.polynomial.legendre import legvander
 from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F64, Mask
 
-MAX_BOUNDARIES = 7  # boundaries that are looked for along each axis
-NARROWEST = 8  # rows or columns of an amplifier at least
+MAX_BOUNDARIES = 7  # most boundaries along each axis
+NARROWEST = 8  # fewest rows or columns of an amplifier
 SIGNIFICANT = 6.0  # standard deviations of a step of the flat
-SMOOTH = 2  # degree of what the lamp does beside the steps
+SMOOTH = 2  # degree of the lamp's variation
 
 
 def relative_gain(flat: F64, noise: F64, good: Mask) -> F64:
@@ -44,7 +44,7 @@ def relative_gain(flat: F64, noise: F64, good: Mask) -> F64:
 
 
 def _profile(values: F64, axis: int) -> F64:
-    """Mean of each row (axis 0) or column (1); of empty ones the median of all."""
+    """Mean of each row (axis 0) or column (1); the median of all for empty ones."""
     count = np.isfinite(values).sum(axis=1 - axis)
     found = np.full(values.shape[axis], np.nanmedian(values))
     kept = np.compress(count > 0, values, axis=axis)
@@ -79,7 +79,7 @@ def _terms(count: int, steps: list[int]) -> F64:
 
 
 def _sizes(along: F64, steps: list[int]) -> tuple[F64, F64]:
-    """Steps of a profile, and their errors by its scatter."""
+    """Steps of a profile, and their errors from its scatter."""
     terms = _terms(len(along), steps)
     inverse = np.linalg.inv(terms.T @ terms)
     fitted = inverse @ (terms.T @ along)

@@ -1,7 +1,7 @@
-"""Which pixels are bad, one rule a flag. A flag is set only where there are data to decide.
+"""Which pixels are bad: one rule per flag, which is set only where there are data to decide.
 
-The rules compare a pixel with the others, and ask that the difference is beyond what the noise of
-the frames can do: on a perfect detector fewer than one pixel in 10⁵ is flagged.
+The rules compare a pixel with others, and require a difference larger than the noise of the frames
+can cause: on a perfect detector fewer than one pixel in 10⁵ is flagged.
 """
 
 from collections.abc import Sequence
@@ -13,10 +13,10 @@ from pixcal.estimators.detector.calibration import MIN_RUNGS, Rung
 from pixcal.kernels.robust import lit, median_and_sigma
 from pixcal.model.arrays import F64, Mask
 
-NEIGHBOURS = 16  # pixels along each side of the blocks whose median a response is compared with
+NEIGHBOURS = 16  # side (px) of the blocks whose median a pixel is compared with
 
-# rows and columns to pixels on squares about one, of its colour in a mosaic; opposite ones are
-# as far from either end of the list
+# rows and columns to pixels of the same mosaic colour on squares about one; opposite ones are
+# equally far from the two ends of the list
 _AROUND = np.array(np.meshgrid(*[np.arange(-6, 7, 2)] * 2, indexing="ij")).reshape(2, -1).T
 _RINGS = tuple(_AROUND[abs(_AROUND).max(axis=1) == reach] for reach in (2, 4, 6))
 _FALSE_ALARM = 1e-6
@@ -31,7 +31,7 @@ _DEGREE = 3
 _FARTHEST = 4.0
 _CLIPPINGS = 4
 _CLIP = 4.0
-_POPULATION = 4.0  # spreads of the logarithm of the noise that a population of pixels reaches
+_POPULATION = 4.0  # standard deviations of log noise up to which pixels are of one population
 _SPREAD_DOF = 8
 _QUARTILE = 0.6745  # of a normal distribution, in standard deviations
 _FEWEST = 64
@@ -39,12 +39,11 @@ _SAMPLE = 4096
 
 
 def hot(rate: F64, error: F64, sigma: float, limit: float) -> Mask:
-    """Dark signal far above that of the neighbours: the glow of an amplifier is none.
+    """Pixels with dark signal far above their neighbours; amplifier glow does not count.
 
-    rate, error : (y, x) dark signal of each pixel and its standard error (ADU/s), from a border of
-        blocks on
-    sigma : robust spread of the detector's dark signals (ADU/s); that of the neighbours may be
-        larger
+    rate, error : (y, x) dark signal of each pixel and its standard error (ADU/s), starting at a
+        block boundary
+    sigma : robust spread of the detector's dark signals (ADU/s); the neighbours' may be larger
     limit : in units of ``sigma``
     """
     median, upper = _around(rate)
@@ -53,12 +52,12 @@ def hot(rate: F64, error: F64, sigma: float, limit: float) -> Mask:
 
 
 def dead(flat: F64, error: F64, low: float, high: float, floor: float) -> Mask:
-    """Response far below or above that of the neighbours, or next to none at all.
+    """Pixels with response far below or above their neighbours, or almost none.
 
-    flat, error : (y, x) relative response and its standard error, from a border of blocks on
+    flat, error : (y, x) relative response and its standard error, starting at a block boundary
     low, high : limits in units of the median of the pixel's block, and of the upper quartile of
-        those in it above ``floor``: beside a dark edge most may see no light
-    floor : lowest response at all
+        its pixels above ``floor``: near a dark edge most may be unlit
+    floor : lowest response of a lit pixel
     """
     median, upper = _around(flat)[0], _around(np.where(flat < floor, np.nan, flat))[1]
     below = (flat < low * median) & (median - flat > _SIGNIFICANT * error)
@@ -70,10 +69,10 @@ def dead(flat: F64, error: F64, low: float, high: float, floor: float) -> Mask:
 
 
 def _below_rings(flat: F64, where: Mask, factor: float) -> Mask:
-    """Whether some pixels (n,) are below ``factor`` times the median of a ring about them.
+    """Whether pixels (n,) are below ``factor`` times the median of a ring about them.
 
-    Across the edge of what is lit, light falls steeply, but the pixels of a ring that lie along the
-    edge have as much of it. Of a cluster of dead pixels the widest ring reaches the others.
+    Light falls steeply at the edge of the lit area, but pixels of a ring that lie along the edge
+    are equally bright. Around a cluster of dead pixels the widest ring reaches good ones.
     """
     y, x = np.nonzero(where)
     found = np.zeros(len(y), np.bool_)
@@ -83,10 +82,10 @@ def _below_rings(flat: F64, where: Mask, factor: float) -> Mask:
         values = np.where(
             inside, flat[np.where(inside, rows, 0), np.where(inside, columns, 0)], np.nan
         )
-        # In pairs about the pixel, or a ring that is cut off would lie on one side of the edge.
+        # Only opposite pairs: a truncated ring would lie on one side of the edge.
         pairs = np.isfinite(values) & np.isfinite(values[:, ::-1])
         values[~pairs] = np.nan
-        # Without any, what the block says holds.
+        # Without pairs the block decides.
         values[~pairs.any(axis=1)] = np.inf
         found |= flat[where] < factor * np.nanmedian(values, axis=1)
     return found
@@ -95,8 +94,8 @@ def _below_rings(flat: F64, where: Mask, factor: float) -> Mask:
 def _around(values: F64) -> tuple[F64, F64]:
     """Median and upper quartile of each pixel's block of `NEIGHBOURS` by `NEIGHBOURS`.
 
-    Of every second row and column, for a mosaic of colour filters; from a border of blocks on, as
-    columns of chunks do. A pixel whose block is empty is its own.
+    Each colour of a filter mosaic (every second row and column) by itself; maps start at a block
+    boundary, as chunks do. A pixel with an empty block keeps its value.
     """
     maps = np.stack([values, values])
     for y, x in np.ndindex(2, 2):
@@ -127,12 +126,12 @@ def _of_blocks(flat: F64) -> tuple[F64, F64]:
 def noisy(
     variance: F64, dof: F64, expected: F64, kurtosis: F64, outliers: F64, factor: float
 ) -> Mask:
-    """Noise without light far above the read noise, telegraph noise included.
+    """Pixels with dark noise far above the read noise, telegraph noise included.
 
-    A standard deviation ``factor`` times the usual one; a smaller excess with a flat top; or more
-    samples out of the limits than particles make.
+    They have a standard deviation ``factor`` times the usual one, a smaller excess with a flat top,
+    or more outliers than particles cause.
     variance, dof, expected : (y, x) temporal variance (ADU²), its freedom, and a usual pixel's
-    kurtosis, outliers : (y, x) excess kurtosis (NaN: unknown) and samples out of the limits
+    kurtosis, outliers : (y, x) excess kurtosis (NaN: unknown) and number of outliers
     """
     ratio = variance / expected
     dofs, which = np.unique(dof, return_inverse=True)
@@ -147,7 +146,7 @@ def noisy(
 
 
 def variance_nearby(variance: F64, dof: F64, usual: float) -> F64:
-    """Variance (ADU²) of a usual pixel about each, ``usual`` or more: amplifiers differ."""
+    """Variance (ADU²) of a usual pixel near each, at least ``usual``: amplifiers differ."""
     known = dof > 0
     if not known.any():
         return np.full(variance.shape, usual)
@@ -157,22 +156,22 @@ def variance_nearby(variance: F64, dof: F64, usual: float) -> F64:
 
 
 def noisy_factor(least: float, variance: F64, dof: int, quantum: float) -> float:
-    """Factor, ``least`` or more, of the usual standard deviation that makes a pixel noisy.
+    """Factor (at least ``least``) over the usual standard deviation above which pixels are noisy.
 
-    A log-normal population (sCMOS) has no defects as far as it reaches. ``variance``: of pixels
-    without light (ADU²), with ``dof``. ``quantum``: step of the samples (ADU).
+    Pixels of a log-normal population (sCMOS) are no defects. ``variance``: of pixels without light
+    (ADU²), with ``dof``. ``quantum``: step of the samples (ADU).
     """
     known = variance[variance > 0]
     if dof < _SPREAD_DOF or not known.size or np.median(known) < quantum**2:
         return least
-    # With the scatter of the variances by chance, which takes pixels as far.
+    # Includes the sampling scatter of the variances, which moves pixels as far.
     return max(least, float(np.exp(_POPULATION * median_and_sigma(np.log(known))[1] / 2)))
 
 
 def nonlinear(rungs: Sequence[Rung], levels: F64, limit: float) -> Mask:
-    """Signal that does not follow that of the other pixels over a ladder of flats.
+    """Pixels whose signal departs from that of others over exposure-time steps of flats.
 
-    Held against pixels of the same brightness: a response that all share is no defect. ``rungs``:
+    Compared with pixels of equal brightness: a nonlinearity of all is no defect. ``rungs``:
     any number; with fewer than three none is flagged. ``levels``: (rung,) of `step_levels`.
     ``limit``: largest relative change of the pixel's share of the level.
     """
@@ -192,7 +191,7 @@ def nonlinear(rungs: Sequence[Rung], levels: F64, limit: float) -> Mask:
             share = share - mean * _common(share / mean - 1, mean, weight > 0)
         total = weight.sum(axis=0)
         mean = (weight * share).sum(axis=0) / total
-        # A rung is part of the mean, so their difference varies less than the rung alone.
+        # A step is part of the mean, so their difference varies less than the step alone.
         spread = np.sqrt(np.maximum(error**2 - 1 / total, 0))
         off = np.abs(share - mean)
         beyond = (off > limit * np.abs(mean)) & (off > _MANY_SIGNIFICANT * spread) & (weight > 0)
@@ -201,7 +200,7 @@ def nonlinear(rungs: Sequence[Rung], levels: F64, limit: float) -> Mask:
 
 
 def _common(off: F64, brightness: F64, used: Mask) -> F64:
-    """What pixels of one brightness (y, x) have in common of their departures (rung, y, x)."""
+    """Part of departures (rung, y, x) that pixels of equal brightness (y, x) share."""
     seen = lit(brightness)
     usual, scale = median_and_sigma(brightness[seen])
     x = (brightness - usual) / scale if scale > 0 else 0 * brightness

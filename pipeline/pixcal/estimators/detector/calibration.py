@@ -11,14 +11,14 @@ from scipy.special import chdtr, chdtri
 from pixcal.kernels.robust import finite_median, lit, median
 from pixcal.model.arrays import F64, Mask
 
-MIN_RUNGS = 3  # fewest exposure times that tell a straight line from a bent one
+MIN_RUNGS = 3  # fewest exposure times that separate a line from a curve
 # Variance over the signal, in units of the least at lower levels, below which pixels are full. A
-# response that bends by a fifth lessens it to 0.64.
+# slope lower by a fifth reduces it to 0.64.
 COLLAPSED = 0.25
 # Least shot noise, relative to the variance without light, of a level that gives a slope; and by
 # how many errors it has to exceed that variance.
 SHOT, CERTAIN = 0.1, 5.0
-_OUTLYING, _CLIPPINGS = 0.01, 3  # chance of a variance that is left out of the mean; times
+_OUTLYING, _CLIPPINGS = 0.01, 3  # probability of a clipped variance; iterations
 NEARLY = 0.02  # relative distance from a pixel's own full well within which its signal is not used
 
 
@@ -76,16 +76,16 @@ class Rung:
     frames: int  # how many were combined
     signal: F64  # mean (ADU); NaN where any of the frames is saturated or not finite
     variance: F64  # of `signal` (ADU²)
-    noise: float  # variance of one sample of a usual pixel that sees the lamp (ADU²)
+    noise: float  # variance of one sample of a usual lit pixel (ADU²)
 
 
 def usual_variance(variance: NDArray[Any], dof: int) -> float:
-    """Variance that most pixels of a tile have, from few samples each; NaN with no ``dof``."""
+    """Typical variance of the pixels of a tile, from few samples each; NaN with no ``dof``."""
     if dof < 1:
         return np.nan
     # The median of a variance of few samples is below its mean.
     usual = finite_median(variance) * dof / float(chdtri(dof, 0.5))
-    # Variances of few whole numbers come in steps: a mean without outliers lies between them.
+    # Variances of few integers are quantised; a mean without outliers is not.
     limit = float(chdtri(dof, _OUTLYING))
     kept = float(chdtr(dof + 2, limit) / chdtr(dof, limit))
     for _ in range(_CLIPPINGS):
@@ -95,10 +95,10 @@ def usual_variance(variance: NDArray[Any], dof: int) -> float:
 
 
 def step_levels(rungs: Sequence[Rung]) -> F64:
-    """Median signal (rung,) of the pixels of a tile that see the lamp; NaN if most are saturated.
+    """Median signal (rung,) of the lit pixels of a tile; NaN if most are saturated.
 
-    All levels are of the same pixels, and a saturated one is among the brightest: the median of the
-    others would be that of dim ones.
+    All levels use the same pixels, and saturated ones rank brightest: without them the median would
+    be that of dim pixels.
     """
     seen = lit(np.fmax.reduce([rung.signal for rung in rungs]))
     if not seen.any():
@@ -111,7 +111,7 @@ def step_levels(rungs: Sequence[Rung]) -> F64:
 def relative_response(rungs: Sequence[Rung], levels: F64) -> tuple[F64, F64]:
     """Signal (y, x) of flats over that of the tile, and its error; NaN where no step can be used.
 
-    All charge over all light ``levels`` (rung,) of `step_levels`: the weights of photon noise.
+    Total charge over total ``levels`` (rung,) of `step_levels`: weighted for photon noise.
     """
     charge = variance = light = np.zeros(rungs[0].signal.shape)
     for rung, level in zip(rungs, levels, strict=True):
@@ -126,7 +126,7 @@ def relative_response(rungs: Sequence[Rung], levels: F64) -> tuple[F64, F64]:
 def unsaturated(
     rungs: Sequence[Rung], levels: F64, dark_variance: float = 0.0
 ) -> tuple[Sequence[Rung], F64]:
-    """Flats without the signal of full pixels, which becomes NaN, and their levels.
+    """Flats with the signal of full pixels replaced by NaN, and their levels.
 
     A full well, maybe far below the highest code, has no photon noise and would outweigh the rest.
     ``levels``: (rung,) of `step_levels`. ``dark_variance``: of a usual sample without light (ADU²).
@@ -155,19 +155,19 @@ def unsaturated(
 
 @dataclass(frozen=True)
 class Linearity:
-    """How straight the signal of flats is over their exposure times."""
+    """Linearity of the signal of flats with exposure time."""
 
     max_deviation: float  # largest relative distance from the straight line
     # (rung,) relative distance of each level from the line; NaN for one that is not used
     deviation: F64
-    # slope, intercept: of the line (ADU/s; ADU). The intercept takes up an error that all
-    # exposure times share
+    # slope, intercept: of the line (ADU/s; ADU). The intercept absorbs an error common to all
+    # exposure times
     slope: float
     intercept: float
 
 
 def linearity(exptimes: F64, levels: F64, used: Mask) -> Linearity | None:
-    """Line through the levels of a ladder of flats that makes the relative distances least.
+    """Line of least squared relative distances through the levels of flats.
 
     ``exptimes, levels``: (rung,) s, and ADU above bias and dark; ``used``: (rung,) those without
     saturation. None with fewer than `MIN_RUNGS` levels.

@@ -1,10 +1,10 @@
-"""Frames whose noise is cut off at code zero: level and noise as they would be without.
+"""Frames whose noise is clipped at code zero: level and noise without clipping.
 
-A sample is a normal number, rounded to a code; what is negative is read as zero. Mean and variance
-of such samples tell level and noise of the normal (a censored one: Cohen 1959, *Technometrics* 1,
-217). Each pixel has a level of its own; most pixels have the same noise, which explains the mean of
-their variances. No likelihood of each pixel is maximised: with a level for each the noise would be
-too low, as much as by one frame of them all (Neyman and Scott 1948, *Econometrica* 16, 1).
+A sample is a normal number rounded to a code; negative values are read as zero. Mean and variance
+of such samples give level and noise of the normal (censored: Cohen 1959, *Technometrics* 1, 217).
+Each pixel has its own level; most have the same noise, which is fitted to the mean of their
+variances. Maximum likelihood with a level per pixel would bias the noise low, by about the loss of
+one frame (Neyman and Scott 1948, *Econometrica* 16, 1).
 """
 
 import math
@@ -19,14 +19,14 @@ from pixcal.kernels.rounding import SHEPPARD
 from pixcal.model.arrays import F64
 
 _LEVELS = np.linspace(-4, 8, 481)  # over the noise
-_CUT = 4.0  # mean over noise below which samples are cut off
-_FINEST = 20.0  # steps of the noise in which codes are summed up at most
+_CUT = 4.0  # mean over noise below which samples are clipped
+_FINEST = 20.0  # most steps per noise in which codes are summed
 _RANGE = 0.3, 5.0  # least and largest noise over that of the samples as they are
 _HOT, _NOISY = 6.0, 10.0
 
 
 def without_cut_off(found: Combined, frames: int, step: float) -> tuple[Combined, float]:
-    """Frames without light as they would be without the end of the converter at zero.
+    """Frames without light, corrected for clipping at code zero.
 
     Parameters
     ----------
@@ -36,14 +36,14 @@ def without_cut_off(found: Combined, frames: int, step: float) -> tuple[Combined
     Returns
     -------
     found : Combined
-        With other means and variances, where most pixels' noise is cut off.
+        With corrected means and variances, where most pixels' noise is clipped.
     factor : float
         Variance of a sample over that of the samples as they are.
     """
     known = np.isfinite(found.mean) & np.isfinite(found.variance)
     if not known.any():
         return found, 1.0
-    # Means, for medians are those of no normal; without hot and noisy pixels.
+    # Means, as medians do not follow the model; without hot and noisy pixels.
     centre, spread = median_and_sigma(found.mean[known])
     spread = max(spread, math.sqrt(float(found.variance[known].mean()) / frames))
     most = (1 + _NOISY * math.sqrt(2 / (frames - 1))) * float(np.median(found.variance[known]))
@@ -65,8 +65,8 @@ def without_cut_off(found: Combined, frames: int, step: float) -> tuple[Combined
     above = found.mean > means[-1]
     seen = np.interp(found.mean, means, variances)
     whole = noise**2 + SHEPPARD * step**2
-    # A usual pixel of few frames is more like the others than like its own chance: of one that is
-    # zero in all of them nothing else is known.
+    # Means of usual pixels in few frames are shrunk towards that of all: a pixel that is always
+    # zero has no other information.
     true = max(1 - sample**2 / frames / float(mean.var()), 0.0) if mean.var() > 0 else 0.0
     likely = np.where(usual, mean.mean() + true * (found.mean - mean.mean()), found.mean)
     corrected = replace(
@@ -79,17 +79,17 @@ def without_cut_off(found: Combined, frames: int, step: float) -> tuple[Combined
 
 
 def variance_at(mean: F64, error: F64, means: F64, variances: F64) -> F64:
-    """Variances of samples of some means with errors (variances), free of a bias by these."""
+    """Variances of samples at means with errors (variances), corrected for bias by these."""
     bend = np.gradient(np.gradient(variances, means), means)
     at = np.interp(mean, means, variances)
     return np.asarray(at - np.interp(mean, means, bend) * error / 2)
 
 
 def _of_cut_off(levels: F64, noise: float, step: float) -> tuple[F64, F64]:
-    """Means and variances (n,) of samples of some levels (n,); ADU."""
+    """Means and variances (n,) of clipped samples at levels (n,); ADU."""
     step = max(step, noise / _FINEST)
     codes = np.arange(1, math.ceil((levels[-1] + 6 * noise) / step) + 2)
-    # A code is reached from half a step below on.
+    # A code begins half a step below its value.
     reached = ndtr((levels[:, None] - step * (codes - 0.5)) / noise)
     mean = step * reached.sum(axis=1)
     square = step**2 * (reached @ (2 * codes - 1.0))

@@ -1,9 +1,9 @@
 """Figures of merit of a detector after EMVA 1288 (release 4.0), in electrons.
 
 Spatial nonuniformity is measured from two averages of independent frames, such as the even and the
-odd ones: what both hold is the detector's, what differs is noise, and no model of the noise is
-asked for. It is split into rows, columns and pixels by an analysis of variance (Searle, Casella and
-McCulloch, *Variance Components*, 1992, section 4.3).
+odd ones: their common part is the detector's, their difference is noise, and no noise model is
+needed. Analysis of variance splits it into rows, columns and pixels (Searle, Casella and McCulloch,
+*Variance Components*, 1992, section 4.3).
 """
 
 import math
@@ -17,7 +17,7 @@ Measure = tuple[float, float]  # a value and its 1-sigma error
 
 # variance over its maximum below which samples saturate: noise alone does not fall so far
 _FALL = 0.8
-# the same of pixels that are full: their noise is that of the readout
+# the same for full pixels, which have only read noise
 _FULL = 0.1
 _BLOCKS = 16
 
@@ -26,9 +26,9 @@ _BLOCKS = 16
 class Nonuniformity:
     """Standard deviations over the detector, each with its error."""
 
-    # total, row, column, pixel: of the map; of what all pixels of a row share, those of a
-    # column; of the rest. Zero where the variance comes out below zero by chance, with the
-    # standard deviation that would show
+    # total, row, column, pixel: of the map; of the part common to each row, to each column; of
+    # the rest. Zero where the variance is negative by chance, with the detectable standard
+    # deviation
     total: Measure
     row: Measure
     column: Measure
@@ -39,7 +39,7 @@ def nonuniformity(a: F64, b: F64, lost: int) -> Nonuniformity:
     """Nonuniformity that two averages of independent frames have in common.
 
     ``a, b``: (y, x) averages of as many frames, in any unit, as `without_gaps` gives them.
-    ``lost``: pixels that are bad.
+    ``lost``: number of bad pixels.
     """
     ny, nx = a.shape
     dofs = np.array([ny - 1, nx - 1, max((ny - 1) * (nx - 1) - lost, 1)], float)
@@ -56,7 +56,7 @@ def nonuniformity(a: F64, b: F64, lost: int) -> Nonuniformity:
 
 
 def without_gaps(values: F64, good: Mask) -> F64:
-    """The map (y, x) less its mean; a bad pixel is what its row and its column let expect."""
+    """The map (y, x) less its mean; bad pixels are filled in from their rows and columns."""
     count = np.maximum(good.sum(axis=1), 1), np.maximum(good.sum(axis=0), 1)
     values = np.where(good, values - values[good].mean(), 0.0)
     rows = values.sum(axis=1) / count[0]
@@ -79,9 +79,9 @@ def _root(variance: float, error: float) -> Measure:
 
 
 def alternation(a: F64, b: F64, *, axis: int) -> Measure:
-    """By how much every second row (axis 0) or column (axis 1) is higher than those between.
+    """Excess of every second row (axis 0) or column (axis 1) over those between.
 
-    Twice the amplitude at the Nyquist frequency; the error is by the scatter of the other lines.
+    Twice the amplitude at the Nyquist frequency; the error is from the scatter over the lines.
     """
     means = (a.mean(axis=1 - axis) + b.mean(axis=1 - axis)) / 2
     # Slow structure differs little between neighbours; only pairs of lines are compared.
@@ -115,7 +115,7 @@ class Spectrogram:
     """Spectrum of a map along its rows or its columns."""
 
     frequency: F64  # (n,) cycles per pixel, zero left out
-    # (n,) root of the mean power of all rows (columns); white noise of s has s everywhere
+    # (n,) root of the mean power of all rows (columns); white noise of rms s gives s everywhere
     amplitude: F64
     noise: float  # the same of the noise in the map
 
@@ -138,8 +138,8 @@ def spectrogram(a: F64, b: F64, *, axis: int) -> Spectrogram:
 def transfer_points(sums: F64, most: int = 60) -> F64:
     """Photon-transfer curve (point, 3): level (ADU), variance of a sample (ADU²) and its error.
 
-    ``sums``: (bin, 3 or more) of `photon_transfer.bin_pairs`; neighbouring bins are put together
-    until there are ``most`` points.
+    ``sums``: (bin, 3 or more) of `photon_transfer.bin_pairs`; neighbouring bins are merged into at
+    most ``most`` points.
     """
     filled = sums[sums[:, 0] > 0]
     if not len(filled):
@@ -153,12 +153,12 @@ def transfer_points(sums: F64, most: int = 60) -> F64:
 def saturation(points: F64) -> Measure | None:
     """Level (ADU) of the photon-transfer curve's maximum, if the variance falls beyond it.
 
-    ``points``: (point, 3) of `transfer_points`. The error is half of the way to the level where the
-    variance has fallen. None where the curve rises to its end: saturation was not reached.
+    ``points``: (point, 3) of `transfer_points`. The error is half the distance to the level where
+    the variance has fallen. None where the curve rises to its end: saturation was not reached.
     """
     if len(points) < 2:
         return None
-    # Of few pixels a variance may be high by chance.
+    # The variance of few pixels may be high by chance.
     peak = int((points[:, 1] - 2 * points[:, 2]).argmax())
     fallen = points[peak + 1 :][points[peak + 1 :, 1] < _FALL * points[peak, 1], 0]
     if not len(fallen):
@@ -168,9 +168,9 @@ def saturation(points: F64) -> Measure | None:
 
 
 def full_level(points: F64) -> float:
-    """Least level (ADU) of full pixels, whose noise is that of the readout; infinite without any.
+    """Lowest level (ADU) of full pixels, which have only read noise; infinite without any.
 
-    Of few levels the curve's maximum may be far below.
+    With few levels the curve's maximum may lie far below.
     """
     peak = int(points[:, 1].argmax()) if len(points) else 0
     full = points[peak + 1 :][points[peak + 1 :, 1] < _FULL * points[peak : peak + 1, 1], 0]
@@ -178,9 +178,9 @@ def full_level(points: F64) -> float:
 
 
 def dynamic_range(full_well: Measure, read_noise: Measure) -> tuple[float, float, float]:
-    """Saturation over the least signal that can be seen (signal-to-noise ratio of one).
+    """Saturation over the least detectable signal (signal-to-noise ratio of one).
 
-    Of values with errors (e-): the ratio, its error, and decibels.
+    Arguments are values with errors (e-); returns the ratio, its error, and decibels.
     """
     # Signal whose shot noise and read noise together equal it: n² = n + σ².
     root = math.sqrt(read_noise[0] ** 2 + 0.25)
@@ -191,11 +191,11 @@ def dynamic_range(full_well: Measure, read_noise: Measure) -> tuple[float, float
 
 
 def dark_slope(times: F64, means: F64) -> Measure | None:
-    """Dark signal (per second) from the means of frames, with the scatter between them.
+    """Dark signal (per second) from the means of frames, with an error from their scatter.
 
-    A black level that is set anew for each exposure time puts their means off the line: where that
-    scatter is the larger one, it counts. ``times``: (frame,) s. None with fewer than three frames
-    or a single exposure time.
+    A black level reset at each exposure time moves means off the line: that scatter counts where it
+    is the larger one. ``times``: (frame,) s. None with fewer than three frames or a single exposure
+    time.
     """
     if len(times) < 3:
         return None

@@ -1,8 +1,8 @@
 """Levels of flats against exposure time: a lamp's steadiness, and the detector's response.
 
-No lamp repeats its light exactly, exposure times have an offset, and black levels move: levels lie
-about a line that need not go through nothing. A curve through them is the detector's only if the
-noise of the flats bends with it, as far as that is precise enough to tell; else it is the lamp's.
+No lamp repeats its light exactly, exposure times have an offset, and black levels drift: levels
+scatter about a line that need not pass through zero. Their curvature is attributed to the detector
+if the noise of the flats agrees with it within errors, else to the lamp.
 """
 
 from collections.abc import Sequence
@@ -17,23 +17,23 @@ from pixcal.kernels.sample_sums import frame_means
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 
-MIN_RUNGS = 3  # fewest levels of flats that tell a curve from a line
-LAMP = 1e-3  # relative error of the light of a flat at least, its exposure time included
-STEADY = 0.1  # rms of the levels about a curve beyond which the lamp was changed between them
-RATES = 1.3  # largest over least light a second of few levels of one lamp
-OFF = 8.0  # usual distances from the curve beyond which a level is of another lamp
-DISAGREE = 4.0  # errors between the curve of the levels and that of their noise
+MIN_RUNGS = 3  # fewest levels of flats that separate a curve from a line
+LAMP = 1e-3  # least relative error of the light of a flat, exposure time included
+STEADY = 0.1  # relative rms of levels about the curve above which the lamp was changed
+RATES = 1.3  # largest ratio of light per second among few levels of one lamp
+OFF = 8.0  # typical distances from the curve beyond which a level has another lamp setting
+DISAGREE = 4.0  # errors between the curvature of levels and of their noise
 
-# least degrees of freedom of the flicker with which first frames tell more than it: six pairs
+# least degrees of freedom of the flicker for first frames to measure lag: six pairs
 FLICKER_KNOWN = 2.0
 
-# information of a median of absolute deviations, over that of a standard deviation
+# efficiency of a median absolute deviation relative to a standard deviation
 _OF_MEDIAN = 0.37
-_WITH_BEFORE = 4  # pairs beyond which those of other frames before them are told apart
+_WITH_BEFORE = 4  # pairs above which the effect of the frames before them is fitted
 _WITH_OFFSET, _WITH_CUBIC = 5, 6  # fewest levels for these terms
 _TURNS = 30
 _SMALL = 1e-4
-_NOT_TOLD = 1e-2  # error of a power that few levels do not tell; it is taken as zero
+_NOT_TOLD = 1e-2  # error of a power that is held at zero as levels are too few
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,9 @@ class Ladder:
     times: F64  # (n,) s
     levels: F64  # (n,) e-, without bias and dark signal
     sizes: F64  # (2,) response S (1 + sizes[0] u + sizes[1] u²), u the level over the highest
-    covariance: F64  # (2, 2); the scatter of the levels about the curve is in it
+    covariance: F64  # (2, 2); includes the scatter of the levels about the curve
     wander: float  # relative rms of the levels about the curve
-    off: F64  # exposure times (s) of flats far off the curve, for which the lamp was changed
+    off: F64  # exposure times (s) of outlying flats, for which the lamp was changed
 
     @property
     def top(self) -> float:
@@ -67,7 +67,7 @@ def _light_of(evidence: Evidence, stack: Stack) -> F64:
 
 
 def level_before(stack: Stack, evidence: Evidence) -> float:
-    """Level (e-) of the frame before a series; zero where time stamps do not tell which it is."""
+    """Level (e-) of the frame before a series; zero where time stamps do not identify it."""
     own = "level before", *stack.key
     return evidence.once(*own, make=lambda: _level_before(stack, evidence))
 
@@ -93,8 +93,8 @@ def warming(evidence: Evidence) -> tuple[float, float]:
 def rise_of(series: Sequence[F64]) -> tuple[float, float]:
     """Relative rise from frame to frame that series of light (t,) share, and its error.
 
-    Both are zero unless it is significant. First frames, which lag makes fainter, do not count, nor
-    do those that are NaN.
+    Both are zero unless it is significant. First frames, which lag makes fainter, and NaN are
+    excluded.
     """
     rises, weights, squares, freedom = [], [], 0.0, -1
     for whole in series:
@@ -117,9 +117,9 @@ def rise_of(series: Sequence[F64]) -> tuple[float, float]:
 
 
 def flicker(evidence: Evidence) -> tuple[float, float]:
-    """Relative change of the lamp from frame to frame, rms, and the degrees of freedom it has."""
-    # The first frame of a series may lack a share of its charge, and have one of the frame before:
-    # of pairs, what their steps have in common by the levels of both is left out.
+    """Relative rms change of the lamp from frame to frame, and its degrees of freedom."""
+    # By lag the first frame of a series may lack a share of its charge and gain one of the frame
+    # before: the common dependence of first steps on both levels is removed.
     rise, _ = warming(evidence)
     steps: list[float] = []
     firsts: list[float] = []
@@ -139,14 +139,14 @@ def flicker(evidence: Evidence) -> tuple[float, float]:
     every = np.concatenate([steps, pairs if len(pairs) > 2 else []])
     if not len(every):
         return 0.0, 1.0
-    # Of few values the median of what is off the median is too low (Croux and Rousseeuw 1992).
+    # The median absolute deviation of few values is biased low (Croux and Rousseeuw 1992).
     few = len(every) / max(len(every) - 0.8, 0.7)
     spread = few * robust_sigma(every) / float(np.sqrt(2))
     return spread, max(_OF_MEDIAN * len(every), 1.0)
 
 
 def straight_line(times: F64, levels: F64, at: F64) -> F64:
-    """Levels at some times on the line that makes the relative distances least."""
+    """Levels at times ``at`` on the line of least squared relative distances."""
     terms = 1 + (len(times) >= _WITH_OFFSET)
     design = np.stack([times, np.ones_like(times)][:terms], axis=1)
     found = np.linalg.lstsq(design / levels[:, None], np.ones(len(levels)))[0]
@@ -170,9 +170,9 @@ def _ladder(evidence: Evidence) -> Ladder | None:
     if len(times) < _WITH_OFFSET and (levels / times).max() > RATES * (levels / times).min():
         return None
     counts = np.array([len(one) for one in light])
-    # Photons hardly matter in the mean of a frame; the lamp does.
+    # The lamp dominates the error of a frame's mean, not photon noise.
     error = np.hypot(LAMP, flicker(evidence)[0] / np.sqrt(counts))
-    # Where the flat varies, bright pixels bend more than the mean does.
+    # Where the flat varies, bright pixels are more nonlinear than the mean.
     flat = evidence.flat[evidence.good] / evidence.flat[evidence.good].mean()
     moments = float((flat**2).mean()), float((flat**3).mean())
     found = _of_one_lamp(times, levels, error, moments)
@@ -187,7 +187,7 @@ def _of_one_lamp(
 ) -> Ladder | None:
     """The ladder without a level far off the curve of the others: no response has such a step.
 
-    The ends are always of the ladder: there a response may have a knee.
+    The end levels are always kept, as a response may have a knee there.
     """
     whole = _bent(times, levels, error, moments)
     if whole is None or len(times) <= _WITH_CUBIC:
@@ -236,7 +236,7 @@ def _bent(times: F64, levels: F64, error: F64, moments: tuple[float, float]) -> 
 
 
 def _agree(found: Ladder, curve: TransferCurve) -> bool:
-    """Whether the noise bends with the levels: variance over level goes with the slope squared."""
+    """Whether noise agrees with levels: variance over level follows the slope squared."""
     u = curve.levels / found.top
 
     def slope(sizes: F64) -> float:
@@ -252,7 +252,7 @@ def _agree(found: Ladder, curve: TransferCurve) -> bool:
 
 
 def ladder_response(evidence: Evidence, level_e: float) -> tuple[F64, F64] | None:
-    """Relative deviations of the response from a straight line at a level, by a ladder of flats.
+    """Relative deviations of the response from a line at a level, from a ladder of flats.
 
     Sizes (2,) of the first and the second power of the level, and covariance; None without a
     ladder.

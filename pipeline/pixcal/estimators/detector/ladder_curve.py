@@ -1,8 +1,8 @@
 """Response at each level of a ladder of flats, where no polynomial of low order describes it.
 
-The noise of flats goes with the slope of the response, and their levels with the response itself if
-the lamp and its exposure times are steady. Both together give the charge of each level: signal plus
-a departure that a natural spline joins from level to level.
+The noise of flats follows the slope of the response; their levels follow the response itself if the
+lamp and its exposure times are steady. Together they give the charge of each level: signal plus a
+departure, which a natural spline interpolates between levels.
 """
 
 from dataclasses import dataclass
@@ -17,10 +17,10 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
 from pixcal.model.arrays import F64
 
-MIN_LEVELS = 6  # fewest levels of which a curve is more than a polynomial
-LOOSE = 0.05  # departure over the signal that is unlikely without data
-_GAIN = 0.01  # by which the gain used may be off
-_PARTS = 9  # of the pixels by their response
+MIN_LEVELS = 6  # fewest levels for more than a polynomial
+LOOSE = 0.05  # prior 1-sigma of the departure over the signal
+_GAIN = 0.01  # prior relative error of the gain used
+_PARTS = 9  # quantiles of the pixels' response
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class LadderCurve:
 
     charge: F64  # (n,) e-
     change: F64  # (n,) signal less charge, e-
-    steps: F64  # (n, m) of the changes by independent errors of one sigma each, e-
+    steps: F64  # (n, m) shifts of the changes by one sigma of each independent error, e-
 
     @property
     def error(self) -> F64:
@@ -48,7 +48,7 @@ def ladder_curve(evidence: Evidence) -> LadderCurve | None:
 
 
 def _bends_by_noise(curve: TransferCurve) -> bool:
-    """Whether noise over level is no polynomial of second order of the level."""
+    """Whether noise over level departs from a second-order polynomial of the level."""
     design = np.stack([(curve.levels / curve.top) ** n for n in range(3)]) / curve.errors
     value = curve.shares / curve.errors
     rest = value - np.linalg.lstsq(design.T, value)[0] @ design
@@ -56,14 +56,14 @@ def _bends_by_noise(curve: TransferCurve) -> bool:
 
 
 def fit_levels(curve: TransferCurve, times: F64, flat: F64) -> LadderCurve | None:
-    """Changes at the levels that make the noise, and the levels over time (s), what they are.
+    """Changes at the levels that fit the noise, and the levels over time (s).
 
-    None where noise and levels disagree: the lamp wanders, or bright pixels have another gain.
+    None where noise and levels disagree: the lamp drifts, or bright pixels have another gain.
     ``flat``: (n,) relative response of the pixels.
     """
     parts = np.quantile(flat / flat.mean(), (np.arange(_PARTS) + 0.5) / _PARTS)
     signal, n = curve.levels[:, None] * parts, len(curve.levels)
-    # One beyond the highest: the end of a natural spline has no curvature, where knees have most.
+    # One knot beyond the highest level: a natural spline has no curvature at its end, knees do.
     above = max(2 * curve.levels[-1] - curve.levels[-2], float(signal.max()))
     knots = np.concatenate([[0.0], curve.levels, [above]])
     unit = LOOSE * knots[1:]

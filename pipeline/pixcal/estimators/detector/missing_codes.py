@@ -1,9 +1,9 @@
-"""Read noise of a converter that leaves codes out: what they add to noise and to mean levels.
+"""Read noise of a converter with missing codes: what these add to noise and to mean levels.
 
-A sample whose code is missing gets the next one there is. Noise of a few codes then depends on
-where the level lies; it is found from what a converter with these codes makes of it, pixel by
-pixel. Noise of less than a quarter of the widest gap is not told well. Which neighbour stands in
-for a missing code the counts of all samples tell. All in codes.
+A sample whose code is missing gets a neighbouring code. The variance of noise of a few codes then
+depends on the level; the noise is found from a model of the conversion, pixel by pixel. Noise below
+a quarter of the widest gap is poorly constrained. The counts of all samples show which neighbour
+replaces a missing code. All in codes.
 """
 
 import numpy as np
@@ -15,19 +15,19 @@ from pixcal.estimators.detector.cut_off import variance_at
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.arrays import F64, I64
 
-POPULATED = 20.0  # counts on both sides from which a code without any is missing
-_BLOCK = 32  # codes whose shifts are added up
-_NEAR = 4  # codes on either side that are looked at
-_FINE = 16  # levels a code
+POPULATED = 20.0  # counts on both sides from which an empty code is missing
+_BLOCK = 32  # codes whose shifts are summed
+_NEAR = 4  # codes examined on either side
+_FINE = 16  # levels per code
 _REACH = 8.0  # of the noise
 _USUAL = 5.0  # spreads of the means of usual pixels
-_LEAST = 0.5  # noise: below it a wide code is all there is
-_MOST = 500  # range of levels that is looked at
-_STANDS_IN = (0.5, -0.5, 0.0)  # the next code, the one before, either: thresholds off the middle
+_LEAST = 0.5  # least noise: below it samples do not leave a wide code
+_MOST = 500  # largest range of levels
+_STANDS_IN = (0.5, -0.5, 0.0)  # next code, code before, nearest: thresholds relative to the middle
 
 
 def missing_codes(counts: F64) -> I64:
-    """Codes that never come up in ``counts`` (code,) though some just below and just above do."""
+    """Codes that never occur in ``counts`` (code,) though some just below and just above do."""
     padded = np.pad(counts, _NEAR)
     count = len(padded) - _NEAR + 1
     beside = np.maximum.reduce([padded[n : n + count] for n in range(_NEAR)])
@@ -36,10 +36,10 @@ def missing_codes(counts: F64) -> I64:
 
 
 def step_noise(counts: F64) -> tuple[float, float]:
-    """What missing codes add to samples whose noise spans many codes.
+    """Noise that missing codes add to samples whose own noise spans many codes.
 
-    Returns the variance, and the spectral density at low frequency of how far samples are moved,
-    by code: by it the mean level, and so the noise, of neighbouring levels rises more or less.
+    Returns the variance of the shifts of samples, and their spectral density at low frequency over
+    codes: it changes the slope of the mean level, and so the noise, from level to level.
     """
     beside = np.pad(counts, _NEAR)
     often = sliding_window_view(beside, 2 * _NEAR + 1).max(axis=1) > POPULATED
@@ -60,14 +60,14 @@ def step_noise(counts: F64) -> tuple[float, float]:
 def noise_before_missing_codes(
     variance: float, error: float, means: F64, frames: int, counts: F64, step: float = 1.0
 ) -> tuple[float, float] | None:
-    """Noise that has some variance, on average over pixels, once it is converted; and its error.
+    """Noise whose variance after conversion, averaged over pixels, is that given; and its error.
 
     None where no noise does.
 
     variance, error : of a sample, on average over the pixels, and its standard error
-    means : (n,) mean samples of pixels like these, over so many ``frames``
-    counts : (code,) how often each code came up
-    step : of the converter, if all of its codes were multiplied by that
+    means : (n,) mean samples of such pixels over ``frames`` frames
+    counts : (code,) how often each code occurred
+    step : of the converter, if all of its codes were multiplied by it
     """
     middle, spread = median_and_sigma(means)
     low, high = middle + np.array([-1, 1]) * max(_USUAL * spread, 1.0)

@@ -8,7 +8,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F32, F64
 
-_CLIP = 25.0  # squares of residuals, over their variance, that are left to particles and the like
+_CLIP = 25.0  # squared residuals over their variance from which they are excluded (particles)
 
 
 def missing_noise(

@@ -1,8 +1,8 @@
-"""Noise of pairs of frames, and what of it all pixels of a row, or of a column, have in common.
+"""Noise of pairs of frames, and the part that all pixels of a row, or of a column, share.
 
-A few rows hold few independent values of their noise: it would hide the photon noise of flats. So
-it is taken off flats, line by line, and its covariances are put back as frames without light have
-them, where there are many more of it.
+A few rows hold few independent values of row noise, which would hide the photon noise of flats. It
+is subtracted from flats, line by line, and its covariances are added back as measured in frames
+without light, which have many more rows.
 """
 
 import math
@@ -16,18 +16,18 @@ from pixcal.model.arrays import F32, F64
 
 LINES = {"row": ((0, 1), (0, 2)), "column": ((1, 0), (2, 0))}  # lags along a line
 
-_SHARED = 5.0  # errors of the noise that a row shares from which it is there
-_OUT = 5.0  # standard deviations of samples that stand out
+_SHARED = 5.0  # significance (errors) from which the noise shared by lines counts
+_OUT = 5.0  # standard deviations of outlying samples
 _PAIR_LAMP_CHANGE = 0.05
-_NEARLY = 5.0  # noise below saturation from which samples of a pixel are cut off
-# Of n normal numbers less their median, n times by how much the variance is less, and by how much
-# each two are anticorrelated: 2 / n by the mean, of which the scatter of the median takes π/2.
+_NEARLY = 5.0  # standard deviations below saturation from which a pixel's noise is clipped
+# Subtracting the median of n normal numbers lowers the variance of each, and the covariance of each
+# two, by this over n: twice the covariance with the median (1 / n), less its variance π / (2 n).
 _MEDIAN_TAKES = 2 - math.pi / 2
 _NO_BLOCKS = np.zeros((0, COLUMNS))
 
 
 def shared_by_lines(dark: F64) -> dict[str, Measure]:
-    """Variance in time that all pixels of a row, or of a column, share, with its error (ADU²).
+    """Temporal variance that all pixels of a row, or of a column, share, with its error (ADU²).
 
     ``dark``: (N_BINS, COLUMNS) sums of `bin_pairs`. Zero where it is not significant.
     """
@@ -36,11 +36,11 @@ def shared_by_lines(dark: F64) -> dict[str, Measure]:
         return {}
     error = total[2] / total[0] / math.sqrt(total[0])
     covariance = dict(zip(map(tuple, LAGS.tolist()), total[3:] / total[0], strict=True))
-    # A coupling reaches the next pixel, and a row that repeats the row after it; not both.
+    # Coupling reaches lag 1 only, a repeat of every second row lag 2 only; line noise has both.
     seen = np.array([min(covariance[lag] for lag in own) for own in LINES.values()])
-    # The mean of its block was taken off: of what the rows share a part, more of it where every
-    # second row repeats it, and of what the columns share as much from all that are not the same
-    # column. Diagonal neighbours show a repeat, and no coupling along rows or columns.
+    # Subtracting block means removed part of the row noise, more where every second row repeats
+    # it, and took column noise off pairs in different columns. Diagonal neighbours show a repeat,
+    # and no coupling along rows or columns.
     kept, taken = BLOCK / (BLOCK + 1), (BLOCK - 1) / BLOCK**2
     repeated = [covariance[2, 2] - covariance[near] for near in ((1, 2), (2, 1))]
     seen += 2 * (BLOCK - 2) / (BLOCK**2 - 1) * np.maximum(repeated, 0)
@@ -54,9 +54,9 @@ def shared_by_lines(dark: F64) -> dict[str, Measure]:
 def shared_by_blocks(difference: F32, quantum: float) -> float:
     """Variance (ADU²) of a sample that the pixels of a block share beyond chance.
 
-    Of lines, outputs, and what changes slowly from place to place; the level of the whole frame is
-    not in it. `pair_statistics` takes it off with the means of its blocks. ``difference``: (y, x)
-    of two frames without light, of full blocks; samples that stand out do not count.
+    It comes from lines, outputs and large-scale variation, without the level of the whole frame.
+    `pair_statistics` removes it with its block means. ``difference``: (y, x) of two frames without
+    light, of full blocks; outliers are excluded.
     """
     tiles = difference.reshape(len(difference) // BLOCK, BLOCK, -1, BLOCK)
     blocks = tiles.swapaxes(1, 2).reshape(-1, BLOCK**2).astype(float)
@@ -78,8 +78,8 @@ def dark_pair_sums(
     """Sums (N_BINS, COLUMNS) over frames 0 and 1, 2 and 3, … without light.
 
     ``frames``: (t, y, x) less their common level (ADU); NaN where a sample is not to be used.
-    ``read_noise, quantum``: as of `pair_statistics`. ``without``: lines whose common noise is taken
-    off.
+    ``read_noise, quantum``: as in `pair_statistics`. ``without``: lines whose common noise is
+    subtracted.
     """
     pairs = zip(frames[::2], frames[1::2], strict=False)
     blocks = [_blocks(*pair, np.inf, read_noise, quantum, without) for pair in pairs]
@@ -95,11 +95,11 @@ def flat_pair_sums(
     line_noise: "LineNoise",
     full: F32 | float = np.inf,
 ) -> F64:
-    """The same of flats, each made as bright as the other of its pair.
+    """The same for flats, with the two frames of a pair scaled to equal level.
 
     frames : (t, y, x) ADU above bias and dark
     levels : (t,) their common levels, in any unit; pairs that differ too much are not used
-    gain, read_noise, quantum : as of `pair_statistics`
+    gain, read_noise, quantum : as in `pair_statistics`
     line_noise : of these pixels
     full : (y, x) or scalar, where samples saturate, ADU above bias and dark
     """
@@ -111,7 +111,7 @@ def flat_pair_sums(
         first, second = first * ((a + b) / (2 * a)), second * ((a + b) / (2 * b))
         level = (first + second) / 2
         noise = np.sqrt(read_noise**2 + np.maximum(level, 0) / gain)
-        # Of nearly full pixels the noise is cut off, beside those of another colour whose is not.
+        # The noise of nearly full pixels is clipped, that of another colour beside them is not.
         # Full pixels beside those of an overscan would pass for half-full ones without noise.
         first[~lit(level) | (level + _NEARLY * noise > full)] = np.nan
         blocks.append(_blocks(first, second, gain, read_noise, quantum, line_noise.lines or ()))
@@ -154,7 +154,7 @@ class LineNoise:
         self._whole, self._rest = np.zeros((2, COLUMNS))
 
     def add(self, frames: F32, sums: F64, read_noise: float, quantum: float) -> None:
-        """Take frames as `dark_pair_sums` does, and its ``sums``; the first tell which lines."""
+        """Add frames as in `dark_pair_sums`, and its ``sums``; the first decide which lines."""
         if self.lines is None:
             self.lines = lines_with_noise(sums)
         if self.lines:
@@ -162,7 +162,7 @@ class LineNoise:
             self._rest += dark_pair_sums(frames, read_noise, quantum, self.lines).sum(axis=0)
 
     def put_back(self, sums: F64) -> F64:
-        """Sums with the noise of lines added back, as frames without light have it."""
+        """Sums with the noise of lines added back, as measured in frames without light."""
         if self.lines:
             shared = self._whole[2:] / self._whole[0] - self._rest[2:] / self._rest[0]
             sums[:, 2:] += sums[:, :1] * shared

@@ -1,9 +1,8 @@
 """Read noise pixel by pixel, from the scatter of few frames without light.
 
 The variance of a pixel in n frames has a relative error of sqrt(2 / (n - 1)), often more than
-pixels differ by. What is drawn here is a draw from the posterior; how pixels are distributed is
-found from all of them, as the likeliest distribution on a grid (Kiefer & Wolfowitz 1956, Ann. Math.
-Statist. 27, 887).
+pixels differ by. Values are drawn from the posterior; its prior is the likeliest distribution of
+all pixels on a grid (Kiefer & Wolfowitz 1956, Ann. Math. Statist. 27, 887).
 """
 
 from collections.abc import Sequence
@@ -15,16 +14,16 @@ from scipy.special import digamma, polygamma
 from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
-FEWEST = 8  # frames that tell pixels apart
-OUTLIER = 4.0  # standard deviations of all pixels beyond which one does not count in their mean
-FINENESS, MOST = 8, 256  # points of the grid: for each error of a logarithm, and at most
+FEWEST = 8  # frames needed for noise by pixel
+OUTLIER = 4.0  # standard deviations of all pixels beyond which one is excluded from the mean
+FINENESS, MOST = 8, 256  # grid points: per error of a logarithm, and at most
 STEPS = 1000  # of expectation maximisation
-BROAD = 0.01  # share of the distribution to begin with that is spread over the whole grid
+BROAD = 0.01  # share of the start distribution that is uniform over the grid
 
 
 @dataclass(frozen=True)
 class PixelNoise:
-    """Relative read noise of the pixels: what is known of it."""
+    """Posterior of the relative read noise of the pixels."""
 
     bin: Indices  # (y, x) bin of the measured variance; -1 in masked pixels
     cumulative: F64  # (bin, n) cumulative posterior probability on the grid of true variances
@@ -51,14 +50,14 @@ class PixelNoise:
             told = good | (noisy & (squares > loud * np.median(squares[good])))
         seen = np.log(np.maximum(squares / freedom, 1e-12)[told])
         half = freedom / 2
-        # A variance of normal samples, about its true value, in logarithms.
+        # Bias and variance of the logarithm of a variance of normal samples.
         bias, error = float(digamma(half) - np.log(half)), float(polygamma(1, half))
         own = good[told]
         seen -= float(np.median(seen[own]))
         spread = robust_sigma(seen[own]) ** 2
         step = max(np.sqrt(error) / FINENESS, float(np.ptp(seen)) / (MOST - 3))
         log = np.arange(np.floor(seen.min() / step) - 1, np.ceil(seen.max() / step) + 2) * step
-        # The bins of measured variances lie about the points of the grid.
+        # Bins of measured variances are centred on grid points.
         bins = np.rint((seen - log[0]) / step).astype(int)
         ratio = log[:, None] - log
         chance = np.exp(half * (ratio + 1 - np.exp(ratio)))
@@ -78,7 +77,7 @@ class PixelNoise:
         known = self.bin >= 0
         own, n = self.bin[known], len(self.log)
         chance, within = rng.random((2, *self.bin.shape))
-        # One search in all distributions, one after the other.
+        # One search in the concatenated distributions.
         order = (self.cumulative + np.arange(len(self.cumulative))[:, None]).ravel()
         index = np.clip(np.searchsorted(order, own + chance[known]) - own * n, 0, n - 1)
         log = np.zeros(self.bin.shape)

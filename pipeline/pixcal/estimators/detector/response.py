@@ -1,8 +1,8 @@
-"""From collected light to signal: boundaries that move with the charge, and a bent response.
+"""From collected light to signal: boundaries that move with the charge, nonlinear response.
 
-The two are fitted together to what the fringe fit leaves, because both make a second harmonic of
-the phase: a response the same for all fringes, moving boundaries (brighter-fatter) one that depends
-on the fringes' spacing.
+Both are fitted together to the residuals of the fringe fit, because both cause a second harmonic of
+the phase. That of the response is equal for all fringes; that of moving boundaries
+(brighter-fatter) depends on the fringe period.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,16 +23,15 @@ from pixcal.kernels.boundaries import REACH, boundary_shifts, moved_charge
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F32, F64
 
-UNIT = 1e-7  # shift of boundaries (px per electron) that is fitted as one
-# Shifts within `REACH` are of six distances: those of any falloff are a sum of these.
+UNIT = 1e-7  # unit of the fitted shift of boundaries (px per electron)
+# Within `REACH` there are six distances: shifts of any falloff are a sum of these.
 FALLOFFS_PX = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
 _FINE_PX = np.geomspace(FALLOFFS_PX[0], FALLOFFS_PX[-1], 61)
-_BESIDE = 5  # of the fine steps: the parabola about the best one goes so far
-LOOSE = 0.02  # departure from a response, of full scale, that is unlikely without data
-# of the response that is free beside boundaries: electrons at which powers of the level are one,
-# and how many powers
+_BESIDE = 5  # half-width of the parabola about the best falloff, fine steps
+LOOSE = 0.02  # prior 1-sigma of the departure from a response, over full scale
+# response fitted with boundaries: level (e-) at which its powers are one, and their number
 LEVEL, POWERS = 5e4, 3
-TOLD = 0.5  # error of the falloff's logarithm with which it is told from others
+TOLD = 0.5  # largest error of the logarithm of a measured falloff
 
 
 def fit_response(
@@ -42,11 +41,11 @@ def fit_response(
     shifts: F64,
     known_shift: tuple[float, float] | None = None,
 ) -> tuple[F64, F64]:
-    """Coefficients c_1, c_2, ... and the shift by an electron (px); their covariance.
+    """Coefficients c_1, c_2, ... and the shift per electron (px); their covariance.
 
     level_e, powers : terms of the relative response 1 + c_1 u + c_2 u² + ..., u = 1 at this level
     shifts : `pixcal.kernels.boundaries.boundary_shifts`, of size one
-    known_shift : the shift and its variance as the noise of neighbours has it
+    known_shift : the shift and its variance from the noise of neighbours
     """
     prior = None
     if known_shift is not None:
@@ -63,7 +62,7 @@ def fit_response(
 
 
 def _signal_of(evidence: Evidence, level_e: float, every: Sequence[F64]) -> Distortion:
-    """What moving boundaries (last sizes) and then a bent response (first) add to a signal."""
+    """Change of a signal by moving boundaries (last sizes), then by the response (first)."""
     flat = evidence.flat.astype(np.float32)
 
     def distortion(fringes: FringeEvidence, signal: F32, sizes: F64) -> F32:
@@ -79,7 +78,7 @@ def _signal_of(evidence: Evidence, level_e: float, every: Sequence[F64]) -> Dist
 
 
 def departure(level: F32, knots_e: F64, change_e: F64) -> F32:
-    """Natural cubic spline through the changes at some levels; constant beyond them."""
+    """Natural cubic spline through the changes at knots; constant beyond them."""
     spline = CubicSpline(knots_e, change_e, bc_type="natural")
     return np.asarray(spline(np.clip(level, knots_e[0], knots_e[-1])), np.float32)
 
@@ -89,7 +88,7 @@ def fit_curve(
 ) -> tuple[F64, F64, Agreement]:
     """Departure (n - 1,) of the signal from a response at all knots but the first, e-.
 
-    With covariance and the sets' agreement. Fringes tell neither an offset nor a factor of it.
+    With covariance and the sets' agreement. Fringes constrain neither its offset nor its factor.
 
     response : signal (t, y, x) of a charge of that shape, e-
     knots_e : (n,) levels, rising, e-, the first zero, where there is no departure
@@ -109,26 +108,26 @@ def fit_curve(
     straight /= np.abs(straight).max(axis=0)
     taken = straight @ np.linalg.pinv(straight[1:])
     rest = np.eye(len(unit) + 1) - np.pad(taken, ((0, 0), (1, 0)))
-    rest = LOOSE * knots_e[-1] * rest[:, :-1]  # nothing at the last knot
+    rest = LOOSE * knots_e[-1] * rest[:, :-1]  # the last knot is not fitted
     return rest @ sizes, rest @ covariance @ rest.T, agreement
 
 
 @dataclass(frozen=True)
 class Boundaries:
-    """Moving boundaries without a bent response, as the second harmonics of all sets show them."""
+    """Moving boundaries without a nonlinear response, from the second harmonics of all sets."""
 
-    # falloff_px, falloff_error: the error infinite where one falloff does about as well as another
+    # falloff_px, falloff_error: the error is infinite where the falloff is not constrained
     falloff_px: float
     falloff_error: float
-    shift: float  # shift, shift_error: by an electron, px, for this falloff
+    shift: float  # shift, shift_error: per electron, px, for this falloff
     shift_error: float
-    with_falloff: float  # by how much the shift changes with the falloff's error, px
-    # against, shapes: chi-square by which a bent response beside them, and boundaries alone that
-    # move by any function of the distance, would fit better
+    with_falloff: float  # change of the shift for one error of the falloff, px
+    # against, shapes: chi-square by which an additional nonlinear response, and boundaries alone
+    # with any function of distance, would fit better
     against: float
     shapes: float
-    # shift of boundaries between rows over that between columns, and by how much it changes with
-    # the falloff's error; its own error is zero where it was held
+    # shift of boundaries between rows over that between columns, its error (zero where it was
+    # held), and its change for one error of the falloff
     along_y: float
     along_y_error: float
     along_y_with_falloff: float
@@ -137,10 +136,10 @@ class Boundaries:
 def boundaries_alone(
     evidence: Evidence, otherwise_px: float, *, by_axis: bool = False
 ) -> Boundaries:
-    """Boundaries that explain the harmonics by themselves, with the falloff that does it best.
+    """Moving boundaries alone, without a nonlinear response, with the best-fitting falloff.
 
-    ``otherwise_px``: falloff (of `FALLOFFS_PX`) where harmonics do not tell. ``by_axis``:
-    boundaries between rows may move by another shift than those between columns.
+    ``otherwise_px``: falloff (of `FALLOFFS_PX`) where harmonics do not constrain it. ``by_axis``:
+    shifts of boundaries between rows and between columns may differ.
     """
     sums = _sums_by_axis(evidence)
     if len(sums) < 2 or not by_axis:
@@ -152,7 +151,7 @@ def boundaries_alone(
 
 
 def _of_any_shape(sums: Sequence[tuple[F64, F64]]) -> float:
-    """Chi-square that boundaries explain by themselves whose shift is any sum of all falloffs."""
+    """Chi-square explained by boundaries alone whose shift is any sum of all falloffs."""
     every = [(normal[POWERS:, POWERS:], right[POWERS:]) for normal, right in sums]
     return float(sum(right @ inverse_normal(normal) @ right for normal, right in every))
 
@@ -193,22 +192,21 @@ def _boundary_sums(evidence: Evidence) -> list[tuple[F64, F64]]:
 
 @dataclass(frozen=True)
 class Beside:
-    """Moving boundaries with a bent response that is free beside them."""
+    """Moving boundaries fitted together with a nonlinear response."""
 
-    # shift, variance: by an electron, px; on the mean of boundaries between columns and between
-    # rows
+    # shift, variance: per electron, px; mean of boundaries between columns and between rows
     shift: float
     variance: float
     gain: float  # chi-square that they explain beyond the response
-    axes: int  # of boundaries, each with a shift of its own: one or two
+    axes: int  # number of axes with a shift of their own: one or two
 
 
 def boundaries_beside(
     evidence: Evidence, falloff_px: float, known: tuple[float, float] | None = None
 ) -> Beside:
-    """Boundaries of a falloff (of `FALLOFFS_PX`), with a response that is free.
+    """Boundaries of a falloff (of `FALLOFFS_PX`), fitted with a free response.
 
-    ``known``: mean shift by an electron (px) and its variance, as the noise of neighbours has it.
+    ``known``: mean shift per electron (px) and its variance, from the noise of neighbours.
     """
     sums = _sums_by_axis(evidence)
     normal, right = _joint(sums, POWERS + FALLOFFS_PX.index(falloff_px))
@@ -229,7 +227,7 @@ def _sums_by_axis(evidence: Evidence) -> list[tuple[F64, F64]]:
 
 
 def _joint(sums: Sequence[tuple[F64, F64]], at: int) -> tuple[F64, F64]:
-    """Normal equations: powers that all sums share, and a shift of each."""
+    """Normal equations: powers common to all sums, and a shift of each."""
     n = POWERS + len(sums)
     joint, right = np.zeros((n, n)), np.zeros(n)
     for number, (normal, own) in enumerate(sums):
@@ -242,7 +240,7 @@ def _joint(sums: Sequence[tuple[F64, F64]], at: int) -> tuple[F64, F64]:
 def _alone(
     sums: Sequence[tuple[F64, F64]], at: int
 ) -> tuple[float, float, float, float, float, float]:
-    """Shift, variance, chi-square explained, and that of a bent response; then the axes' ratio."""
+    """Shift, variance, chi-square explained, that of an added response; ratio of axes, error."""
     information = np.array([normal[at, at] for normal, _ in sums])
     rights = np.array([right[at] for _, right in sums])
     sizes = rights / information
@@ -256,7 +254,7 @@ def _alone(
 
 
 def _best_falloff(found: F64, otherwise_px: float, of_any: float) -> Boundaries:
-    """By a parabola about the best; ``of_any``: chi-square of boundaries of any shape."""
+    """From a parabola about the best; ``of_any``: chi-square of boundaries of any shape."""
     best = int(np.clip(np.argmax(found[:, 2]), _BESIDE, len(found) - 1 - _BESIDE))
     near = np.array([best - _BESIDE, best, best + _BESIDE])
     at = np.log(_FINE_PX[near] / _FINE_PX[best])
@@ -270,7 +268,7 @@ def _best_falloff(found: F64, otherwise_px: float, of_any: float) -> Boundaries:
             otherwise_px, np.inf, size, variance**0.5, 0.0, against, of_any - gain, ratio, own, 0.0
         )
     top = float(-slope / (2 * curved))
-    # Not beyond what was tried; how far that is from the best is not known then.
+    # Limited to the range tried; the distance from the maximum adds to the error.
     there = float(np.clip(top, *np.log(_FINE_PX[[0, -1]] / _FINE_PX[best])))
     error = float(np.hypot(error, top - there))
     size, variance, gain, against, ratio, own = (

@@ -1,7 +1,7 @@
-"""Photon transfer of flats, level by level, over that of the gain used.
+"""Photon transfer of flats, level by level, over that expected with the gain used.
 
-Noise that neighbours share counts with that of the pixels themselves: crosstalk and brighter-fatter
-move it from one to the other and leave the sum, as far as `STEPS` reach.
+Covariances of neighbours are added to the variance: crosstalk and brighter-fatter move noise from
+one to the other but conserve the sum within `STEPS`.
 """
 
 from collections.abc import Iterable
@@ -14,26 +14,26 @@ from pixcal.kernels.line_means import without_line_means
 from pixcal.kernels.residual_sums import residual_sums
 from pixcal.model.arrays import F64, Mask
 
-# rows and columns from a pixel to itself and to those that it may share its noise with
+# rows and columns from a pixel to itself and to those that may share its noise
 STEPS = np.array([(0, 0), (0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0)])
-# error of a share of the variance that is left however many samples there are: no owner knows the
-# gain of a detector better than this, and amplifiers differ by as much
+# systematic error of a share of the variance: no detector's gain is known better than this, and
+# amplifiers differ by as much
 FLOOR = 5e-3
-MIN_PIXELS = 200  # fewest pixels that tell a noise
+MIN_PIXELS = 200  # fewest pixels for a noise measurement
 CLIP = 6.0  # standard deviations beyond which a residual does not count
 
 _MIN_LEVELS = 3
 _ALIKE = 1e4
-_READ_KNOWN = 0.3  # relative error of the read noise's variance as it was used
+_READ_KNOWN = 0.3  # assumed relative error of the variance of the read noise
 
 
 @dataclass(frozen=True)
 class TransferCurve:
-    """Photon transfer of flats over that of the gain used, as a line over the level."""
+    """Photon transfer of flats over that expected with the gain used, as a line in the level."""
 
     share: float  # share, error: at level zero
     error: float
-    slope: float  # slope, slope_error: change up to the top
+    slope: float  # slope, slope_error: change from zero to the highest level
     slope_error: float
     top: float  # highest level, e-
     levels: F64  # levels, shares, errors: (n,) of each level (e-)
@@ -44,11 +44,11 @@ class TransferCurve:
 def transfer_curve(evidence: Evidence, *, whole: bool = False) -> TransferCurve | None:
     """Photon transfer of each level of flats.
 
-    None with fewer than three levels, or where that without light is not known.
+    None with fewer than three levels, or without a known level of dark frames.
 
-    Where flats told the gain, of `STEPS` only those count that were found to share noise, unless
-    the ``whole`` noise is asked for. The slope is better known so; but what several share together
-    may be more than the error when that of none is significant.
+    Where the gain was measured from flats, only `STEPS` found to share noise count, unless
+    ``whole``. This makes the slope more precise, but several insignificant covariances may
+    together exceed the error.
     """
     return evidence.once("transfer curve", whole, make=lambda: _transfer_curve(evidence, whole))
 
@@ -82,9 +82,9 @@ def _transfer_curve(evidence: Evidence, whole: bool) -> TransferCurve | None:
 
 
 def _read_alone(sums: F64) -> F64:
-    """Sums of frames without light as if they had no dark signal, whose shot noise is as expected.
+    """Sums of frames without light, less the expected shot noise of their dark signal.
 
-    It is of low levels, where the response has another slope than at that of flats.
+    Dark signal is low, where the response has another slope than at the levels of flats.
     """
     n, _, s12, s22, _, p2, square = sums.T
     none = np.zeros_like(n)
@@ -93,9 +93,9 @@ def _read_alone(sums: F64) -> F64:
 
 
 def shot_share(sums: Iterable[F64], counted: Mask | None = None) -> tuple[float, float] | None:
-    """Noise that grows with the level over that expected, with its error; None without samples.
+    """Level-dependent noise over that expected, with its error; None without samples.
 
-    ``counted`` tells which of `STEPS` to add to the first, all by default.
+    ``counted``: which of `STEPS` to add to the first, all by default.
     """
     total = sum(sums, np.zeros((len(STEPS), 7)))
     if not total[0, 0]:
@@ -120,7 +120,7 @@ def shot_share(sums: Iterable[F64], counted: Mask | None = None) -> tuple[float,
 
 
 def sums_of_stacks(evidence: Evidence) -> Iterable[F64]:
-    """The same of flats, and of frames without light, which tell the noise at no level."""
+    """Sums of flats, and of frames without light, which give the noise at zero level."""
     if any(s.kind == "flat" and _is_enough(s) for s in evidence.stacks):
         for stack in filter(_is_enough, evidence.stacks):
             sums = _of_stack(stack, evidence)
@@ -144,8 +144,8 @@ def _products_of(stack: Stack, evidence: Evidence) -> F64 | None:
         return None
     frames = (stack.adu - evidence.bias.astype(np.float32)) * np.float32(evidence.gain)
     level = frames.mean(axis=0)
-    # What a frame has more: of light, or of bias. Pixels' own levels are too noisy to say how much
-    # noise to expect: that would come out too small a share of it.
+    # Excess of a frame, of light or of bias. Pixels' own levels are too noisy to predict their
+    # noise: the share would be biased low.
     pattern = evidence.flat if stack.kind == "flat" else np.ones(level.shape)
     pattern = np.where(good, pattern, 0).astype(np.float32)
     usual = pattern * max(float(level[good].mean() / pattern[good].mean()), 0.0)
@@ -154,7 +154,7 @@ def _products_of(stack: Stack, evidence: Evidence) -> F64 | None:
     more = np.einsum("tyx,yx->t", frames, pattern / noise)
     brighter = (more / (pattern**2 / noise).sum())[:, None, None] * pattern
     ones = np.ones(level.shape)
-    # Few frames are no average of what every second row has in common.
+    # Noise that every second row shares does not average out over few frames.
     residual = without_line_means(frames - brighter, good)
     return residual_sums(
         residual, usual + brighter, ones, evidence.read_noise**2 * ones, good,
@@ -164,7 +164,7 @@ def _products_of(stack: Stack, evidence: Evidence) -> F64 | None:
 
 
 def _shared_steps(evidence: Evidence) -> Mask:
-    """Which of `STEPS` share noise as far as the flats told it: all where they told no gain."""
+    """Which of `STEPS` share noise according to the flats; all where these gave no gain."""
     if np.isnan(evidence.photon_transfer[0]):
         return np.ones(len(STEPS), np.bool_)
     counted = {(0, 0), *evidence.neighbours, *((-y, -x) for y, x in evidence.neighbours)}

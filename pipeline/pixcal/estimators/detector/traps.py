@@ -1,9 +1,9 @@
-"""What stays behind of a frame's charge, from its forward model.
+"""Charge that a frame leaves behind, from a forward model.
 
-A share that is the same at all levels and does not depend on what stayed before only changes
-amplitude and phase of the frames, which the fit takes up: the contrast of each frame shows it. All
-else leaves harmonics of the phases of these frames in the residuals. Both are fitted at once, by
-Gauss-Newton steps on the loss that a model predicts, beside a bent response of the frame itself.
+A share that is equal at all levels, and independent of charge held before, only changes amplitude
+and phase of the frames, which the fringe fit absorbs: it appears in the contrast. Any other loss
+leaves harmonics of the phases in the residuals. Gauss-Newton steps fit the loss that a model
+predicts to both, together with a nonlinear response.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,14 +24,14 @@ STEP = 0.03  # relative step of a parameter for its derivative
 SLOW = (2, 1)  # powers of the time, and harmonics of the phase, that the contrast is free to have
 UNKNOWN = 6  # frames after a gap, whose past is not known
 CONVERGED = 1.0  # fall in chi-square that a step must bring
-# lengths of a step that are tried: where room is short, samples that fill it change with the step
+# factors of a step that are tried: the samples that fill the traps change with the step
 LENGTHS = (4.0, 2.0, 1.0, 0.5, 0.25)
-NOT_EVEN = 25.0  # chi-square from which what stays is taken to depend on the level
-# trials for traps that fill up: what they keep from frame to frame, and hold at most, over what
-# they would take of full scale
+NOT_EVEN = 25.0  # chi-square from which the share depends on the level
+# start values for traps that fill up: part kept from frame to frame, and capacity over the loss
+# of full scale without such a limit
 KEEPS, ROOMS = (0.3, 0.6), (0.1, 0.2, 0.4, 0.7)
-STEPS = 12  # of all parameters of such traps
-_UNTOLD = 1e-9  # relative error that is none, of a parameter without influence on the frames
+STEPS = 12  # Gauss-Newton steps for such traps
+_UNTOLD = 1e-9  # relative error below which a parameter does not influence the frames
 
 Loss = Callable[[F64, F32], F32]
 
@@ -53,21 +53,21 @@ class FittedLoss:
 
     @property
     def errors(self) -> F64:
-        """1-sigma (p,); as large as the parameter itself where the frames do not tell it."""
+        """1-sigma (p,); equal to the parameter where the frames do not constrain it."""
         errors, size = np.sqrt(np.diag(self.covariance).clip(0)), np.abs(self.value)
         return np.where(errors > _UNTOLD * size, errors, size)
 
 
 class LossFit:
-    """Fringe frames, to be held against losses of charge; ``level_e``: full scale, e-."""
+    """Fits losses of charge to fringe frames; ``level_e``: full scale, e-."""
 
     def __init__(self, evidence: Evidence, level_e: float) -> None:
         self._sets = [_Set(evidence, fringes, level_e) for fringes in evidence.fringes.values()]
 
     def fit(self, lost: Loss, start: Sequence[float] | F64, rounds: int) -> FittedLoss:
-        """Gauss-Newton steps, at most ``rounds``, of parameters (p,), none of them zero, of a loss.
+        """Fit nonzero parameters (p,) of a loss; ``rounds``: limit of Gauss-Newton steps.
 
-        ``lost``: charge (t, n), e-, that frames lose, from the parameters and their own charge.
+        ``lost``: gives the charge (t, n), e-, that frames lose, from parameters and own charge.
         """
         value = np.array(start, float)
         rests = self._rests(lost, value)
@@ -78,7 +78,7 @@ class LossFit:
             step = (inverse_normal(normal) @ right)[: len(value)]
             gain = 0.0
             for factor in LENGTHS:
-                # A part of a step that would change the sign is no step of this model.
+                # Parameters keep their sign: one that would change it is halved instead.
                 moved = value + factor * step
                 moved = np.where(value * moved > 0, moved, value / 2)
                 tried = self._rests(lost, moved)
@@ -97,16 +97,16 @@ class LossFit:
     def by_level(
         self, few: "LossFit", banded: Loss, trapped: Loss, share: float, full: float
     ) -> tuple[FittedLoss | None, FittedLoss | None]:
-        """Shares of bands of the level, or traps that fill up; None for what explains no more.
+        """Shares of bands of the level, and traps that fill up; None if the fit does not improve.
 
-        ``few``: fewer pixels to search traps on. ``banded, trapped``: as of `fit`. ``share``:
+        ``few``: fewer pixels, to search traps. ``banded, trapped``: as in `fit`. ``share``:
         mean share that stays behind; ``full``: full scale, e-.
         """
         even = np.full(len(BANDS), share)
         self.weigh(banded, even)
         bands = self.fit(banded, even, 2)
         precision = inverse_normal(bands.covariance)
-        # The contrast tells the common share to its square, which steps about a model leave out.
+        # Contrast is sensitive to the square of the common share, which linear steps neglect.
         away = bands.value - (precision @ bands.value).sum() / precision.sum()
         if float(away @ precision @ away) < NOT_EVEN:
             return None, None
@@ -124,11 +124,11 @@ class LossFit:
         return bands, traps if better else None
 
     def chi2(self, lost: Loss, value: Sequence[float] | F64) -> float:
-        """Of a loss as it is."""
+        """Of a loss with these parameters."""
         return sum(rest.chi2 for rest in self._rests(lost, np.array(value)))
 
     def weigh(self, lost: Loss, value: Sequence[float] | F64) -> None:
-        """Take what a loss leaves of the contrast for its noise."""
+        """Set the contrast's noise from the scatter that a loss leaves."""
         for one, rest in zip(self._sets, self._rests(lost, np.array(value)), strict=True):
             one.contrast_error *= robust_sigma(rest.contrast[one.known])
 
@@ -136,7 +136,7 @@ class LossFit:
         return [one.rest(lost(value, one.level)) for one in self._sets]
 
     def _sums(self, lost: Loss, value: F64, rests: Sequence["_Rest"]) -> tuple[F64, F64]:
-        """Least-squares sums of a step of the parameters, then of a bent response."""
+        """Normal equations for a step of the parameters, then of a nonlinear response."""
         slopes: list[list[_Rest]] = []
         for n, size in enumerate(value):
             near = value.copy()
@@ -156,7 +156,7 @@ class LossFit:
 
 @dataclass(frozen=True)
 class _Rest:
-    """What is left of residuals (t, n), over their noise, and of the contrast (t,), over its."""
+    """Residuals (t, n) and contrast (t,) after correction, each over its noise."""
 
     samples: F32
     contrast: F64
@@ -179,7 +179,7 @@ class _Set:
     """One fringe set."""
 
     def __init__(self, evidence: Evidence, fringes: FringeEvidence, level_e: float) -> None:
-        # Pixels differ in the share that stays: what a level adds to it must not be told by that.
+        # Pixels differ in their share, which must not pass for a dependence on level.
         self._freedom = freedom = Freedom(fringes, before=True)
         self._flat = evidence.flat[freedom.good].astype(np.float32)
         self.level: F32 = freedom.of_good(evidence.level(fringes, np.nan_to_num(fringes.model)))
@@ -201,11 +201,11 @@ class _Set:
 
     @cached_property
     def bent(self) -> list["_Rest"]:
-        """What bands of the response leave."""
+        """Residuals that bands of a nonlinear response cause."""
         return [self._of_change(part / self._flat) for part in self._bands]
 
     def rest(self, lost: F32) -> _Rest:
-        """Residuals and contrast without a loss (t, n), e-."""
+        """Residuals and contrast corrected for a loss (t, n), e-."""
         change = self._of_change(-lost / self._flat)
         samples = self._sigma * self._residual - change.samples
         return _Rest(samples, self._contrast / self.contrast_error - change.contrast)
