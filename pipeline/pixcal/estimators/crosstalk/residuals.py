@@ -38,8 +38,8 @@ class Residuals:
     charge: F32  # (t, y, x) mean charge as collected, which is its variance, over sigma (10⁴ e-)
     shot: F32  # (t, y, x) variance that charge gives after the couplings, over sigma
     one: F32  # (t, y, x) one over sigma
-    # (m, s, y, x) what was taken off every `STRIDE`-th frame, orthonormal, and grown to stand
-    # for all
+    # (m, s, y, x) modes removed from every `STRIDE`-th frame, orthonormal, scaled to represent
+    # all
     modes: F32
     steady: bool = False  # whether the charge of a pixel is the same in all frames
 
@@ -93,14 +93,13 @@ def _of_stack(stack: Stack, evidence: Evidence, known: Sequence[Coupling], kept:
 
 def _of_fringes(found: FringeEvidence, known: Sequence[Coupling], kept: F32) -> Residuals:
     """Fringe frames less the fit, as they were before they were divided by the flat."""
-    # A curved response makes second and third harmonics of the fringes, not the same for all
-    # pixels.
+    # A nonlinear response causes second and third harmonics of the fringes that differ by pixel.
     at = _spread(len(found.g), found.good.size)
     flat = 1 / found.shot_factor
     theta = filled(np.where(found.good, found.theta, np.nan) * flat, found.k)
     collected = uncouple_fringes(theta, known, found.origin)
     charge = np.maximum(_model(collected, found.g[at], found.dk[at]) / np.float32(UNIT), 0)
-    # Also what changes along the window: a fringe vector that moves, rows that are exposed later.
+    # Also changes along the window: a moving fringe vector, rows that are exposed later.
     y, x = grid((flat.shape[0], flat.shape[1]))
     places = np.concatenate([theta, x * theta, y * theta]).reshape(9, -1) / np.abs(theta).max()
     scale = np.where(found.good, flat / UNIT**0.5, np.nan).astype(np.float32)
@@ -113,7 +112,7 @@ def _of_fringes(found: FringeEvidence, known: Sequence[Coupling], kept: F32) -> 
 
 
 def _without_response(rest: F32, charge: F32) -> F32:
-    """Residuals (t, y, x) less their mean at each level: a curved response. In place."""
+    """Residuals (t, y, x) less their mean at each level: a nonlinear response. In place."""
     # Frame by frame: the level indices of all frames would take more memory than the frames.
     step = float(charge.max()) / LEVELS or 1.0
     count, total = np.zeros((2, LEVELS))
@@ -152,7 +151,7 @@ def _noise(rest: F32, charge: F32, read: F32, kept: F32, of_time: F32, of_place:
     e = freedom.left_over(rest.reshape(len(rest), -1)).reshape(rest.shape) * one
     left = np.maximum(1 - freedom.taken_by_pixels(), np.float32(MIN_NOISE_SHARE))
     e /= np.sqrt(left).reshape(e.shape)
-    # Noise beyond what is known makes every product count for less.
+    # Excess noise lowers the weight of every product.
     squares = float(np.einsum("tyx,tyx->t", e, e).sum(dtype=float))
     excess = max(1.0, squares / max(int(np.count_nonzero(one)), 1))
     less = np.float32(excess**-0.5)

@@ -1,9 +1,9 @@
-"""Which couplings there are: links, periods and classes of pixels that stand out of the noise.
+"""Detection of couplings: significant links, periods and classes of pixels.
 
-Every pair of pixels a step apart, and every period of rows and columns, is tried. A link is taken
-if it stands out so far that chance takes any in one acquisition of a hundred; half of that is left
-to the few looks at adjacent pixels that couple alike everywhere. Shares there and back, and of many
-classes, are one number until the data tell them apart.
+Every pair of pixels a step apart, and every period of rows and columns, is tested. A link is
+accepted at a false-alarm rate of one acquisition in a hundred; half of that is reserved for the few
+tests of adjacent pixels with equal coupling everywhere. Shares there and back, and of many classes,
+are one number until the data separate them.
 """
 
 from collections.abc import Callable
@@ -19,31 +19,31 @@ from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
 
 FALSE_ALARM = 0.01  # chance that noise alone gives any coupling
-# Share of the looks that are as good as independent: periods have pixels in common. Measured: it
-# makes the median significance of acquisitions without couplings about zero.
+# Effective share of independent tests, as periods have pixels in common. Measured: it makes the
+# median significance of acquisitions without couplings about zero.
 INDEPENDENT = 0.35
-WORTH = 16.0  # fall in chi-square for which another share is taken, once a link is known to couple
-NEAR, MAX_FAR = 2, 12  # of a kernel few couplings reach over more pixels than that
-NEAREST = (0, 1), (1, 0)  # links that a capacitance makes alike
-NOTHING = 1e-6  # weight of a share below which it is not measured at all
+WORTH = 16.0  # fall in chi-square required of another share of a link that couples
+NEAR, MAX_FAR = 2, 12  # distance (px), and most couplings of a kernel beyond it
+NEAREST = (0, 1), (1, 0)  # links that a capacitance makes equal
+NOTHING = 1e-6  # weight of a share below which it is not measured
 
 
 @dataclass(frozen=True)
 class Looks:
-    """Numbers that were tried together."""
+    """Tests made together."""
 
     best: float  # largest chi-square of one of them
     count: int
 
     @property
     def log_none(self) -> float:
-        """Logarithm of the chance that none is as large without couplings."""
+        """Logarithm of the probability that none is as large without couplings."""
         return float(INDEPENDENT * self.count * np.log1p(-np.exp(self._log_one)))
 
     @property
     def log_any(self) -> float:
-        """That of the chance that one of them is."""
-        # A small chance, which looks multiply.
+        """Logarithm of the probability that one of them is."""
+        # A small probability, times the number of tests.
         none = self.log_none
         few = self._log_one + np.log(INDEPENDENT * self.count)
         return float(np.log(-np.expm1(none)) if none < -1e-9 else few)
@@ -55,7 +55,7 @@ class Looks:
 
 @dataclass(frozen=True)
 class Choice:
-    """All that is taken, and how far the best of it is from chance."""
+    """All accepted couplings, and the significance of the best."""
 
     links: tuple[int, ...]  # that stand out
     classes: PixelClasses  # of the period

@@ -1,1 +1,1 @@
-"""What an acquisition holds as evidence of an effect: frames, maps, and what their fit takes up."""
+"""Evidence of effects in an acquisition: frames, maps, and what their fit absorbs."""

@@ -1,9 +1,8 @@
 """Distortions of the signal that the fit of the fringes cannot absorb, fitted to its residuals.
 
-A distortion adds something to the samples that depends on the signal and a few sizes. The
-directions in which the fit is free are projected out of it and of the residuals (with weights),
-which makes both blind to every error of the fit; sizes follow by weighted least squares
-(Gauss-Newton).
+A distortion changes the samples by a function of the signal and a few sizes. The directions in
+which the fit is free are projected out of it and of the residuals (with weights), so that errors of
+the fit do not matter; sizes follow by weighted least squares (Gauss-Newton).
 """
 
 from collections.abc import Callable, Sequence
@@ -22,29 +21,29 @@ from pixcal.model.arrays import F32, F64
 
 Distortion = Callable[[FringeEvidence, F32, F64], F32]
 
-# of the alternating projections: with the weights of fringes of full contrast 0.5 % of the rest
-# still lies in directions that are free, and half as much with each turn more
+# alternating projections: for fringes of full contrast 0.5 % of the remainder still lies in free
+# directions, and each further one halves that
 _TURNS = 4
 
 _INDEPENDENT = 1e-3
 _NEGLIGIBLE = 1e-6
 
-# steps, all with the slopes of no distortion: each gains a factor of the distortion's size, until
-# all sizes together move by less than this many standard errors
+# most steps, all with the derivatives at zero distortion; they end when all sizes together move by
+# less than this many standard errors
 _ROUNDS = 8
 _STILL = 0.1
 
-DENIED = 0.25  # share of what sets show by themselves from which common sizes are refused
+DENIED = 0.25  # share of the chi-square of separate sizes above which common ones are rejected
 
 
 class TwoWay:
-    """A table of frames by pixels whose rows and columns are each free in some functions.
+    """A table of frames by pixels, with free functions of time and of place.
 
     weight : (t, n) one over the variance; zero where a sample has no weight
-    of_time : (k, t) the functions of time that a pixel is free to have
-    of_place : (j, n) the functions of place that a frame is free to have
-    slopes : (t, p, j) shares of the functions of place in each parameter of a frame, where these
-        are fewer
+    of_time : (k, t) functions of time, free in each pixel
+    of_place : (j, n) functions of place, free in each frame
+    slopes : (t, p, j) coefficients of the functions of place for each parameter of a frame, where
+        these are fewer
     """
 
     def __init__(self, weight: F32, of_time: F32, of_place: F32, slopes: F64 | None = None) -> None:
@@ -57,13 +56,13 @@ class TwoWay:
         upper = np.triu_indices(k)
         products = self.of_time[upper[0]] * self.of_time[upper[1]]
         normal = symmetric((products @ self.weight).T)
-        # A pixel with hardly a sample has no parameters.
+        # A pixel with too few samples has no parameters.
         trace = np.einsum("nii->n", normal)[:, None, None]
         return np.linalg.inv(normal + (_NEGLIGIBLE * trace + 1e-30) * np.eye(k))
 
     @cached_property
     def frame_covariance(self) -> F64:
-        """Covariance (t, j, j) of the frames' share of the functions of place, from the noise."""
+        """Covariance (t, j, j) of each frame's coefficients of ``of_place``, from the noise."""
         upper = np.triu_indices(len(self.of_place))
         products = self.of_place[upper[0]] * self.of_place[upper[1]]
         normal = symmetric(self.weight @ products.T)
@@ -73,7 +72,7 @@ class TwoWay:
         return turned @ inverse_normal(self._slopes @ normal @ turned, 1e-7) @ self._slopes
 
     def left_over(self, change: F32) -> F32:
-        """What the freedom leaves of a change (t, n) of the samples; 0 where one has no weight."""
+        """Part of a change (t, n) of the samples orthogonal to the freedom; 0 without weight."""
         inverse = np.ascontiguousarray(np.moveaxis(self.pixel_inverse, 0, -1), np.float32)
         covariance = self.frame_covariance.astype(np.float32)
         return left_over(
@@ -81,7 +80,7 @@ class TwoWay:
         )
 
     def taken_by_pixels(self) -> F32:
-        """Share (t, n) of the variance that the free pixels take off the residuals."""
+        """Share (t, n) of the variance that the pixels' free parameters absorb."""
         k, count = self.of_time.shape
         products = (self.of_time[:, None] * self.of_time).reshape(k * k, count)
         inverse = self.pixel_inverse.reshape(-1, k * k).astype(np.float32)
@@ -91,9 +90,9 @@ class TwoWay:
 class Freedom(TwoWay):
     """The directions in which a fit of a fringe set is free.
 
-    Of the frames (B, A cos phi, A sin phi) and the fringe vector; of the pixels the three maps, and
-    as much again for each higher of the ``harmonics`` of the phase and, with ``before``, a share of
-    the frame before. ``margin``: pixels along the edges that are left out. ``good``: (y, x) the n
+    Frames are free in (B, A cos phi, A sin phi) and the fringe vector; pixels in the three maps, in
+    higher ``harmonics`` of the phase and, with ``before``, in a share of the frame before.
+    ``margin``: pixels along the edges that are excluded. ``good``: (y, x) the n
     pixels used; ``of_time``: (k, t) orthonormal; ``of_place``: (7, n) the maps, and their slopes
     along x and y.
     """
@@ -117,7 +116,7 @@ class Freedom(TwoWay):
         independent = independent[:, size > _INDEPENDENT * size[0]]
         y, x = (np.broadcast_to(v, good.shape)[good] for v in grid((good.shape[0], good.shape[1])))
         theta = fringes.theta[:, good]
-        # The maps, and their slopes along x and y; the latter turn with the phase of the frame.
+        # The maps, and their slopes along x and y, which rotate with the phase of the frame.
         of_place = np.stack(
             [*theta, x * theta[1], x * theta[2], y * theta[1], y * theta[2]]
         ).astype(np.float32)
@@ -135,15 +134,15 @@ class Freedom(TwoWay):
 
 @dataclass(frozen=True)
 class Agreement:
-    """Whether sets have sizes in common."""
+    """Whether sets agree on common sizes."""
 
-    common: float  # common, own: chi-square that common sizes explain, and each set's own
+    common: float  # common, own: chi-square explained by common sizes, and by each set's own
     own: float
     more: int  # sizes that are each set's own, less the common ones
 
     @property
     def refused(self) -> bool:
-        """Whether sets deny much of what others show, beyond chance."""
+        """Whether sets contradict each other substantially, beyond chance."""
         apart = self.own - self.common
         chance = sigmas_of_chi2(apart, self.more) < SIGNIFICANT if self.more else True
         return apart > DENIED * self.own and not chance
@@ -157,15 +156,15 @@ def fit_distortions(
     margin: int = 0,
     prior: tuple[F64, F64] | None = None,
 ) -> tuple[F64, F64, Agreement]:
-    """Sizes (count,) of distortions that all sets have in common, and their covariance.
+    """Sizes (count,) of distortions common to all sets, and their covariance from sample noise.
 
-    That is from the noise of the samples. Last, how far the sets agree on them.
+    Returns also the sets' agreement.
 
-    distortion : from a set, its signal (t, y, x) without distortion and the sizes, what is added to
-        the signal (t, y, x). Derivatives are the changes by sizes of one.
+    distortion : gives the change of the signal (t, y, x) from a set, its undistorted signal
+        (t, y, x) and the sizes. Derivatives are the changes by sizes of one.
     margin : pixels along the edges that are not used
-    prior : (float64 array, float64 array) values of the sizes that are known otherwise, and their
-        information (inverse variance; zero of those that are not known)
+    prior : (float64 array, float64 array) prior values of the sizes, and their information (inverse
+        variance; zero without a prior)
     """
     fits = [_SetFit(fringes, distortion, count, margin) for fringes in sets]
     known, information = (np.zeros(count), np.zeros(count)) if prior is None else prior
@@ -193,15 +192,15 @@ def distortion_sums(
 ) -> tuple[F64, F64]:
     """Normal matrix (count, count) and right-hand side (count,) of sizes that all sets share.
 
-    Parameters as of `fit_distortions`. What holds for all sizes together holds for any of them.
-    ``near`` makes sizes (count,) near the right ones of a set's own sums: a distortion is a
-    straight line in its sizes about these.
+    Parameters as in `fit_distortions`. Rows and columns of the sums serve for a subset of sizes.
+    ``near`` gives approximate sizes (count,) from a set's own sums; the distortion is linearised
+    about these.
     """
     normal, right = np.zeros((count, count)), np.zeros(count)
     for fringes in sets:
         fit = _SetFit(fringes, distortion, count, margin)
         about = near(fit.normal, fit.right(np.zeros(count)))
-        fit.right(about)  # from here on the signal is that without these
+        fit.right(about)  # from here on the signal is without these
         normal, right = normal + fit.normal, right + fit.right(about) + fit.normal @ about
     return normal, right
 
@@ -218,7 +217,7 @@ def _agreement(fits: Sequence["_SetFit"], rights: Sequence[F64]) -> Agreement:
 
 
 class _SetFit:
-    """One set: residuals, what the fit took up, and the normal matrix without distortion."""
+    """One set: residuals, the freedom of the fit, and the normal matrix without distortion."""
 
     def __init__(
         self, fringes: FringeEvidence, distortion: Distortion, count: int, margin: int
@@ -226,7 +225,7 @@ class _SetFit:
         self._fringes, self._distortion = fringes, distortion
         self._freedom = Freedom(fringes, margin=margin)
         self._residual = self._freedom.left_over(self._freedom.of_good(fringes.residual))
-        # Where there is no fit, the samples themselves act on the pixels around.
+        # Pixels without a fit affect their neighbours by the samples themselves.
         seen = np.isfinite(fringes.electrons) & ~fringes.good
         self._fitted = np.nan_to_num(np.where(seen, fringes.electrons, fringes.model))
         self._signal = self._fitted

@@ -1,4 +1,4 @@
-"""What a part of an acquisition tells about its effects: samples, maps, frames, side by side."""
+"""Evidence from a part of an acquisition about its effects: samples, maps, frames."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -15,40 +15,40 @@ from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 T = TypeVar("T")
-FreeFrames = tuple[F64, F64]  # parameters (t, 5) of frames, each by itself, and covariance
+FreeFrames = tuple[F64, F64]  # parameters (t, 5) of independent frames, and covariance
 
 STRIPE = 4  # rows of a stripe of `FringeEvidence.halves`: few neighbours lie in different halves
-SATURATED = 1e-3  # share of saturated samples from which flats tell nothing of levels and noise
+SATURATED = 1e-3  # share of saturated samples above which flats are unusable for levels and noise
 DITHER = 0.38  # noise over a code from which means of rounded samples are right to 2 % of a code
-NO_SAMPLE = -(1 << 30)  # electrons that stand for a sample without weight
-# samples of a set that are looked at where every one costs some hundred operations
+NO_SAMPLE = -(1 << 30)  # electrons that mark a sample without weight
+# most samples of a set where each costs some hundred operations
 MAX_SAMPLES = 1 << 21
-MIN_SIZE = 32  # pixels that stay along each side, and frames, if there are as many
+MIN_SIZE = 32  # least pixels kept along each side, and least frames, if available
 
 
 @dataclass(frozen=True)
 class FringeEvidence:
-    """One fringe set on a part of the window, and what the fit found there."""
+    """One fringe set on a part of the window, and its fit."""
 
     name: str
     baseline_mm: tuple[float, float]  # nominal
     k: tuple[float, float]  # fringe vector (kx, ky) at the window's centre, rad/px
     origin: tuple[int, int]  # row and column of the part's first pixel in the window
     window: tuple[int, int]  # rows and columns of the whole window
-    frame: Indices  # (t,) number of each frame in the set, ascending; frames may be left out
+    frame: Indices  # (t,) number of each frame in the set, ascending; frames may be missing
     time_s: F64  # (t,) time of each frame after the first of the set, s
     exptime_s: float  # nan when unknown
-    # (t, y, x) reduced samples (bias and dark taken off, divided by the flat); NaN without weight
+    # (t, y, x) reduced samples (less bias and dark, divided by the flat); NaN without weight
     electrons: F32
     adu: NDArray[np.generic]  # (t, y, x) the same samples as the camera wrote them
     g: F64  # (t, 3) (B, A cos phi, A sin phi) at the middle of the part
     dk: F64  # (t, 2) change of the fringe vector (x, y), rad/px; zeros when the fit held it
-    # (t, 5) (B, A cos phi, A sin phi, dkx, dky) of each frame by itself, from this part's pixels,
-    # with the fringe vector free whether the fit held it or not
+    # (t, 5) (B, A cos phi, A sin phi, dkx, dky) of each frame independently, from this part's
+    # pixels, with the fringe vector free even if the fit held it
     free: F64
     free_covariance: F64  # (t, 5, 5) of ``free``, from the noise of the samples
     theta: F64  # (3, y, x) (iota, alpha sin psi, alpha cos psi), e-
-    sigma: F64  # (y, x) 1-sigma error of the phase psi, rad, of the noise
+    sigma: F64  # (y, x) 1-sigma error of the phase psi by noise, rad
     delta: F64  # (y, x) offset along the fringe axis, px, modes removed; NaN where masked
     good: Mask  # (y, x)
     # read_variance, shot_factor: (y, x) variance of a sample: ``shot_factor * model +
@@ -93,9 +93,9 @@ class FringeEvidence:
 
     @cached_property
     def halves(self) -> tuple[FreeFrames, FreeFrames]:
-        """``free`` and ``free_covariance`` of each half of the pixels, as `free_frames` has them.
+        """``free`` and ``free_covariance`` of each half of the pixels, as in `free_frames`.
 
-        Of a new evidence they are known; they are found anew for some of its frames or pixels.
+        They are stored in a new evidence, and recomputed for a subset of its frames or pixels.
         """
         codes = np.where(np.isnan(self.electrons), np.float32(NO_SAMPLE), self.electrons)
         _, *halves = free_frames(
@@ -128,7 +128,7 @@ class Stack:
 
     @property
     def key(self) -> tuple[str, float, int]:
-        """Kind and level, by which the stacks of an acquisition are told apart."""
+        """Kind and level, which identify a stack of an acquisition."""
         return self.kind, *self.level
 
 
@@ -139,7 +139,7 @@ class Evidence:
     fringes: Mapping[str, FringeEvidence]  # fringe sets by name
     stacks: tuple[Stack, ...]  # bias, darks and flats
     gain: float  # e-/ADU
-    read_noise: float  # of a sample, the rounding of the converter included; e- rms
+    read_noise: float  # of a sample, with the rounding of the converter; e- rms
     amplifier_noise: float  # the same before rounding
     bias: F64  # bias, dark_rate, flat: (y, x) calibration maps: ADU, e-/s, relative
     dark_rate: F64
@@ -151,24 +151,23 @@ class Evidence:
     distance_mm: float
     notes: tuple[str, ...] = field(default=())
     origin: tuple[int, int] = (0, 0)  # row and column of the part's first pixel in the window
-    # gain that photon transfer gives (e-/ADU), its error, and the reduced chi-square; nan where it
-    # gives none
+    # gain from photon transfer (e-/ADU), its error, and the reduced chi-square; nan without any
     photon_transfer: tuple[float, float, float] = (np.nan, np.nan, np.nan)
-    # lags (rows, columns) whose noise that gain counts
+    # lags (rows, columns) whose covariance that gain includes
     neighbours: tuple[tuple[int, int], ...] = ()
-    step_adu: int = 1  # of which all calibration samples are multiples
-    # flats that saturate in the frames that a simulation is held against; None of those themselves
+    step_adu: int = 1  # all calibration samples are multiples of it
+    # flats that saturate in the data with which a simulation is compared; None for the data
     full: frozenset[Level] | None = None
     _found: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def once(self, name: str, *given: Any, make: Callable[[], T]) -> T:
-        """What follows from this evidence and hashable arguments, made when first asked for."""
+        """Result that depends on this evidence and hashable arguments, made at first use."""
         if (name, *given) not in self._found:
             self._found[name, *given] = make()
         return cast(T, self._found[name, *given])
 
     def level(self, fringes: FringeEvidence, signal: F32) -> F32:
-        """Electrons in the pixels for a signal (t, y, x) of a set: flat and dark put back."""
+        """Electrons in the pixels for a signal (t, y, x) of a set: with flat and dark again."""
         seconds = fringes.exptime_s if np.isfinite(fringes.exptime_s) else 0.0
         dark = np.maximum(self.dark_rate, 0) * seconds
         return signal * self.flat.astype(np.float32) + dark.astype(np.float32)
@@ -185,24 +184,24 @@ class Evidence:
 
     @property
     def dithered(self) -> bool:
-        """Whether the read noise spans so much of a code that means of dark samples are right."""
+        """Whether the read noise spans enough of a code for unbiased means of dark samples."""
         return self.amplifier_noise > DITHER * self.gain * self.step_adu
 
     @property
     def has_level(self) -> bool:
-        """Whether the level without light is known, so that noise can be held against light."""
-        # A camera that cuts its noise off at zero may have a bias of zero everywhere.
+        """Whether the level without light is known, so that noise can be compared with light."""
+        # A camera that clips its noise at zero may have a bias of zero everywhere.
         return bool(self.bias.any()) or any(stack.kind != "flat" for stack in self.stacks)
 
     @cached_property
     def ladder(self) -> tuple[Stack, ...]:
-        """Flats by exposure time, without those that are saturated in part."""
+        """Flats by exposure time, without partly saturated ones."""
         full = self.saturated if self.full is None else self.full
         return tuple(s for s in self.of_kind("flat") if s.level not in full)
 
     @cached_property
     def saturated(self) -> frozenset[Level]:
-        """Flats of which so many samples of good pixels saturate that they tell nothing."""
+        """Flats with too many saturated samples in good pixels to be used."""
         limit = self.saturation_adu
         return frozenset(
             s.level
@@ -227,7 +226,7 @@ class Evidence:
 
 def stripes(shape: tuple[int, ...]) -> Mask:
     """One half of a window by stripes of rows (columns if rows are few), to broadcast to (y, x)."""
-    # The sequence of Thue and Morse: it has no period that a fringe could fall in with.
+    # The Thue-Morse sequence has no period that could coincide with fringes.
     axis = 0 if shape[0] >= 2 * STRIPE else 1
     half = np.bitwise_count(np.arange(shape[axis]) // STRIPE) % 2 == 0
     return np.expand_dims(half, 1 - axis)
@@ -243,10 +242,10 @@ def free_frames(
     shot_factor: F64,
     good: Mask,
 ) -> tuple[FreeFrames, FreeFrames, FreeFrames]:
-    """Parameters (t, 5) of every frame by itself, the pixels being known, and their covariance.
+    """Parameters (t, 5) of every frame independently, for known pixels, and their covariance.
 
-    From all good pixels, and from each half of them, taken by stripes of rows: the bench is common
-    to both halves, the noise of the samples is not, that of whole rows included.
+    From all good pixels, and from each half of them by stripes of rows: the bench is common to both
+    halves; the noise of samples, and of whole rows, is not.
 
     Parameters
     ----------
@@ -281,7 +280,7 @@ def free_frames(
 
 
 def central_crop(evidence: Evidence, samples: int = MAX_SAMPLES) -> Evidence:
-    """Central pixels of a window, and of very long sets the first frames, for costly estimates."""
+    """Central pixels of a window, and first frames of very long sets, for costly estimates."""
     ny, nx = evidence.good.shape
     longest = max((len(f.g) for f in evidence.fringes.values()), default=1)
     shrink = min(1.0, float(np.sqrt(samples / (longest * ny * nx))))

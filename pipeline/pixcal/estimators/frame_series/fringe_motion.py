@@ -1,8 +1,8 @@
-"""How the fringe vectors of an acquisition move: jitter, walk, ramp, vibration, change of colour.
+"""Motion of the fringe vectors of an acquisition: jitter, walk, ramp, vibration, wavelength.
 
-All sets are taken together. A change of wavelength by epsilon takes ``epsilon k`` off every set's
-own vector k; a motion of the fibres moves all vectors alike. Sets with fringes of different
-directions therefore tell them apart; with one direction only, what happens along k is either.
+All sets are fitted together. A change of wavelength by epsilon subtracts ``epsilon k`` from every
+set's own vector k; a motion of the fibres moves all vectors equally. Sets with fringes of different
+directions separate the two; with one direction only, motion along k may be either.
 """
 
 from collections.abc import Sequence
@@ -17,13 +17,13 @@ from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F64
 
 CROSSED = 0.5  # sine of the angle between fringes from which they count as different
-HOP_WINDOWS = (2, 4, 8, 16, 32)  # frames before and after, of which the means are compared
+HOP_WINDOWS = (2, 4, 8, 16, 32)  # frames before and after a hop whose means are compared
 SIGNIFICANT_HOP = 6.5
-SIGNIFICANT_STEP = 2.5  # standard deviations of a hop beside a slope, which tells half as well
+SIGNIFICANT_STEP = 2.5  # the same for a hop fitted with a slope, which doubles its error
 MAX_HOPS = 64
-OCTAVE = 1.4  # ratio of frequencies over which the power of a slow change hardly differs
-BESIDE = 3  # modes on either side, of which the power is that of a line
-# excess of the power over that of white noise, in errors, that is a slow change's
+OCTAVE = 1.4  # ratio of frequencies over which the power of a slow change is nearly constant
+BESIDE = 3  # modes on either side that hold the power of a line
+# excess of the power over white noise, in errors, above which a slow change is significant
 SLOW_SIGMAS = 3.0
 
 
@@ -41,15 +41,15 @@ class Hop:
 class Motion:
     """Changes of the fringe vectors of all sets."""
 
-    series: tuple[FrameSeries, ...]  # without hops and a sure line
+    series: tuple[FrameSeries, ...]  # without hops and a significant line
     raw: tuple[FrameSeries, ...]  # with them
     hops: dict[str, tuple[Hop, ...]]  # of each set
-    line: Line | None  # the strongest, sure or not
+    line: Line | None  # the strongest, significant or not
     crossed: bool  # whether there are fringes of different directions
 
 
 def motion_of(evidence: Evidence) -> Motion | None:
-    """Motion of the fringes in all sets with frames enough; None without any."""
+    """Motion of the fringes in all sets with enough frames; None without any."""
     return evidence.once("motion of the fringes", make=lambda: _motion_of(evidence))
 
 
@@ -58,7 +58,7 @@ def _motion_of(evidence: Evidence) -> Motion | None:
     if not found:
         return None
     hops = {s.name: find_hops(s) for s in found}
-    # A hop is in all modes: what follows the phase is sought where none is left.
+    # A hop affects all modes, so shapes that follow the phase are fitted after its removal.
     still = [_with_hops(s, hops[s.name], -1.0).cleaned() for s in found]
     line, cleared = cleared_of_line(still, _level)
     angles = [np.arctan2(s.k[1], s.k[0]) for s in found]
@@ -74,7 +74,7 @@ def _motion_of(evidence: Evidence) -> Motion | None:
 def vector_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
     """Of every set: name, times (t,), slow and fast change (t, 2) of the fringe vector, rad/px.
 
-    Walk modes, each lessened by its share of noise (Wiener); what is fast keeps its power.
+    Walk modes, each reduced by its share of noise (Wiener); the fast part keeps its power.
     """
     found = []
     for fringes in evidence.fringes.values():
@@ -99,7 +99,7 @@ def vector_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
 
 
 def _around(modes: F64, low: float, high: float, beside: int = 0) -> tuple[F64, F64]:
-    """Mean power (k, 2) of modes in a range of factors on their frequency; and how many."""
+    """Mean power (k, 2) of modes between two factors of each frequency, and their number."""
     order = np.arange(1, len(modes) + 1)
     first = np.maximum(np.floor(order * low).astype(int) - beside, 1) - 1
     last = np.minimum(np.ceil(order * high).astype(int) + beside, len(modes))
@@ -121,17 +121,17 @@ def ramps_and_colour(series: FrameSeries) -> F64:
 
 
 def colour_of(series: FrameSeries) -> F64:
-    """Relative change (t,) of the wavelength that each frame's vector shows by itself."""
+    """Relative change (t,) of the wavelength from each frame's own vector."""
     k = np.array(series.k)
     weight = np.linalg.solve(series.noise, k)
     return np.asarray(-(series.values @ weight) / (k @ weight))
 
 
 def find_hops(series: FrameSeries) -> tuple[Hop, ...]:
-    """Jumps of the wavelength: along the fringe vector, and sharp among what else moves it.
+    """Jumps of the wavelength: along the fringe vector, and sharper than its other motion.
 
-    Means before and after are compared with their scatter along the run. The narrowest significant
-    difference locates the hop.
+    Differences of means before and after are compared with their scatter along the run. The
+    narrowest significant difference locates the hop.
     """
     k, along = np.array(series.k), colour_of(series)
     across = series.values @ np.array([-k[1], k[0]]) / (k @ k)
@@ -140,7 +140,7 @@ def find_hops(series: FrameSeries) -> tuple[Hop, ...]:
         if len(along) < 6 * width:
             break
         aside, aside_scatter = _differences(across, width)
-        # Across a gap a drift is a jump.
+        # Across a gap a drift looks like a jump.
         frames = 2 * width - 1
         smooth = series.frame[frames:] - series.frame[:-frames] > frames
         for _ in range(MAX_HOPS):
@@ -158,7 +158,7 @@ def find_hops(series: FrameSeries) -> tuple[Hop, ...]:
 
 
 def _is_step(values: F64, at: int, width: int, size: float) -> bool:
-    """Whether a change stays the same beside a slope: that of a slow drift does not."""
+    """Whether a change persists when a slope is fitted too; that of a slow drift does not."""
     frame = np.arange(-width, width, dtype=float)
     design = np.stack([np.ones(2 * width), frame, frame >= 0], axis=1)
     steps = np.convolve(values, np.linalg.pinv(design)[2, ::-1], "valid")
@@ -195,7 +195,7 @@ def _differences(values: F64, width: int) -> tuple[F64, float]:
 
 
 def _with_hops(series: FrameSeries, hops: Sequence[Hop], times: float) -> FrameSeries:
-    """The series with its hops added so many times."""
+    """The series with its hops added ``times`` times."""
     colour = np.zeros(len(series))
     for hop in hops:
         colour += times * hop.size * (np.arange(len(series)) >= hop.frame)

@@ -1,9 +1,9 @@
-"""Hops between two levels, as a hidden Markov model: how far, and how often.
+"""Hops between two levels, as a hidden Markov model: their size and rate.
 
-Short stays on a level hide in the noise of the frames, and counting what stands out of it leaves
-them out. Here every frame has a chance of either level, given all frames; size, rate, and the base
-of each series (a ramp) with its noise are those of maximum likelihood, by the algorithm of Baum,
-Petrie, Soules & Weiss 1970 (Ann. Math. Statist. 41, 164).
+Short stays on a level are hidden in the noise of the frames, and counting significant hops misses
+them. Here every frame has a probability of either level, given all frames; size, rate, and the base
+of each series (a ramp) with its noise have maximum likelihood, by the algorithm of Baum, Petrie,
+Soules & Weiss 1970 (Ann. Math. Statist. 41, 164).
 """
 
 from collections.abc import Callable, Sequence
@@ -17,10 +17,10 @@ from pixcal.model.arrays import F64
 
 ROUNDS = 200
 SETTLED = 1e-4  # growth of the log-likelihood at which they end
-BASES = 33  # levels tried for the base of each series, to begin with
-# of the size, and in all of the time: what is smaller counts as this
+BASES = 33  # start values tried for the base of each series
+# lower limits: noise over the size; number of hops in the whole time
 MIN_NOISE, FEWEST_HOPS = 1e-3, 0.01
-# of the rate's logarithm, and of the size over the noise, over which the likelihood bends
+# step of the rate's logarithm, and of the size over the noise, for the likelihood's curvature
 STEP = 0.2
 
 
@@ -32,8 +32,8 @@ class Hopping:
     error: float
     rate: float  # rate, rate_error: of hops, 1/s
     rate_error: float
-    # standard deviation of each series about its levels, where these were looked at; and the ramp
-    # that their bases have in common, 1/s
+    # standard deviation of each series about its levels, if fitted; and the ramp common to their
+    # bases, 1/s
     noise: tuple[float, ...] = ()
     ramp: float = 0.0
     ramp_error: float = np.inf
@@ -50,7 +50,7 @@ class _Series:
     likelihood: float = 0.0
 
     def weighed(self, size: float, rate: float) -> "_Series":
-        """With the chances of its states, and the likelihood of all."""
+        """With the probabilities of its states, and the likelihood."""
         off = self.values - self.base
         odds = size * (off - size / 2) / self.noise**2
         second, changes, growth = likely_states(odds, _change(rate, self.time_s))
@@ -58,7 +58,7 @@ class _Series:
         return replace(self, second=second, changes=changes, likelihood=first + growth)
 
     def ramp(self, size: float) -> tuple[float, float]:
-        """Slope of the base and its error, in which hops that may or may not be there count."""
+        """Slope of the base and its error, which includes uncertain hops."""
         time = self.time_s - self.time_s.mean()
         unsure = size**2 * float(np.sum(time**2 * self.second * (1 - self.second)))
         square = float(time @ time)
@@ -71,7 +71,7 @@ def find_hopping(
 ) -> Hopping:
     """Hops of a common ``size`` and ``rate`` (1/s) in several series ``values`` (t,).
 
-    ``slopes``: of the bases, 1/s; to begin with, like size and rate.
+    ``slopes``: of the bases, 1/s. All three are start values.
     """
     series = zip(values, times_s, slopes, strict=True)
     every = [_begun(*one, size, rate) for one in series]
@@ -89,7 +89,7 @@ def find_hopping(
         rate = max(rate * sum(s.changes for s in every) / expected, FEWEST_HOPS / seconds)
 
     def of_size(step: float) -> float:
-        # The bases go along.
+        # The bases are refitted.
         moved = [
             replace(s, base=s.base - step * size * _ramp_of(s.second, s.time_s)) for s in every
         ]
@@ -108,18 +108,18 @@ def find_hopping(
 
 
 def _error(likelihood: Callable[[float], float], step: float) -> float:
-    """One sigma, from the bend of a logarithm of the likelihood at its top."""
+    """One sigma, from the curvature of the log-likelihood at its maximum."""
     bend = 2 * likelihood(0.0) - likelihood(-step) - likelihood(step)
     return abs(step) / float(np.sqrt(max(bend, 1e-9)))
 
 
 def scatter_of(values: F64) -> float:
-    """Standard deviation of a series from frame to frame, as if nothing but noise were in it."""
+    """Standard deviation of a series from differences of frames, as if it were only noise."""
     return robust_sigma(np.diff(values)) / float(np.sqrt(2)) or 1e-300
 
 
 def _change(rate: float, time_s: F64) -> F64:
-    """Chance (t - 1,) that the number of hops from a frame to the next is odd."""
+    """Probability (t - 1,) that the number of hops from a frame to the next is odd."""
     return np.asarray(-np.expm1(-2 * rate * np.diff(time_s)) / 2)
 
 
@@ -143,7 +143,7 @@ def _ramp_of(values: F64, time_s: F64) -> F64:
 
 
 def _size(every: Sequence[_Series]) -> float:
-    """Size of the hops, beside a ramp of each series; zero where all stay on one level."""
+    """Size of the hops, with a ramp of each series free; zero where all stay on one level."""
     seen = total = 0.0
     for s in every:
         ramp = _ramp_of(s.second, s.time_s)
@@ -153,7 +153,7 @@ def _size(every: Sequence[_Series]) -> float:
 
 
 def _settled(s: _Series, size: float) -> _Series:
-    """With the base and the noise that go with its states."""
+    """With base and noise refitted for its states."""
     base = _ramp_of(s.values - size * s.second, s.time_s)
     off = s.values - base
     square = off**2 - 2 * size * s.second * off + size**2 * s.second
@@ -163,16 +163,16 @@ def _settled(s: _Series, size: float) -> _Series:
 
 @kernel()
 def likely_states(odds: F64, change: F64) -> tuple[F64, float, float]:
-    """Chance of the second state, expected changes, and gain in log-likelihood.
+    """Probability of the second state, expected changes, and gain in log-likelihood.
 
     Forward and backward through a series (Rabiner 1989, Proc. IEEE 77, 257). ``odds``: (t,)
-    log-likelihood of the second state less the first. ``change``: (t - 1,) chance of a change to
-    the next frame.
+    log-likelihood of the second state less the first. ``change``: (t - 1,) probability of a change
+    to the next frame.
     """
     n = len(odds)
     ahead, second = np.empty(n), np.empty(n)
-    # Of the frames so far, the chance of the second state; of those to come, of the first state
-    # (one, other) their likelihood.
+    # Forward: probability of the second state, given the frames so far. Backward: likelihood of
+    # later frames for the first and the second state (one, other).
     before, likelihood = 0.5, 0.0
     for t in range(n):
         if t:

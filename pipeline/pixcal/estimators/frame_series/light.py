@@ -1,9 +1,9 @@
-"""How the light of the frames of an acquisition changes: its level, its contrast, its offset.
+"""Changes of the light in the frames of an acquisition: level, contrast and offset.
 
-Three things move a frame's mean intensity B and fringe amplitude A. The power of the light moves
-both alike; the contrast moves A alone; an offset of the electronics, or light without fringes,
-moves B alone. So the covariance of (B, log A/B) tells them apart, whatever the size of each, and
-frames without light say how large the offset is by itself.
+Three causes change a frame's mean intensity B and fringe amplitude A. The power of the light
+changes both equally; the contrast changes A alone; an electronic offset, or light without fringes,
+changes B alone. The covariance of (B, log A/B) separates them, whatever their sizes, and frames
+without light measure the offset alone.
 """
 
 from collections.abc import Sequence
@@ -18,11 +18,11 @@ from pixcal.estimators.frame_series.variance_components import Modes
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 
-FEWEST_DARK = 12  # frames without light from which their offset is learnt
+FEWEST_DARK = 12  # fewest frames without light to measure their offset
 IMBALANCE = 0.02, 0.15  # least and most difference of the fibres' powers over their sum
 LIGHT_PARTS = ("power", "power_walk", "contrast", "contrast_walk", "offset", "offset_walk")
 PATTERNS = {
-    # What moves (B, log A/B), as the covariance of the two.
+    # Covariance of (B, log A/B) for each kind of change.
     "power": np.array([[1.0, 0.0], [0.0, 0.0]]),
     "contrast": np.array([[0.0, 0.0], [0.0, 1.0]]),
     "offset": np.array([[1.0, -1.0], [-1.0, 1.0]]),
@@ -33,18 +33,18 @@ PATTERNS = {
 class FrameLight:
     """Light of the frames of all sets."""
 
-    sets: tuple[FrameSeries, ...]  # (B over its mean less one, log A/B), without a sure line
-    dark: tuple[FrameSeries, ...]  # mean level of frames without light (e-), and nothing
+    sets: tuple[FrameSeries, ...]  # (B over its mean less one, log A/B), without significant line
+    dark: tuple[FrameSeries, ...]  # mean level of frames without light (e-), and zero
     level: dict[str, float]  # mean signal of each set, e-
-    line: Line | None = None  # the strongest in B, sure or not
+    line: Line | None = None  # the strongest in B, significant or not
 
     def modes(self, parts: Sequence[str], ramp: bool = False) -> Modes:
-        """Walk modes of all series, with the parts that kinds of change have in them.
+        """Walk modes of all series, with the covariance of kinds of change.
 
         ``power``, ``contrast`` or ``offset`` (white), with ``_walk`` (a random walk; 1/s) or
         ``_smooth`` (ramps and settlings: the square of a walk's spectrum); offsets in e-², the
-        others relative. With ``ramp``, an offset that rises with the time of each series (e-/s) is
-        their known shape.
+        others relative. ``ramp`` adds an offset that rises with time in each series (e-/s) as the
+        known shape.
         """
         return assemble(
             [*self.sets, *self.dark],
@@ -71,7 +71,7 @@ class FrameLight:
 
 
 def light_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
-    """Of every set: name, times (t,), relative intensity and contrast (t,), lessened by noise."""
+    """Of every set: name, times (t,), relative intensity and contrast (t,), Wiener-filtered."""
     found = []
     for f in evidence.fringes.values():
         series = light_series(f)
@@ -86,7 +86,7 @@ def light_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
 
 
 def _levels(found: FringeEvidence) -> tuple[F64, F64]:
-    """Intensity over its mean and contrast over its median (t,), of every frame by itself."""
+    """Intensity over its mean and contrast over its median (t,), of independent frames."""
     b, a = found.free[:, 0], np.hypot(found.free[:, 1], found.free[:, 2])
     return b / b.mean(), a / b / np.median(a / b)
 
@@ -107,8 +107,8 @@ def ambient_shares(evidence: Evidence) -> list[tuple[float, float]]:
 def separate_powers(evidence: Evidence) -> float:
     """Relative rms change of the contrast where the powers of two fibres change separately.
 
-    With power shares ``(1 ± d) / 2`` the contrast goes with ``sqrt(1 - d²)``; a change x of d moves
-    it by ``-d x``. Up to `IMBALANCE` of the intensity it is no effect of its own; zero otherwise.
+    With power shares ``(1 ± d) / 2`` the contrast goes with ``sqrt(1 - d²)``; a change x of d
+    changes it by ``-d x``. Up to `IMBALANCE` of the intensity it is no separate effect; else zero.
     """
     of_level = of_contrast = chance = 0.0
     for f in evidence.fringes.values():
@@ -126,7 +126,7 @@ def separate_powers(evidence: Evidence) -> float:
 
 
 def light_of(evidence: Evidence) -> FrameLight | None:
-    """Light of all sets with frames enough; None without any."""
+    """Light of all sets with enough frames; None without any."""
     return evidence.once("light of the frames", make=lambda: _light_of(evidence))
 
 
