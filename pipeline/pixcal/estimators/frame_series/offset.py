@@ -1,10 +1,10 @@
-"""A constant added to a whole frame, told apart from noise of rows, columns and pixels.
+"""A constant added to a whole frame, separated from noise of rows, columns and pixels.
 
 Stripes of rows and stripes of columns halve the pixels. The mean of a frame (W) holds its offset
-and all noise; the difference of the halves by rows (R) the noise of rows and pixels, by columns (C)
-of columns and pixels, the one across (K) of pixels alone, each as much as the mean does. So the
-four variances give that of the offset, without a model of the noise, and its noise is taken out
-(Wiener).
+and all noise; the difference of halves by rows (R) the noise of rows and pixels, by columns (C) of
+columns and pixels, by both (K) of pixels alone, each with the same variance as in the mean. The
+four variances therefore give that of the offset, without a noise model; offsets are Wiener-filtered
+accordingly.
 """
 
 from collections.abc import Sequence
@@ -22,13 +22,13 @@ from pixcal.estimators.frame_series.variance_components import (
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.model.arrays import F32, F64, Mask
 
-FEWEST = 8  # frames from which something is learnt; of fewer, chance is not what it is taken for
+FEWEST = 8  # fewest frames: with fewer, chance does not follow the assumed distribution
 FEWEST_PIXELS = 16  # in each quarter
 # R, C, K of the quarters
 CONTRASTS = np.array([[1, 1, -1, -1], [1, -1, 1, -1], [1, -1, -1, 1]]) / 4
-# where noise of pixels, rows and columns shows among W, R, C, K
+# whether noise of pixels, rows and columns is present in W, R, C, K
 NOISES = np.array([[1, 1, 1, 1], [1, 1, 0, 0], [1, 0, 1, 0]])
-# lowest size of the noise of pixels, of what is predicted; other parts may go as far below zero as
+# lowest size of the pixels' noise over the prediction; other parts may be negative down to
 # `BELOW` of it
 MIN_NOISE = 0.05
 BELOW = 0.3
@@ -41,13 +41,13 @@ Course = tuple[str, F64, F64]
 
 @dataclass(frozen=True)
 class OffsetSeries:
-    """Offsets of frames that were taken one after the other."""
+    """Offsets of consecutive frames."""
 
     name: str
     time_s: F64  # (t,) after the first frame of the acquisition where that is known
     step_s: float  # median time from frame to frame
     values: F64  # (t, 4) W, R, C, K, e-
-    noise: F64  # (4,) variance that the noise of the pixels gives them, e-²
+    noise: F64  # (4,) their variance from the noise of the pixels, e-²
     nuisance: F64  # (t, p) shapes that are no offsets
 
     def __len__(self) -> int:
@@ -55,7 +55,7 @@ class OffsetSeries:
 
 
 def dark_offsets(stack: Stack, good: Mask, gain: float, read_noise: float) -> OffsetSeries | None:
-    """Of frames without light, in e-; None where they are too few."""
+    """Offsets of frames without light, e-; None where they are too few."""
     masks = _quarters(good)
     if len(stack.adu) < FEWEST or masks is None:
         return None
@@ -67,7 +67,7 @@ def dark_offsets(stack: Stack, good: Mask, gain: float, read_noise: float) -> Of
 
 
 def fringe_offsets(found: FringeEvidence, flat: F64) -> OffsetSeries | None:
-    """Of fringes, divided by the flat: offsets ``1 / flat``, as far as B, A and phi leave them."""
+    """Offsets of fringe frames: ``1 / flat`` after division by the flat, with B, A, phi free."""
     masks = _quarters(found.good)
     if len(found.g) < FEWEST or masks is None:
         return None
@@ -79,7 +79,7 @@ def fringe_offsets(found: FringeEvidence, flat: F64) -> OffsetSeries | None:
     means = np.stack([value for value, _ in fits])
     noise = np.array([variance.mean() for _, variance in fits])
     phi = found.phi
-    # A bent response: harmonics of the phase, and the level of the light.
+    # A nonlinear response: harmonics of the phase, and the level of the light.
     shapes = [np.cos(phi), np.sin(phi), np.cos(2 * phi), np.sin(2 * phi), found.g[:, 0]]
     return _series(found.name, found.time_s, found.start_s, means, noise, np.stack(shapes, axis=1))
 
@@ -115,7 +115,7 @@ def offset_modes(every: Sequence[OffsetSeries], shapes: Sequence[F64]) -> Modes:
 
 
 def _quarters(good: Mask) -> list[Mask] | None:
-    """Good pixels of the four quarters, as `CONTRASTS` takes them."""
+    """Good pixels of the four quarters, in the order of `CONTRASTS`."""
     ny, nx = good.shape
     rows, columns = _half(ny)[:, None], _half(nx)
     masks = [good & (rows == a) & (columns == b) for a in (True, False) for b in (True, False)]
@@ -139,7 +139,7 @@ def _sums(found: FringeEvidence, flat: F64, masks: Sequence[Mask]) -> list[tuple
     pull = pull * weight
 
     def summed(weights: F32 | F64, patterns: F64) -> F64:
-        # All masks at once: the weights are read once.
+        # All masks together, so that the weights are read once.
         every = np.stack([np.where(mask.ravel(), patterns, 0) for mask in masks])
         sums = weights @ every.astype(np.float32).reshape(-1, patterns.shape[1]).T
         return np.asarray(sums.astype(float).reshape(len(weights), len(masks), -1).swapaxes(0, 1))
@@ -174,7 +174,7 @@ def _diagonals(values: F64) -> F64:
 
 
 def fringe_courses(light: FrameLight) -> tuple[list[Course], float]:
-    """Slow offsets of every set, of what moves B and not A; then what is left, e- rms."""
+    """Slow offsets of every set, from changes of B but not A; then the remainder, e- rms."""
     light = replace(light, dark=())
     drifts, every = ("offset_walk", "offset_smooth"), (*LIGHT_PARTS, "offset_smooth")
     found, jitter = [], []
@@ -183,7 +183,7 @@ def fringe_courses(light: FrameLight) -> tuple[list[Course], float]:
         size = np.maximum(estimate_components(modes).size, 0.0)
         n = len(series) - 1
         parts = size[:, None, None, None] * modes.parts[:, :n]
-        # In e-, what (B, log A/B) share with the drift.
+        # In e-, the covariance of (B, log A/B) with the drift.
         drift = light.level[series.name] * sum(parts[every.index(name)] for name in drifts)
         offset = series.walk_modes.series(_wiener(parts, drift[:, :, 0], modes.values[:n]))
         some = np.unique(np.linspace(0, n, min(KNOTS, n + 1)).astype(int))
@@ -193,7 +193,7 @@ def fringe_courses(light: FrameLight) -> tuple[list[Course], float]:
 
 
 def dark_courses(evidence: Evidence) -> list[Course]:
-    """All that moves the level of bias and of dark frames, where these are of one exposure time."""
+    """Changes of the level of bias and dark frames, where these have one exposure time."""
     found = []
     for kind in ("bias", "dark"):
         stacks = evidence.of_kind(kind)

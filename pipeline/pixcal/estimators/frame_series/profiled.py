@@ -1,4 +1,4 @@
-"""The best value of a parameter that series do not depend on linearly, by its likelihood."""
+"""Maximum-likelihood value of a nonlinear parameter of series."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,12 +9,12 @@ import numpy as np
 from pixcal.estimators.frame_series.variance_components import Components
 from pixcal.model.arrays import F64
 
-FARTHEST = 3.0  # largest error of the logarithm of a parameter: beyond, it is not known
+FARTHEST = 3.0  # largest error of the logarithm of a measured parameter
 HALVINGS = 4  # of the distance to the values on either side
 
 
 class ProfiledFit(Protocol):
-    """Components for a value of the parameter, and where to begin."""
+    """Components for a value of the parameter, from a start."""
 
     def __call__(self, value: float, start: Components | None, steps: int = ...) -> Components:
         """Sizes after some steps of the fit."""
@@ -32,7 +32,7 @@ class Profiled:
     log_width: float = 0.0  # from the value to either side, of the logarithm
 
     def slope(self, sizes: Sequence[float]) -> float:
-        """What a size changes by with the parameter's error, from its values at the sides."""
+        """Change of a size for one error of the parameter, from its values at the sides."""
         if not self.sides:
             return 0.0
         log_error = self.error / self.value

@@ -1,8 +1,8 @@
-"""Light that rows of a frame have beside the frame's own, from sums over each row.
+"""Light of other frames in the rows of a frame, from sums over each row.
 
-In any row such light is a sum of the pixels' maps, so that the products of the residuals with the
-maps, and of the maps with each other, hold all that the samples tell of it. Light of the next or
-the last frame grows with the row.
+In any row such light is a sum of the pixels' maps, so the products of the residuals with the maps,
+and of the maps with each other, are sufficient statistics. Light of the next or the last frame
+grows with the row.
 """
 
 from collections.abc import Sequence
@@ -20,25 +20,25 @@ from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import F64, Indices
 
 _MIN_FRAMES, _MIN_PIXELS = 12, 80
-_KNEES = 24  # places of the row from which the next step is seen that are tried
+_KNEES = 24  # places tried for the first row that contains the next step
 _TURNS = 3
 _SMALL = 1e-3
 _BENT = 16.0  # chi-square that a knee inside the window must gain
 KNOTS = 13  # rows at equal distances at which the profile is given
 ORIGINS = 8  # phases tried as the one where the modulator's range begins
-# standard deviations from which that phase is sought more finely, and how finely, rad
+# significance from which that phase is refined, and its final precision, rad
 CLEAR, FINEST = 4.0, 0.01
-OWN_ORDERS = 4  # harmonics of a frame's own phase that a step must not be taken for
+OWN_ORDERS = 4  # harmonics of a frame's own phase that are removed from steps
 
 
 def enough_frames(found: FringeEvidence) -> bool:
-    """Whether a set has the frames and pixels to tell of rows."""
+    """Whether a set has enough frames and pixels for rows."""
     return bool(np.count_nonzero(found.good) > _MIN_PIXELS and len(found.g) >= _MIN_FRAMES)
 
 
 @dataclass(frozen=True)
 class RowSums:
-    """Of the frames of a set that have one before and one after."""
+    """Sums for the frames of a set that have both neighbours."""
 
     found: FringeEvidence
     inside: Indices  # (t,) places of these frames in it
@@ -67,7 +67,7 @@ class RowSums:
 
     @cached_property
     def _modes(self) -> F64:
-        """Light (t, y, m, 3) that each frame is free to have: the maps, and turns along y."""
+        """Modes (t, y, m, 3) that are free in each frame: the maps, and phase slopes along y."""
         t, y = self.right.shape[:2]
         modes = np.broadcast_to(np.eye(3), (t, y, 3, 3))
         if not np.any(self.found.dk):
@@ -86,12 +86,12 @@ class RowSums:
     def share(self, other: F64, factors: F64 | None = None) -> tuple[F64, F64]:
         """Normal matrix (y, y) and right-hand side (y,) of the share of a light in each row.
 
-        Less what pixels and frames take up of it. ``other``: (t, 3) the light's parameters in the
-        frames inside. ``factors``: (y, 3) factors of these parameters in each row.
+        Without the part that pixels and frames absorb. ``other``: (t, 3) the light's parameters in
+        the frames inside. ``factors``: (y, 3) factors of these parameters in each row.
         """
         g = self.found.g[self.inside]
         own = (other - g @ (np.linalg.pinv(g) @ other))[:, None]
-        # Pixels take up what is best for their own weights: more of chance, by their freedom.
+        # Pixels absorb more noise than light, by their degrees of freedom.
         left = 1 - g.shape[1] / len(g)
         if factors is not None:
             own = own * factors
@@ -131,7 +131,7 @@ class RowRamp:
 
     @classmethod
     def _best(cls, sets: Sequence[tuple[F64, F64, F64]], way: int) -> "RowRamp":
-        """Of the normal sums by row; a knee inside the window only where it is really better."""
+        """From normal sums by row; a knee inside the window only if significantly better."""
         rows = np.unique(np.concatenate([s[0] for s in sets]))
         first, last = rows[0], rows[-1]
         edge = 0.0 if way > 0 else last
@@ -152,7 +152,7 @@ class RowRamp:
                 ramp = np.maximum(way * (rows_of - knee), 0.0)
                 terms.append(np.stack([ramp, -way * slope * (ramp > 0)], axis=1))
             values, covariance = _slope(sets, terms)
-            # The ramp itself is refitted; the second term moves its foot.
+            # The ramp is refitted; the second term moves its knee.
             knee = float(np.clip(knee + np.clip(values[1], -step, step), first, last))
             slope = float(values[0])
         errors = np.sqrt(np.diag(covariance))
@@ -160,7 +160,7 @@ class RowRamp:
 
 
 def _slope(sets: Sequence[tuple[F64, F64, F64]], terms: Sequence[F64]) -> tuple[F64, F64]:
-    """Sizes of terms (row, n) of the share and their covariance; its mean goes into the frames."""
+    """Sizes of terms (row, n) of the share, covariance; the frames absorb the mean share."""
     n = terms[0].shape[1]
     normal, right = np.zeros((n, n)), np.zeros(n)
     for (_, own, vector), term in zip(sets, terms, strict=True):
@@ -172,7 +172,7 @@ def _slope(sets: Sequence[tuple[F64, F64, F64]], terms: Sequence[F64]) -> tuple[
 
 
 def _apart_in_time(g: F64, share: float, way: int) -> F64:
-    """Parameters (t, 3) of the frames, of which a share is that of the frame a way further on."""
+    """Parameters (t, 3) of frames, less a share of those of the frame before or after (``way``)."""
     found = g.copy()
     order = range(len(g) - 2, -1, -1) if way > 0 else range(1, len(g))
     for t in order:
@@ -188,12 +188,12 @@ def _rows(sums: RowSums, way: int, share: F64) -> tuple[F64, F64, F64]:
     return sums.rows, *sums.share(g[sums.inside + way] - g[sums.inside], factors)
 
 
-# Phases of rows that go with the step of the phase: a modulator that settles
+# Phase errors of rows proportional to the phase step: a modulator that settles
 
 
 @dataclass(frozen=True)
 class Settling:
-    """Share of a step by which the phase of a row is off."""
+    """Phase error of each row as a share of the phase step."""
 
     way: int  # -1: of the step from the last frame; 1: of the step to the next one
     # where the modulator's range of one turn begins; None: it goes the shorter way
@@ -223,13 +223,13 @@ def profile(share: Sequence[float] | F64, rows: F64) -> F64:
 
 @cache
 def _terms(rows: int) -> F64:
-    """What a profile is at so many rows (y, KNOTS) for a unit at each of its knots; mean zero."""
+    """Profiles (y, KNOTS) of zero mean at ``rows`` rows, for a unit value at each knot."""
     terms = profile(np.eye(KNOTS), np.linspace(0, 1, rows))
     return np.asarray(terms - terms.mean(axis=0))
 
 
 def find_settling(sets: Sequence[RowSums]) -> Settling:
-    """The likeliest profile, of the last step or the next, along either way around the turn."""
+    """The likeliest profile, of the last step or the next, in either direction of rotation."""
     origins = [None, *(2 * np.pi * n / ORIGINS for n in range(ORIGINS))]
     ways = [(way, origin) for way in (-1, 1) for origin in origins]
     found = {one: _fit(sets, *one) for one in ways}
@@ -240,19 +240,19 @@ def find_settling(sets: Sequence[RowSums]) -> Settling:
         chance = _significance(gain, len(ways))
         if origin is None or chance < CLEAR or width < FINEST:
             return Settling(way, origin, share, error, chance)
-        # A frame whose step is taken around the wrong way is off by the share of a turn.
+        # A step taken in the wrong direction is off by the share of one turn.
         for near in (origin - width / 2, origin + width / 2):
             found[way, near] = _fit(sets, way, near)
         width /= 2
 
 
 def settling_sigmas(sets: Sequence[RowSums], way: int, origin: float | None) -> float:
-    """Significance of a profile of steps that way, whatever the others."""
+    """Significance of a profile for given steps alone."""
     return _significance(_fit(sets, way, origin)[0], 1)
 
 
 def _significance(gain: float, tried: int) -> float:
-    """Of the best gain in chi-square of so many."""
+    """Of the best gain in chi-square of ``tried``."""
     return sigmas_of_chi2(max(gain - 2 * np.log(tried), 1e-9), KNOTS - 1)
 
 
@@ -264,7 +264,7 @@ def _fit(sets: Sequence[RowSums], way: int, origin: float | None) -> tuple[float
         f = sums.found
         _, cosine, sine = f.g.T
         step = beside_own_phase(steps_of(f.phi, way, origin), f.phi)
-        # Of B, A cos phi and A sin phi, what a turn of the phase does, times the step.
+        # Derivative of B, A cos phi and A sin phi by the phase, times the step.
         other = step[:, None] * np.stack([np.zeros(len(step)), -sine, cosine], axis=1)
         own, vector = sums.share(other[sums.inside])
         terms = _terms(len(vector))
@@ -279,7 +279,7 @@ def _fit(sets: Sequence[RowSums], way: int, origin: float | None) -> tuple[float
         value, weight = np.array(slopes).T
         mean = float(np.average(value, weights=weight))
         line = np.linspace(-0.5, 0.5, KNOTS)
-        # Of a profile's slope over the rows the fit's free fringe vectors have left nothing.
+        # The fit's free fringe vectors absorbed the slope of the profile over the rows.
         rows = terms @ line
         share = share + line * (mean - rows @ terms @ share / (rows @ rows))
         variance = variance + line**2 / weight.sum()
@@ -288,14 +288,14 @@ def _fit(sets: Sequence[RowSums], way: int, origin: float | None) -> tuple[float
 
 
 def beside_own_phase(step: F64, phi: F64) -> F64:
-    """Steps (t,) without what goes with harmonics of the frames' own phases."""
+    """Steps (t,) without harmonics of the frames' own phases."""
     turns = np.outer(phi, np.arange(OWN_ORDERS + 1))
     own = np.hstack([np.cos(turns), np.sin(turns[:, 1:])])
     return np.asarray(step - own @ np.linalg.lstsq(own, step, rcond=1e-9)[0])
 
 
 def _weighted_slope(found: FringeEvidence, step: F64, turn: F64) -> tuple[float, float]:
-    """Change of the share from first to last row, by the fringe vectors, and its weight."""
+    """Change of the share from first to last row, from fringe vectors, and its weight."""
     size, moved = step - step.mean(), turn - turn.mean()
     value = float(size @ moved / (size @ size))
     left = moved - value * size

@@ -1,8 +1,8 @@
-"""What a fringe set's frames do by themselves, as series: their light, their fringe vector.
+"""Series of a fringe set's frames: their light, their fringe vector.
 
-The bench is the same for all pixels of a frame, the noise of the samples is not. The half
-difference of two halves of the pixels therefore holds the noise alone, whatever it is made of, and
-is fitted beside the series: no model of the noise stands between them.
+The bench is the same for all pixels of a frame, the noise of the samples is not. Half the
+difference of two halves of the pixels therefore holds the noise alone, whatever its origin. It is
+fitted together with the series, so no noise model is needed.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,16 +21,16 @@ from pixcal.estimators.frame_series.variance_components import (
 from pixcal.kernels.frame_order import with_neighbours
 from pixcal.model.arrays import F64, Indices, Mask
 
-FEWEST = 32  # frames of a set from which something is learnt
+FEWEST = 32  # fewest frames of a set
 HARMONICS = 10  # of the phase, that are no noise
-SPENT = 0.25  # share of the frames' freedom that shapes which follow the phase may take
+SPENT = 0.25  # share of the degrees of freedom that shapes which follow the phase may use
 SLOW = 12  # walk modes that are drift
-# modes whose power is the level of the one in their middle; median of chi-square
+# modes whose median power is the level of the central one; median of chi-square
 AROUND, MEDIAN = 15, 0.455
 OUTLIER = 9.0  # power over the level from which a mode counts less
-DARK = 0.05  # share of the mean light below which a frame tells nothing
-MIN_NOISE = 0.05  # lowest size of the noise, of what is predicted
-BELOW = 0.15  # how far below zero a size may come out, of the noise
+DARK = 0.05  # share of the mean light below which a frame is not used
+MIN_NOISE = 0.05  # lowest size of the noise, over the prediction
+BELOW = 0.15  # how negative a size may be, over the noise
 
 
 @dataclass(frozen=True)
@@ -42,15 +42,15 @@ class FrameSeries:
     frame: Indices  # (t,) numbers of the frames in their set
     time_s: F64  # (t,)
     exptime_s: float  # nan when unknown
-    # values, apart: (t, 2) the quantities, and the half difference of theirs from two halves of
-    # the pixels
+    # values, apart: (t, 2) the quantities, and half their difference between two halves of the
+    # pixels
     values: F64
     apart: F64
-    shapes: F64  # (t, p) what follows the phase of the fringes, which is no noise
-    # noise, apart_noise: (2, 2) covariance that the noise model predicts of them, mean over frames
+    shapes: F64  # (t, p) functions of the fringe phase, which are no noise
+    # noise, apart_noise: (2, 2) their covariance from the noise model, mean over frames
     noise: F64
     apart_noise: F64
-    share: float = 1.0  # of the frames' freedom that is left
+    share: float = 1.0  # of the frames' degrees of freedom that remain
 
     def __len__(self) -> int:
         return len(self.values)
@@ -62,7 +62,7 @@ class FrameSeries:
 
     @property
     def walk_modes(self) -> WalkModes:
-        """In which noise and walks are independent."""
+        """Modes in which noise and walks are independent."""
         return walk_modes(self.time_s)
 
     def cleaned(self) -> "FrameSeries":
@@ -91,7 +91,7 @@ def motion_series(found: FringeEvidence, *, every: bool = False) -> FrameSeries 
 
 
 def light_series(found: FringeEvidence) -> FrameSeries | None:
-    """B over its mean less one, and the logarithm of A/B; None where too few frames tell."""
+    """B over its mean less one, and the logarithm of A/B; None with too few usable frames."""
 
     def values(free: F64) -> F64:
         b, a = free[:, 0], np.hypot(free[:, 1], free[:, 2])
@@ -135,12 +135,12 @@ def _series(
         jacobian = slopes(free[use])
         taken.append(values(free[use]))
         noises.append(np.einsum("tai,tij,tbj->ab", jacobian, covariance[use], jacobian) / use.sum())
-    # A window of one row tells nothing of ky.
+    # A window of one row does not constrain ky.
     if min(np.diag(noise).min() for noise in noises) <= 0:
         return None
     frame, time = found.frame[use], found.time_s[use]
     phase = np.arctan2(found.free[use, 2], found.free[use, 1])
-    # What neighbours leave in a frame is told from those that have both.
+    # Effects of neighbouring frames are measured in frames that have both.
     inside = np.arange(len(frame)) if every else with_neighbours(frame)
     if len(inside) < FEWEST // 2:
         return None
@@ -164,8 +164,8 @@ def _series(
 def without(values: F64, shapes: F64, basis: WalkModes) -> F64:
     """Series (t, c) without shapes (t, p) and mean, by weighted least squares of their modes.
 
-    A mode's weight is the inverse of the power around it: drifts and lines are no shapes. What
-    noise loses to the shapes is given back to each mode.
+    A mode's weight is the inverse of the power around it: drifts and lines are no shapes. The noise
+    that the shapes absorb is restored in each mode.
     """
     modes, design = basis.of(values), basis.of(shapes)
     rest = np.empty_like(modes)
@@ -184,7 +184,7 @@ def without(values: F64, shapes: F64, basis: WalkModes) -> F64:
 
 
 def _follows_phase(phase: F64, inside: Indices, basis: WalkModes) -> F64:
-    """Shapes (n, p) of n frames inside that go with the phases (t,) and steps; likeliest first."""
+    """Shapes (n, p) of n frames inside, functions of phases (t,) and steps; likeliest first."""
     own = phase[inside]
     steps = phase[inside - 1] - own, phase[inside + 1] - own
     angles = [own, 2 * own, *steps, 3 * own, 4 * own]
@@ -241,7 +241,7 @@ def assemble(
 
 
 def mode_variance(series: FrameSeries, parts: F64) -> F64:
-    """Variance (t - 1, 2) of a series' modes, of noise and parts (m, t - 1, 2, 2) of any size."""
+    """Variance (t - 1, 2) of a series' modes, for fitted noise and parts (m, t - 1, 2, 2)."""
     modes = assemble([series], lambda _: parts)
     size = np.maximum(estimate_components(modes).size, 0.0)
     # The first half of the modes are those of the series, the others of its two halves.

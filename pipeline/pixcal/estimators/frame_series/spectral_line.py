@@ -1,4 +1,4 @@
-"""A vibration among series of frames: the line that stands out of their spectrum."""
+"""A vibration in series of frames: the strongest line of their spectrum."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -10,9 +10,9 @@ from pixcal.estimators.frame_series.variance_components import log_chance, sigma
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 
-FINER = 8  # frequencies looked at for each that a series tells apart
-SLOWEST = 4.0  # fewest swings of a line within a run; what is slower is drift
-# looks for each frequency that a series tells apart: the highest place lies between any two
+FINER = 8  # frequencies examined per independent frequency of a series
+SLOWEST = 4.0  # fewest periods of a line within a run; slower changes are drift
+# effective trials per independent frequency, as the maximum may lie between two
 TRIALS = 4.0
 
 
@@ -26,12 +26,12 @@ class Line:
     # the noise
     amplitude: F64
     amplitude_error: F64
-    # logarithm of the chance that noise makes such a line anywhere in the spectrum
+    # logarithm of the probability of such a line by noise anywhere in the spectrum
     log_chance: float
 
     @property
     def sure(self) -> bool:
-        """Whether it is taken for one."""
+        """Whether it is significant."""
         return sigmas(self.log_chance) > SIGNIFICANT
 
 
@@ -71,11 +71,11 @@ def cleared_of_line(
     level: Callable[[FrameSeries], F64],
     channels: Sequence[int] = (0, 1),
 ) -> tuple[Line | None, tuple[FrameSeries, ...]]:
-    """The strongest line, as `find_line`, and the series without it if it is sure."""
+    """The strongest line, as `find_line`, and the series without it if it is significant."""
     line = find_line(every, level, channels)
     if line is None or not line.sure:
         return line, tuple(every)
-    # Once more, over a level that the line itself does not raise.
+    # Repeated with a level that the line itself does not raise.
     levels = {s.name: level(s) for s in _without_line(every, line)}
     line = find_line(every, lambda s: levels[s.name], channels) or line
     return line, _without_line(every, line)
@@ -85,7 +85,7 @@ def _without_line(every: Sequence[FrameSeries], line: Line) -> tuple[FrameSeries
     found = []
     for s in every:
         turn = 2 * np.pi * line.hz * s.time_s
-        # Of one weight: the power around a line is its own.
+        # Equal weights: the power around a line is its own.
         swing = np.stack([np.ones_like(turn), np.cos(turn), np.sin(turn)], axis=1)
         sizes = np.linalg.lstsq(swing, s.values)[0]
         found.append(replace(s, values=s.values - swing @ sizes))
@@ -94,7 +94,7 @@ def _without_line(every: Sequence[FrameSeries], line: Line) -> tuple[FrameSeries
 
 def _spectrum(s: FrameSeries, level: F64, channels: Sequence[int], grid: F64) -> tuple[F64, F64]:
     """Power (f, channel) in units of the level, and the level, both at frequencies ``grid``."""
-    # Made white by its modes first: a walk or a ramp would leak all over the spectrum.
+    # Whitened by its modes first: a walk or a ramp would leak over the whole spectrum.
     n, basis = len(s), s.walk_modes
     level = level[:, list(channels)]
     place = s.frame - s.frame[0]
@@ -110,7 +110,7 @@ def _spectrum(s: FrameSeries, level: F64, channels: Sequence[int], grid: F64) ->
 
 
 def _peak(grid: F64, power: F64, at: int) -> tuple[float, float]:
-    """Frequency of a peak and its error, by the parabola through its three highest values."""
+    """Frequency of a peak and its error, from a parabola through its three highest values."""
     step = grid[1] - grid[0]
     inside = min(max(at, 1), len(grid) - 2)
     before, here, after = power[inside - 1 : inside + 2]
@@ -118,5 +118,5 @@ def _peak(grid: F64, power: F64, at: int) -> tuple[float, float]:
     if bend >= 0:
         return float(grid[at]), float(step)
     shift = float(np.clip((before - after) / (2 * bend), -1, 1))
-    # The power is the growth of the log-likelihood: its bend is the information.
+    # The power is the growth of the log-likelihood: its curvature is the information.
     return float(grid[inside] + shift * step), float(step / np.sqrt(-bend))

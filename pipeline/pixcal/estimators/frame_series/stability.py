@@ -1,8 +1,8 @@
-"""What a window's Allan deviations say: level, slope, knee, each with its error.
+"""Level, slope and knee of a window's Allan deviations, each with its error.
 
 A simulated population of pixels with white noise and the run's own gaps goes through the same
-estimator, from a fixed seed. It tells how far the median over pixels lies below the deviation, how
-it scatters, and how the lengths, which share batches, are correlated.
+estimator, from a fixed seed. It gives the bias of the median over pixels, its scatter, and the
+correlation of the lengths, which share batches.
 """
 
 from collections.abc import Sequence
@@ -20,8 +20,8 @@ SEED = 20250611
 MAX_DRAWS = 1 << 18
 MAX_SAMPLES = 1 << 26  # simulated batches: bounds the time where runs are long
 ONE_SIGMA = (0.15865525393145707, 0.8413447460685429)  # levels of the one-sigma limits
-# Fall of chi-square that a knee must bring. White noise brings as much in 0.1 % of runs where
-# pixels are independent (5100 simulated), in up to 2 % where they share most of their noise.
+# Fall of chi-square required of a knee. White noise exceeds it in 0.1 % of runs where pixels are
+# independent (5100 simulated), in up to 2 % where they share most of their noise.
 KNEE_CHI2 = 10.0
 WHITE_SHARE = 0.1  # the slope is fitted where the rest is below this share of the white variance
 
@@ -194,7 +194,7 @@ def _powers(m: F64) -> F64:
 
 
 def _find_rest(m: F64, logs: F64, covariance: F64) -> F64 | None:
-    """Coefficients (b, c, d)/a of sigma² = a/m + b + c m + d m², or None where a/m will do."""
+    """Coefficients (b, c, d)/a of sigma² = a/m + b + c m + d m², or None where a/m suffices."""
     if len(m) < 3:
         return None
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))

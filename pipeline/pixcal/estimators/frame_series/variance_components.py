@@ -1,4 +1,4 @@
-"""How much of a series is white and how much wanders: components of its variance.
+"""Components of a series' variance: white noise and random walks.
 
 In walk modes white noise and a walk are independent from mode to mode. Each mode is a normal vector
 of covariance ``sum_i size_i part_i`` about ``known @ beta``. The sizes are those of restricted
@@ -24,9 +24,9 @@ MAX_STEPS = 60
 CONVERGED = 1e-5  # growth of the log-likelihood at which scoring ends
 _DOUBLINGS = 60  # of an error in search of the upper limit of a size
 HALVINGS = 12  # of a step that does not make the data likelier
-FAR = 1e3  # growth by the first step of the signals from which they are found before the noise
-NEAR = 2.0  # growth from which the average information makes the steps
-SHORTEST = 0.1  # step in time, of the median one, that shorter ones count as
+FAR = 1e3  # growth by the signals' first step above which they are fitted before the noise
+NEAR = 2.0  # growth below which steps use the average information
+SHORTEST = 0.1  # least step in time, over the median one
 
 
 def trace_products(weight: F64, parts: F64) -> F64:
@@ -42,7 +42,7 @@ class Modes:
 
     values: F64  # (n, c)
     known: F64  # (n, c, p) shapes that are fitted, each by a coefficient
-    parts: F64  # (m, n, c, c) what unit sizes add to the covariance of each mode
+    parts: F64  # (m, n, c, c) covariance of each mode for unit sizes
     # start, least: (m,) sizes to begin with and lowest ones; below zero, so that what is not
     # there may come out either side of nothing
     start: F64

@@ -1,8 +1,8 @@
-"""What data and simulation are compared by: curves of statistics, by domain or by kind of frame.
+"""Test statistics that compare data and simulation, by domain or by kind of frame.
 
-A statistic is a function of an acquisition's evidence, marked by `statistic`; all that the files
-here hold are found by `test_statistics`. It gives a short curve: values that mean the same in every
-acquisition of the same size, whatever made it.
+A statistic is a function of an acquisition's evidence, marked by `statistic`; `known_statistics`
+collects all in these files. It gives a short curve: values with the same meaning in every
+acquisition of the same size, measured or simulated.
 """
 
 import importlib
@@ -19,7 +19,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics.look import Look
 from pixcal.model.arrays import F64
 
-# stands for the name of a set where a curve is of the detector or of several sets
+# replaces the name of a set where a curve is of the detector or of several sets
 DETECTOR = "detector"
 
 
@@ -32,7 +32,7 @@ class Curve:
 
     @classmethod
     def numbered(cls, values: ArrayLike) -> Self:
-        """Values whose places are 0, 1, ...; none where there is nothing to look at."""
+        """Values at x = 0, 1, ...; none for an empty sequence."""
         value = np.asarray(values, float)
         return cls(np.arange(len(value), dtype=float), value)
 
@@ -42,20 +42,19 @@ Key = tuple[str, str]  # name of a statistic and of the fringe set (or `DETECTOR
 
 @dataclass(frozen=True)
 class Statistic:
-    """A way of looking at data."""
+    """A test statistic."""
 
     name: str
     title: str
     domain: str  # `space`, `time`, `intensity` or `noise`
-    quantity: str  # what the values are: of a power, what their roots are
+    quantity: str  # of the values; for a power, of their roots
     unit: str  # of the quantity; empty where it is a ratio
     x_label: str
     kind: str  # `linear`, or `power`: mean squares, which are compared by their logarithms
-    of_set: bool  # looks at one fringe set; else at all of the evidence,
-    of_all: bool  # or at all fringe sets together
-    floor: float  # least standard deviation that chance has, where simulations may all be alike
-    # from a `Look` (of a set), those of all sets, or `Evidence`; None where there is nothing to
-    # look at
+    of_set: bool  # uses one fringe set; else all of the evidence,
+    of_all: bool  # or all fringe sets together
+    floor: float  # least standard deviation by chance, as simulations may all be equal
+    # from a `Look` (of a set), those of all sets, or `Evidence`; None where data are missing
     measure: Callable[[Any], Curve | None]
 
 
@@ -88,10 +87,10 @@ def statistic(
 def family(
     name: str, members: Sequence[tuple[str, ...]], *texts: str, **options: Any
 ) -> Callable[[Callable[[Any, Any], Curve | None]], tuple[Statistic, ...]]:
-    """Mark a function of a word and data as a statistic for each of some words.
+    """Mark a function of a word and data as a statistic for each of several words.
 
-    Texts and options are as of `statistic`; ``{0}`` in them is the word, ``{1}`` ... those beside
-    it in ``members``. An option may be a mapping by the word.
+    Texts and options are as in `statistic`; ``{0}`` in them is the word, ``{1}`` ... those that
+    follow it in ``members``. An option may be a mapping by the word.
     """
 
     def filled(text: Any, words: tuple[str, ...]) -> Any:
@@ -124,7 +123,7 @@ def known_statistics() -> Mapping[str, Statistic]:
 
 
 def measure(evidence: Evidence) -> dict[Key, Curve]:
-    """Every statistic of an acquisition that it has the frames for."""
+    """Every statistic for which an acquisition has the frames."""
     found: dict[Key, Curve] = {}
     looks = {name: Look(fringes, evidence) for name, fringes in evidence.fringes.items()}
     every: tuple[tuple[str, Any], ...] = ((DETECTOR, tuple(looks.values())),)

@@ -1,7 +1,7 @@
-"""Statistics of bias, dark and flat frames: what changes between two frames of one scene.
+"""Statistics of bias, dark and flat frames: differences of two frames of one scene.
 
-The difference of two frames holds no fixed pattern, only noise: what neighbours, rows and columns
-share of it, at several distances, and how that grows with the level.
+The difference of two frames holds no fixed pattern, only noise. The statistics are its covariance
+between neighbours, rows and columns at several distances, and how that grows with the level.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from pixcal.model.arrays import F32, F64, Mask
 
 of_noise = partial(statistic, "noise")
 
-REPEATS = (1, 2, 3, 4)  # rows or columns between two that may share noise
+REPEATS = (1, 2, 3, 4)  # distances (lines) of rows or columns that may share noise
 WILD = 8.0
 BANDS = 4  # of the spectrum, from the size of the window to two pixels
 
@@ -39,15 +39,15 @@ def _differences(evidence: Evidence, stack: Stack) -> F32:
     if stack.kind == "flat":
         steps = _without_gradient(steps, evidence)
     steps -= frame_means(steps, good)[:, None, None].astype(np.float32)
-    # Root mean squares: medians of whole numbers jump.
+    # Root mean squares, as medians of integers are quantised.
     rest = steps / np.sqrt((steps[:, good] ** 2).mean())
     rest[np.abs(rest) > WILD] = 0
     return np.asarray(rest * good, np.float32)
 
 
 def _without_gradient(steps: F32, evidence: Evidence) -> F32:
-    """Differences (t, y, x) of flats without what a change of the light's gradient does."""
-    # Of the sky it turns from frame to frame; the lamp is no part of the detector.
+    """Differences (t, y, x) of flats without changes of the light's gradient."""
+    # The gradient of the sky rotates from frame to frame; light is no part of the detector.
     basis = evidence.once("gradient of the light", make=lambda: _gradient(evidence))
     flat = steps.reshape(len(steps), -1)
     return np.asarray((flat - flat @ basis @ basis.T).reshape(steps.shape))
@@ -63,7 +63,7 @@ def _gradient(evidence: Evidence) -> F32:
 
 
 def repeated(evidence: Evidence, kind: str) -> tuple[Stack, ...]:
-    """Stacks of a kind whose frames can be subtracted, and whose noise codes do not hide."""
+    """Stacks of a kind with several frames, whose noise is not hidden by rounding."""
     if kind != "flat" and not evidence.dithered:
         return ()
     stacks = evidence.ladder if kind == "flat" else evidence.of_kind(kind)
@@ -71,7 +71,7 @@ def repeated(evidence: Evidence, kind: str) -> tuple[Stack, ...]:
 
 
 def _correlation(evidence: Evidence, stacks: Sequence[Stack]) -> F64:
-    """Correlation (step,) of pixels some rows and columns apart; lines have their own statistic."""
+    """Correlation (step,) of pixels by rows and columns; lines have their own statistic."""
 
     def sums(stack: Stack) -> F64:
         own = "neighbours", *stack.key
@@ -92,7 +92,7 @@ def _neighbour_sums(evidence: Evidence, stack: Stack) -> F64:
 
 
 def _repeats(rest: F32, good: Mask, axis: int) -> F64:
-    """Products of the means of lines some lines apart, over the variance of a mean."""
+    """Products of the means of lines at `REPEATS`, over the variance of a mean."""
     means = rest.sum(axis=axis) / np.sqrt(np.maximum(good.sum(axis=axis - 1), 1))
     means = means - means.mean(axis=1, keepdims=True)
     return np.array([float((means[:, n:] * means[:, :-n]).mean()) for n in REPEATS])

@@ -1,4 +1,4 @@
-"""What a bench lets expect of every curve, from simulations with different random numbers."""
+"""Expectation of every curve for a bench, from simulations with different random numbers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,8 +13,8 @@ STRAIGHT = 10.0  # standard deviations beyond which they count by their logarith
 _PREFIX, _INFIX = "estimate_of_", "_in_"
 Curves = Mapping[Key, Curve]
 
-TOLERANCE = 0.05  # share of what an effect does that its simulation may be wrong by
-# standard deviations from which one value of a curve is changed, whatever the others are
+TOLERANCE = 0.05  # relative error of a simulated effect
+# standard deviations from which a value of a curve has changed, independently of the others
 STANDS_OUT = 2.5
 
 
@@ -58,17 +58,17 @@ def scaled(values: F64, usual: F64) -> F64:
 
 @dataclass(frozen=True)
 class Reference:
-    """What the nominal bench lets expect: simulations with different seeds, on their scales."""
+    """Simulations of the nominal bench with different seeds, on their scales."""
 
     # median (n,) of each curve that is a power; None for the others
     usual: Mapping[Key, F64 | None]
     values: Mapping[Key, F64]  # (simulation, n) of each curve, in the order of the seeds
-    # as how many independent values each curve's are, `independent_values`
+    # effective number of independent values of each curve, `independent_values`
     independent: Mapping[Key, float]
 
     @classmethod
     def of(cls, simulated: Sequence[Curves]) -> "Reference":
-        """From simulations; curves that not all of them have are left out."""
+        """From simulations; only curves that all of them have."""
         keys = [k for k in simulated[0] if all(k in s for s in simulated)]
         keys = [k for k in keys if len({len(s[k].value) for s in simulated}) == 1]
         usual: dict[Key, F64 | None] = {}
@@ -95,19 +95,19 @@ class Reference:
 
 @dataclass(frozen=True)
 class Expectation:
-    """What a bench, nominal or with effects, lets expect of every curve."""
+    """Expectation of every curve for a bench, nominal or with effects."""
 
     # mean, variance: (n,) on the reference's scales; the variance of a value of the data about the
     # mean
     mean: Mapping[Key, F64]
     variance: Mapping[Key, F64]
     noise: Mapping[Key, F64]  # variance (n,) of the nominal bench alone
-    independent: Mapping[Key, float]  # as of the reference
+    independent: Mapping[Key, float]  # as in the reference
     dof: int
 
 
 def expect_nominal(reference: Reference) -> Expectation:
-    """What the nominal bench lets expect."""
+    """Expectation for the nominal bench."""
     mean, variance, noise, count = {}, {}, {}, 2
     for key, values in reference.values.items():
         count = len(values)
@@ -123,16 +123,16 @@ def expect_with(
     error: float = 0.0,
     beside: Expectation | None = None,
 ) -> Expectation:
-    """What a bench with effects lets expect, from simulations with the reference's first seeds.
+    """Expectation for a bench with effects, from simulations with the reference's first seeds.
 
-    ``error``: relative, of the strength of what is new on top of ``beside`` (default: the nominal
-    bench).
+    ``error``: relative error of the strength of what is new on top of ``beside`` (default: the
+    nominal bench).
     """
     nominal = expect_nominal(reference)
     scaled_ones = [reference.on_scale(s) for s in simulated]
     pairs: dict[Key, tuple[F64, F64]] = {}
     for key, values in reference.values.items():
-        # An estimate may fail in a few simulations: the others tell what it is.
+        # An estimate may fail in a few simulations: the others are used.
         having = [n for n, s in enumerate(scaled_ones) if key in s]
         if 2 * len(having) > len(simulated):
             pairs[key] = np.stack([scaled_ones[n][key] for n in having]), values[having]
@@ -141,7 +141,7 @@ def expect_with(
     for key, (own, same_seeds) in pairs.items():
         change, count, noise = own - same_seeds, len(own), nominal.noise[key]
         paired = change.var(axis=0, ddof=1) if count > 1 else usual * noise
-        # What the same seeds do not have in common, in units of the noise: 2 is all of it.
+        # Variance not shared between equal seeds, over the noise: 2 if none is shared.
         apart = min(float(np.mean(paired / noise)), 2.0)
         shift = change.mean(axis=0)
         certain = _certain(shift, apart * noise / count)
@@ -149,7 +149,7 @@ def expect_with(
         added = mean[key] - (beside or nominal).mean[key]
         more = (TOLERANCE * certain * shift) ** 2 + (error * added) ** 2 + certain * paired / count
         if count > 1:
-            # What the effects add to the scatter, beyond what few seeds have by chance.
+            # Scatter added by the effects, beyond the sampling error of few seeds.
             chance = noise * np.sqrt(4 * apart * (1 - apart / 4) / (count - 1))
             excess = own.var(axis=0, ddof=1) - same_seeds.var(axis=0, ddof=1) - chance
             more += np.maximum(excess, 0)
@@ -158,8 +158,8 @@ def expect_with(
 
 
 def _usual_scatter(pairs: Mapping[Key, tuple[F64, F64]], nominal: Expectation) -> float:
-    """Variance of changes that are chance alone, over the noise: that of most curves."""
-    # Effects that move the light change the noise of every sample a little, and so all curves.
+    """Variance of chance changes over the noise, from most curves."""
+    # Effects on the light change the noise of every sample a little, and so all curves.
     sizes = [
         float(np.mean((own - same) ** 2 / nominal.noise[key])) for key, (own, same) in pairs.items()
     ]
@@ -167,9 +167,9 @@ def _usual_scatter(pairs: Mapping[Key, tuple[F64, F64]], nominal: Expectation) -
 
 
 def _certain(shift: F64, chance: F64) -> F64:
-    """Share (n,) of a curve's change that is the effects' (positive part of James and Stein).
+    """Share (n,) of a curve's change that is due to effects (positive-part James-Stein).
 
-    Of the whole curve; and of values by themselves, where one stands out.
+    For the whole curve, and for single values that are significant.
     """
     squares = shift**2 / np.maximum(chance, 1e-300)
     whole = max(1 - 1 / max(float(np.mean(squares)), 1e-300), 0.0)
@@ -177,7 +177,7 @@ def _certain(shift: F64, chance: F64) -> F64:
 
 
 def _variance(values: F64, floor: float) -> F64:
-    """Variance (n,), leaning on the other values of the curve so that none is tiny by chance."""
+    """Variance (n,), shrunk towards that of the curve so that none is tiny by chance."""
     own = values.var(axis=0, ddof=1)
     rounding = (1e-9 * np.abs(values).max(axis=0)) ** 2
     leaning = 0.9 * own + 0.1 * np.median(own) + rounding + 1e-300
@@ -185,10 +185,10 @@ def _variance(values: F64, floor: float) -> F64:
 
 
 def independent_values(values: F64, floor: float = 0.0) -> float:
-    """As how many independent values those of a curve are, when the least likely one is looked at.
+    """Effective number of independent values of a curve, for its least likely value.
 
-    Each simulation (simulation, n) is held against the others; of n values the least chance u has
-    -log(1 - u) distributed exponentially with mean 1 / n, whose likelihood gives n.
+    Each simulation (simulation, n) is compared with the others. For the least p-value u of n,
+    -log(1 - u) has an exponential distribution of mean 1 / n, whose likelihood gives n.
     """
     count, n = values.shape
     if n == 1 or count < 3:

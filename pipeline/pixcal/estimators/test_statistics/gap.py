@@ -1,8 +1,8 @@
-"""The gap between data and simulations: curve by curve, how far beyond what chance allows.
+"""The gap between data and simulations: curve by curve, the difference beyond chance.
 
-Values are held against simulations of the same bench by Student's distribution: with few of them, a
-deviation counts for as much as it can. Mean squares are compared through a root below their usual
-size and a logarithm above it, whose scatter is nearly normal.
+Values are compared with simulations of the same bench by Student's distribution, which allows for
+few simulations. Mean squares are compared by a root below their usual size and a logarithm above
+it, whose scatter is nearly normal.
 """
 
 from collections.abc import Mapping
@@ -15,25 +15,24 @@ from pixcal.estimators.test_statistics import Key
 from pixcal.estimators.test_statistics.expectation import Expectation, statistic_named
 from pixcal.model.arrays import F64
 
-ALLOWED = 2.0  # standard deviations that a value may be off by before it counts as a gap
-CHANCE = 1e-3  # chance, of all statistics together, below which a difference is a gap
+ALLOWED = 2.0  # standard deviations of a value that do not count as a gap
+CHANCE = 1e-3  # p-value, for all statistics together, below which a difference is a gap
 
 
 @dataclass(frozen=True)
 class Difference:
     """One curve of the data against an expectation."""
 
-    sigmas: F64  # (n,) signed; of a normal, as rare as the deviation is
-    # logarithm of the chance that any of the curve's values is as far off; uniform (its
-    # exponential) where there is no gap
+    sigmas: F64  # (n,) signed, equivalent deviations of a normal
+    # logarithm of the p-value of the curve's largest deviation; the p-value is uniform without a
+    # gap
     log_chance: float
-    # squares of the deviations, as far as they are beyond `ALLOWED` standard deviations, over the
-    # nominal noise
+    # squares of the deviations beyond `ALLOWED` standard deviations, over the nominal noise
     excess: float
 
     @property
     def worst(self) -> int:
-        """Number of the value that is furthest off."""
+        """Number of the value with the largest deviation."""
         return int(np.argmax(np.abs(self.sigmas)))
 
 
@@ -42,7 +41,7 @@ def compare(data: Mapping[Key, F64], expected: Expectation) -> dict[Key, Differe
     keys = [key for key in expected.mean if key in data]
     if not keys:
         return {}
-    # All values at once: a call takes longer than a curve.
+    # All values in one call, as the call is slow.
     sizes = [len(data[key]) for key in keys]
     starts = np.cumsum([0, *sizes[:-1]])
     off = np.concatenate([data[key] - expected.mean[key] for key in keys])
@@ -62,7 +61,7 @@ def compare(data: Mapping[Key, F64], expected: Expectation) -> dict[Key, Differe
 
 
 def _any_of(log_chance: F64, count: F64) -> F64:
-    """Logarithm of the chance that the least of some independent chances is as small."""
+    """Logarithm of the probability that the least of ``count`` p-values is as small."""
     none = count * np.log1p(-np.minimum(np.exp(log_chance), 1 - 1e-15))
     tiny = log_chance < -30
     many = np.log(-np.expm1(np.where(tiny, -1.0, none)))
@@ -70,7 +69,7 @@ def _any_of(log_chance: F64, count: F64) -> F64:
 
 
 def flagged(differences: Mapping[Key, Difference]) -> set[Key]:
-    """Curves that differ by more than chance, all statistics being looked at (Bonferroni)."""
+    """Curves that differ by more than chance, for all statistics together (Bonferroni)."""
     limit = np.log(CHANCE / max(len(differences), 1))
     return {key for key, d in differences.items() if d.log_chance < limit}
 
@@ -86,12 +85,12 @@ def sigmas_among(log_chance: float, tested: int) -> float:
 
 
 def log_likelihood(data: Mapping[Key, F64], expected: Expectation) -> float:
-    """Logarithm of the chance density (Student's) of the data, of all curves together."""
+    """Log probability density (Student's) of the data, for all curves together."""
     return sum(_log_density(data[key], expected, key) for key in expected.mean if key in data)
 
 
 def likelier(data: Mapping[Key, F64], before: Expectation, after: Expectation) -> dict[Key, float]:
-    """By how much the logarithm of the chance density of each curve rises."""
+    """Rise of the log probability density of each curve."""
     return {
         key: _log_density(data[key], after, key) - _log_density(data[key], before, key)
         for key in before.mean
@@ -100,7 +99,7 @@ def likelier(data: Mapping[Key, F64], before: Expectation, after: Expectation) -
 
 
 def _log_density(values: F64, expected: Expectation, key: Key) -> float:
-    """Of one curve; of more than three values it counts as three, for they are not independent."""
+    """Of one curve; more than three values count as three, as they are not independent."""
     variance, nu = expected.variance[key], expected.dof
     square = (values - expected.mean[key]) ** 2 / variance
     terms = -(nu + 1) / 2 * np.log1p(square / nu) - np.log(variance) / 2
@@ -109,15 +108,15 @@ def _log_density(values: F64, expected: Expectation, key: Key) -> float:
 
 @dataclass(frozen=True)
 class Gap:
-    """How much of the gap is left, against the nominal bench's."""
+    """Remaining gap, relative to that of the nominal bench."""
 
     total: float  # 1: all of it; 0: none
-    # weights, left: of each curve: its weight, and the share of its excess that is left
+    # weights, left: of each curve: its weight, and the share of its excess that remains
     weights: Mapping[Key, float]
     left: Mapping[Key, float]
 
     def of_domain(self, domain: str) -> tuple[float, float]:
-        """Weight of a domain, and of what is left of it, over all of the gap at the start."""
+        """Weight of a domain, and of its remaining part, over the whole initial gap."""
         whole = sum(self.weights.values()) or 1.0
         own = [k for k in self.left if statistic_named(k[0]).domain == domain]
         return (
@@ -129,7 +128,7 @@ class Gap:
 def remaining(
     before: Mapping[Key, Difference], after: Mapping[Key, Difference], where: set[Key]
 ) -> Gap:
-    """The gap left: what differed (``where``) by squares of significance, new curves in full."""
+    """Remaining gap: curves ``where`` weighted by squared significance, new ones in full."""
     weights = {k: sigmas_of(before[k].log_chance) ** 2 for k in where}
     whole = sum(weights.values())
     left = {

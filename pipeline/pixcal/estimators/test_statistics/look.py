@@ -1,4 +1,4 @@
-"""One fringe set as the statistics look at it: residuals in units of their noise, maps, frames."""
+"""One fringe set as input of statistics: residuals in units of their noise, maps, frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,20 +27,20 @@ from pixcal.kernels.sample_sums import (
 )
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
-WILD = 8.0  # standard deviations beyond which a residual counts as an outlier and no more
+WILD = 8.0  # standard deviations beyond which a residual counts only as an outlier
 OUTLIERS = (5.0, 7.0, 10.0)  # standard deviations beyond which residuals are counted
 
 
 @dataclass(frozen=True)
 class Look:
-    """A fringe set of some evidence, and what several statistics need of it."""
+    """A fringe set of the evidence, and quantities that several statistics need."""
 
     found: FringeEvidence
     evidence: Evidence
 
     @property
     def good(self) -> Mask:
-        """Pixels (y, x) that are looked at."""
+        """Pixels (y, x) used."""
         return self.found.good
 
     @cached_property
@@ -72,7 +72,7 @@ class Look:
 
     @cached_property
     def theta(self) -> F32:
-        """Maps (3, pixel) of all pixels as the fit has them; zero in those that are not good."""
+        """Maps (3, pixel) of the fit for all pixels; zero in those that are not good."""
         theta = np.where(self.good, self.found.theta, 0).astype(np.float32)
         return np.asarray(theta.reshape(3, -1))
 
@@ -96,7 +96,7 @@ class Look:
 
     @property
     def thinned(self) -> int:
-        """One of so many frames is enough for statistics of pairs of pixels."""
+        """Interval of frames for statistics of pairs of pixels."""
         return max(1, len(self.residual) // MAX_FRAMES)
 
     @cached_property
@@ -136,7 +136,7 @@ class Look:
 
     @cached_property
     def stitched(self) -> Indices:
-        """Fields (y, x) of the foundry's stitching, as the offsets show them."""
+        """Fields (y, x) of the foundry's stitching, from the offsets."""
         return stitched_fields([self.maps["offset"]], [self.fringe_terms])
 
     @cached_property
@@ -165,7 +165,7 @@ class Look:
 
     @cached_property
     def frames(self) -> dict[str, F64]:
-        """Per frame (t,): relative intensity and contrast; turns along and across, rad."""
+        """Per frame (t,): relative intensity and contrast; phase along and across, rad."""
         b, a_cos, a_sin, dkx, dky = self.found.free.T
         contrast = np.hypot(a_cos, a_sin) / b
         ny, nx = self.good.shape
@@ -182,14 +182,14 @@ class Look:
 
 EDGE = 2  # pixels along the edges of the window that maps leave out
 LEVELS = 8  # bins of level
-CODES = 64  # codes whose remainders are told apart, a power of two
+CODES = 64  # modulus of the codes' remainders, a power of two
 CELLS = 4  # cells of the window along each side
 # rows and columns to a neighbour
 STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0), (0, 4), (4, 0))
 ADJACENT = 4  # of these, to pixels that touch
 MAX_FRAMES = 300  # frames for statistics of pairs of pixels
 PATTERN_DEGREE = 3  # of the Legendre polynomials that smooth patterns are made of
-SPARSE = 7  # one of so many pixels tells the range of the levels
+SPARSE = 7  # interval of pixels for the range of levels
 
 
 def neighbour_sums(
@@ -223,7 +223,7 @@ def _pairs(good: Mask, steps: Sequence[tuple[int, int]]) -> tuple[F32, F64]:
 
 
 def by_cell(values: F64, good: Mask) -> F64:
-    """Means (cell,) of the good pixels of each cell; empty where a cell has hardly any."""
+    """Means (cell,) of the good pixels of each cell; empty where a cell has too few."""
     ny, nx = good.shape
     row = np.arange(ny)[:, None] * CELLS // ny
     cell = row * CELLS + np.arange(nx)[None, :] * CELLS // nx

@@ -1,4 +1,4 @@
-"""Statistics of noise: its size, what neighbours, rows and columns share, pixels that stand out."""
+"""Statistics of noise: size, covariance of neighbours, rows and columns, outlying pixels."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -24,7 +24,7 @@ of_noise = partial(statistic, "noise")
 of_noise_power = partial(statistic, "noise", power=True)
 
 MIN_DARKS = 5
-CUT_OFF = 1e-3  # share of samples at code zero from which noise is cut off
+CUT_OFF = 1e-3  # share of samples at code zero above which noise is clipped
 # Read noise, in steps of the converter, below which the variance of a pixel depends on where its
 # level lies between two codes.
 COARSE = 0.65
@@ -63,7 +63,7 @@ def variance_by_time(look: Look) -> Curve:
 
 @of_noise("correlation of adjacent pixels", "correlation", x="neighbour")
 def neighbours(look: Look) -> Curve:
-    """Correlation of the residuals of pixels that touch: by itself, for most crosstalk is there."""
+    """Correlation of the residuals of adjacent pixels: separate, as most crosstalk is there."""
     sums, count = look.neighbours
     return Curve.numbered(_mean_product(sums, count)[:ADJACENT])
 
@@ -147,7 +147,7 @@ def outliers(look: Look) -> Curve:
     floor=1.0,
 )
 def dark_outliers(evidence: Evidence) -> Curve | None:
-    """The same of samples of darks, which last longer and have less noise."""
+    """The same for darks, which have longer exposures and less noise."""
     limits, counts = np.array(OUTLIERS), np.zeros((2, len(OUTLIERS)))
     stacks = [s for s in evidence.of_kind("dark") if len(s.adu) >= MIN_DARKS]
     for stack in stacks:
@@ -187,10 +187,10 @@ def read_noise(evidence: Evidence) -> Curve | None:
     rounded = evidence.read_noise > evidence.amplifier_noise
     if rounded and evidence.amplifier_noise < COARSE * evidence.gain * evidence.step_adu:
         return None
-    # Where noise is cut off at code zero, its size tells the level of a pixel.
+    # Where noise is clipped at code zero, its size depends on the level of a pixel.
     if (stacks[0].adu[:, evidence.good] == 0).mean() > CUT_OFF:
         return None
-    # Of whole numbers a median jumps by a code.
+    # A median of integers jumps by a code.
     level = frame_means(stacks[0].adu, evidence.good).astype(np.float32)
     frames = stacks[0].adu - level[:, None, None]
     variance = np.var(frames, axis=0, ddof=1) * (evidence.gain / evidence.read_noise) ** 2
@@ -212,7 +212,7 @@ def jumping(frames: F32) -> Mask:
 
 
 def ranges_about(values: F64, quantiles: Sequence[float]) -> F64:
-    """Mean around each quantile q, over ranks within min(q, 1 - q) / 2: few whole numbers jump."""
+    """Mean around each quantile q, over ranks within min(q, 1 - q) / 2, as integers jump."""
     ordered, found = np.sort(values), []
     for q in quantiles:
         apart = min(q, 1 - q) / 2

@@ -1,7 +1,7 @@
 """Statistics of patterns in single frames: tones of the noise, and smooth light or offsets.
 
-A tone with another phase in every frame is no part of any map, and neighbours hardly share it. Of
-smooth patterns a frame's fit takes up its level and its fringes, and leaves the others.
+A tone with another phase in every frame is in no map, and hardly correlates neighbours. A frame's
+fit absorbs its level and its fringes, but no other smooth pattern.
 """
 
 import numpy as np
@@ -31,7 +31,7 @@ def highest_ordinate(noise: F32, good: Mask) -> Curve:
         tones = rfft2(frames)
         power += (tones.real**2 + tones.imag**2).sum(axis=0, dtype=float)
     power /= len(noise) * np.count_nonzero(good)
-    # What whole rows or columns share has its own statistics.
+    # Noise of whole rows or columns has its own statistics.
     power[0] = power[:, 0] = 0
     y, x = np.unravel_index(int(np.argmax(power)), power.shape)
     frequency = float(np.hypot(np.fft.fftfreq(noise.shape[1])[y], x / noise.shape[2]))
@@ -39,9 +39,10 @@ def highest_ordinate(noise: F32, good: Mask) -> Curve:
 
 
 def tone_sigmas(noise: F32, good: Mask) -> Curve:
-    """Significance of the highest ordinate, which of white noise is a standard normal.
+    """Significance of the highest ordinate, a standard normal for white noise.
 
-    An ordinate has Wilson and Hilferty's distribution (1931), of two degrees of freedom a frame.
+    An ordinate has Wilson and Hilferty's distribution (1931), with two degrees of freedom per
+    frame.
     """
     highest = highest_ordinate(noise, good)
     ninth = 1 / (9 * len(noise))
@@ -96,9 +97,9 @@ def smooth_patterns_of(kind: str, evidence: Evidence) -> Curve | None:
 
 @statistic("time", "smooth patterns that follow the phase", "strongest", unit="σ")
 def smooth_patterns_by_phase(look: Look) -> Curve | None:
-    """Size of the strongest pattern that goes with two and three times the frame's phase."""
+    """Size of the strongest pattern that follows two and three times the frame's phase."""
     phi = look.found.phi
-    # The pixels' fit takes up what goes with the phase itself.
+    # The pixels' fit absorbs patterns that follow the phase itself.
     taken = np.linalg.qr(np.stack([np.ones_like(phi), np.cos(phi), np.sin(phi)], axis=1))[0]
     turns = np.stack([f(n * phi) for n in (2, 3) for f in (np.cos, np.sin)], axis=1)
     shapes, size, _ = np.linalg.svd(turns - taken @ (taken.T @ turns), full_matrices=False)

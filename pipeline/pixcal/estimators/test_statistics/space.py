@@ -69,7 +69,7 @@ MAPS = (
     ("light", "relative level", "", "large-scale variation"),
 )
 BINS = 6
-# px; standard deviation of harmonics, a fiftieth of what stars need
+# px; standard deviation of harmonics that is irrelevant, a fiftieth of what stars need
 IRRELEVANT = {"offset": 1e-6, "contrast": 0.0, "light": 0.0}
 FLOOR = 0.3  # least standard deviation of a term over the one that the map's own scatter gives
 
@@ -84,7 +84,7 @@ MAP_LINES = tuple((f"{m[0]}_{lines}", *m, lines) for m in MAPS for lines in AXES
     x="period, {5}",
 )  # fmt: skip
 def repeats_of_lines(of: str, look: Look) -> Curve:
-    """Size of what repeats after some rows or columns."""
+    """Size of patterns that repeat over rows or columns."""
     name, lines = of.split("_")
     size = np.abs(repeats(look.maps_beside_fringes[name], AXES[lines]))
     return Curve(np.array(PERIODS, float), size)
@@ -112,19 +112,19 @@ def residual_fringes(name: str, look: Look) -> Curve:
     return Curve(np.array([1.0, 1.25, 2.0, 2.25]), sizes)
 
 
-# Of light, whose surface is taken off, nothing is left but what outliers do to it.
+# Light is excluded: its surface was removed, so only the influence of outliers remains.
 @family(
     "{0}_bending", MAPS, "space", "{0}: {3}", "coefficient", unit="σ", x="Legendre term",
     floor=FLOOR,
 )  # fmt: skip
 def low_orders(name: str, look: Look) -> Curve:
-    """Legendre terms, over what a map as red as this one has by chance."""
+    """Legendre terms, over their size by chance in an equally red map."""
     values = look.maps[name]
     terms = legendre(values.shape, 4 if name == "contrast" else 3)
     field = look.stitched if name == "offset" else np.zeros(values.shape, np.intp)
     fit = FieldFit.of(values, terms[1:], field)
     error = np.sqrt(fit.variance * redness(fit.rest) * np.diag(fit.covariance))
-    # Two Gaussian beams make a contrast that bends in any direction, but no more than that.
+    # Two Gaussian beams cause curvature of the contrast in any direction, but no higher terms.
     first = 3 if name != "contrast" else 6
     pulls = fit.values / np.maximum(error, 1e-300)
     return Curve(np.arange(first, len(terms), dtype=float), pulls[first - 1 :])

@@ -1,4 +1,4 @@
-"""Statistics in time: what changes from frame to frame, slowly or with the frame before."""
+"""Statistics in time: changes from frame to frame, slow or dependent on the frame before."""
 
 from functools import partial
 from itertools import pairwise
@@ -31,8 +31,8 @@ STACKS = (
 MIN_FRAMES = 8
 LAGS = (1, 2, 3, -1, -2)
 BATCHES = 8
-# smallest singular value, of the largest, of shapes that a sequence of phases can tell apart: a
-# ramp of equal steps, or four of them, cannot tell all
+# smallest singular value, over the largest, of shapes that a sequence of phases separates; a ramp
+# of equal steps, or four of them, does not separate all
 DISTINCT = 0.05
 
 
@@ -131,8 +131,8 @@ def allan_of_batches(look: Look) -> Curve | None:
 @of_time("first flat of each level against the next ones", "relative intensity", sets=False)
 def first_flats(evidence: Evidence) -> Curve | None:
     """Relative change: mean over the levels, and slope against the rise from the frame before."""
-    # A lamp that flickers changes each level by itself. Lag changes the first frame by a share of
-    # the rise, which is large only where the ladder begins.
+    # Lamp flicker changes each level independently. Lag changes the first frame by a share of the
+    # rise, which is large only where the series of exposure times begins.
     stacks = [s for s in evidence.ladder if len(s.adu) > 1]
     every = [light_of(evidence, s) for s in stacks]
     if flicker(evidence)[1] < FLICKER_KNOWN or min(light.mean() for light in every) <= 0:
