@@ -20,7 +20,7 @@ TRIALS = 4.0
 class Line:
     """A line of one frequency in the series of all sets."""
 
-    hz: float  # hz, hz_error: as the frames see it: above half their rate it is folded below
+    hz: float  # hz, hz_error: as sampled: aliased if above half the frame rate
     hz_error: float
     # amplitude, amplitude_error: (2,) of each channel; mean square over the sets, less that of
     # the noise

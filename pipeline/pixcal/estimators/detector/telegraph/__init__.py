@@ -1,5 +1,5 @@
 """Telegraph noise of a population of pixels.
 
-`moments` has what is measured of each pixel, `classes` how likely that is for each amplitude,
-`population` how many jump, how far and how often; `find` puts them together.
+`moments` measures each pixel, `classes` gives its likelihood for each amplitude, `population` how
+many pixels jump, how far and how often; `find` combines them.
 """

@@ -1,7 +1,7 @@
 """Likelihoods of pixels' variances by classes of amplitudes, and mixtures of the classes.
 
-A pixel that jumps by A between two equally likely levels has A²/4 more variance, or less of that
-where it stays long or is rarely in one of them.
+A pixel that jumps by A between two equally likely levels has A²/4 more variance, or less where it
+stays long or one level is rare.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,20 +14,20 @@ from scipy.special import logsumexp, softmax
 from pixcal.estimators.detector.telegraph.moments import LAGS, Moments
 from pixcal.model.arrays import F32, F64, Indices
 
-AMPLITUDES = np.geomspace(0.1, 300, 90)  # amplitudes over the common noise that are looked at
+AMPLITUDES = np.geomspace(0.1, 300, 90)  # grid of amplitudes over the common noise
 _DRAWN = 600
-PLACES = (np.arange(5) + 0.5) / 5  # of pixels in the range of their stays
+PLACES = (np.arange(5) + 0.5) / 5  # of pixels in the range of dwell times
 _UNDERFLOW = 1e-200
-# Pixels' own noise is log-normal: nodes as far as this, at least so many, in its deviations, and as
-# dense as this, in those of a variance as the samples tell it
+# Pixels' own noise is log-normal. Nodes: reach (its standard deviations), least number, and spacing
+# (standard deviations of a sample variance)
 _REACH, _FEWEST, _STEP = 3.0, 7, 2.0
 
 
 @dataclass(frozen=True)
 class AmplitudeClasses:
-    """Pixels of a series, for each amplitude that they may have."""
+    """Likelihoods of the pixels of a series for each amplitude."""
 
-    likely: F64  # (n, class) likelihood of each pixel's variance over the largest of its own
+    likely: F64  # (n, class) likelihood of each pixel's variance over its largest
     largest: F64  # (n, 1) the logarithm of that, over the likelihood of a quiet pixel
     quiet: F64  # (n,) logarithm of the likelihood of a quiet pixel of the same noise
     noise: float  # variance that the pixels have without jumps, over the common one
@@ -52,7 +52,7 @@ class AmplitudeClasses:
         return cls(levels, largest, quiet, noise, added, *of_levels)
 
     def mixed(self) -> F64:
-        """Likelihoods (n, class) by what a pixel may have shown of its amplitude."""
+        """Likelihoods (n, class), averaged over the variance that an amplitude may show."""
         mixed = self.likely @ self.chances
         return np.asarray(np.maximum(mixed, _UNDERFLOW, out=mixed))
 
@@ -64,17 +64,17 @@ class AmplitudeClasses:
         return mixed
 
     def expected(self, lag: int) -> F64:
-        """Products of frames (n, class) to be expected, as in `Moments`, of one of its lags."""
+        """Expected products of frames (n, class) at one lag, as in `Moments`."""
         products = (self.likely @ self.products[lag]) * (self.noise * self.added)
         return np.asarray(products / self.mixed())
 
 
 @dataclass(frozen=True)
 class Stays:
-    """How long pixels stay in a level."""
+    """Dwell times of pixels in a level."""
 
     mean_s: float  # geometric mean over the pixels; 0: no longer than a frame
-    decades: float = 0.0  # range of the pixels' times, even in the logarithm
+    decades: float = 0.0  # range of the pixels' times, uniform in the logarithm
     upper: float = 0.5  # share of the time in the upper level
 
     def kept(self, period_s: float, places: F32 | F64) -> F64:
@@ -102,7 +102,7 @@ def states(keeps: tuple[float, ...], count: int, upper: float) -> F64:
 def _levels(keeps: tuple[float, ...], count: int, upper: float) -> tuple[F64, F64]:
     """Chances (level, class) that a class shows another's variance; products (lag, level, class).
 
-    A pixel that stays long shows more or less of its two levels, or one: another amplitude.
+    A pixel that stays long may show its levels unequally, or one only: another amplitude.
     """
     shown = states(keeps, count, upper)
     seen = (shown**2).sum(axis=0) / (count - 1)
@@ -137,7 +137,7 @@ def own_noises(parts: Sequence[Moments]) -> list[tuple[float, float]]:
 def of_own_noise(
     pixels: Indices, parts: Sequence[Moments], classes: Iterable[AmplitudeClasses]
 ) -> tuple[F64, F64]:
-    """Log-likelihoods of all series together with one noise: (pixel, class) over quiet (pixel,)."""
+    """Log-likelihoods of all series for one noise: (pixel, class) over quiet; quiet (pixel,)."""
     total, quiet = np.zeros((len(pixels), len(AMPLITUDES))), np.zeros(len(pixels))
     for m, one in zip(parts, classes, strict=True):
         at = np.searchsorted(pixels, m.pixel)
@@ -151,7 +151,7 @@ def joined(pixels: Indices, parts: Sequence[Moments], unit: float, stays: Stays)
     total = np.full((len(pixels), len(AMPLITUDES)), -np.inf)
     every = np.full(len(pixels), -np.inf)
     for noise, share in own_noises(parts):
-        # One after the other: each is large.
+        # One at a time, as each is large.
         classes = (AmplitudeClasses.of(m, unit, stays, noise) for m in parts)
         ratio, quiet = of_own_noise(pixels, parts, classes)
         ratio += quiet[:, None] + share
@@ -178,17 +178,17 @@ class Mixture:
         return cls(np.exp(logarithms - largest[:, None]), largest, logarithms)
 
     def log_telegraph(self, weight: F64) -> F64:
-        """Of each pixel, of all classes with their weights (class,)."""
+        """Log-likelihood ratio of each pixel for classes with weights (class,)."""
         total = self.ratio @ weight
         found = self.largest + np.log(np.maximum(total, _UNDERFLOW))
-        # Where the largest has hardly any weight the others have been rounded to nothing.
+        # Where the largest has hardly any weight the others underflowed.
         lost = total <= _UNDERFLOW
         found[lost] = logsumexp(self.logarithms[lost], b=weight, axis=1)
         return found
 
     def log_likelihood(self, weight: F64) -> F64:
         """Of each pixel, quiet or not."""
-        # Amplitudes below those looked at do nothing.
+        # Amplitudes below the grid count as quiet.
         quiet = np.log(max(1 - weight.sum(), 1e-12))
         return np.asarray(np.logaddexp(quiet, self.log_telegraph(weight)))
 
@@ -203,10 +203,10 @@ class Mixture:
         return np.asarray(own @ self.ratio - quiet)
 
     def chance(self, weight: F64) -> F64:
-        """Of each pixel, that it is not quiet."""
+        """Probability that each pixel is not quiet."""
         return np.asarray(np.exp(self.log_telegraph(weight) - self.log_likelihood(weight)))
 
     def shares(self, weight: F64) -> F64:
-        """Chances (pixel, class) of the classes, if it is not."""
+        """Probabilities (pixel, class) of the classes of pixels that are not quiet."""
         logarithms = self.logarithms + np.log(np.maximum(weight, _UNDERFLOW))
         return np.asarray(softmax(logarithms, axis=1))

@@ -1,9 +1,9 @@
-"""How long pixels stay in a level, from frames of which there are many.
+"""Dwell times of pixels in a level, from many frames.
 
 A few dozen bias or dark frames show which pixels jump, and how far; hundreds of fringe frames show
-for how long they stay. What the fringes leave of a pixel's charge is alike in frames near each
-other. Its mean product falls exponentially with the time between two frames (Machlup 1954, J. Appl.
-Phys. 25, 341): slowly where pixels stay long.
+how long they stay. The residuals of such a pixel are correlated in time. Their autocovariance falls
+exponentially with the time between two frames (Machlup 1954, J. Appl. Phys. 25, 341), slowly for
+long dwell times.
 """
 
 from collections.abc import Sequence
@@ -19,18 +19,18 @@ from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64, Indices
 
 LAGS = np.array([1, 2, 4, 8, 16, 32])  # frames apart
-DECADES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)  # ranges of the pixels' times that are tried
+DECADES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)  # ranges of dwell times that are tried
 TRUSTED = 0.1  # share by which the variance in fringes may differ from that in darker frames
 DIFFER = 4.0  # by which the chi-square of unequal times must be lower
-CLEAR = 5.0  # errors of the variance from which it tells a time
+CLEAR = 5.0  # significance (errors) of the variance from which a time is fitted
 FEWEST_PIXELS = 20
 _FEWEST_PAIRS = 16
-_LEAST, _MOST = 0.2, 5.0  # periods, and lengths of the series, between which times are looked for
+_LEAST, _MOST = 0.2, 5.0  # limits of times: in periods, and in lengths of the series
 
 
 @dataclass(frozen=True)
 class LitSeries:
-    """Charge of some pixels that the fringes do not explain, in frames that follow one another."""
+    """Residual charge of pixels in consecutive frames."""
 
     charge: F64  # (t, n) e-; 0 where there is none
     weight: F64  # (t, n) inverse of its variance without jumps, e-⁻²; 0 where there is none
@@ -43,10 +43,10 @@ class LitSeries:
 def find_stays(
     lit: Sequence[LitSeries], seen: Moments, upper: float = 0.5
 ) -> tuple[Stays, float] | None:
-    """Stays of the pixels, and the error (s) of their mean; None where the frames do not tell.
+    """Dwell times of the pixels, and the error (s) of their mean; None if not constrained.
 
-    ``upper``: share of the time in the upper level. ``seen``: the frames by which the pixels were
-    chosen, in which those that stayed in one level are missing.
+    ``upper``: share of the time in the upper level. ``seen``: the frames in which the pixels were
+    selected, without those that stayed in one level.
     """
     lit = [s for s in lit if s.charge.shape[1] >= FEWEST_PIXELS and s.period_s > 0]
     products = [_products(s) for s in lit]
@@ -96,7 +96,7 @@ def find_stays(
     decades, chi2, (_, log_time), (_, error) = best
     if not np.isfinite(chi2):
         return None
-    # Another range of the times may be the true one: it has another mean.
+    # Another range of the times, with another mean, may be the true one.
     chi2s, times = (np.array([one[n] for one in tried]) for n in (1, 2))
     chance = np.exp((chi2 - chi2s) / 2) * np.where(np.array(DECADES) > 0, 1 / len(DECADES), 1)
     other = float(chance @ (times[:, 1] - log_time) ** 2 / chance.sum())
@@ -105,13 +105,13 @@ def find_stays(
 
 
 def _products(series: LitSeries) -> tuple[F64, F64]:
-    """Mean products (lag, n) of each pixel times their weights, and these; NaN without frames."""
+    """Weighted mean products (lag, n) of each pixel, and the weights; NaN without frames."""
     root = np.sqrt(series.weight)
     noise = series.charge * root
     shape = len(LAGS), noise.shape[1]
     sums, weights = np.full(shape, np.nan), np.full(shape, np.nan)
-    # White noise less what was fitted to it is unlike itself from frame to frame: of its
-    # covariance, times the weights, this is missing.
+    # The fit makes residuals of white noise anticorrelated between frames: their weighted
+    # covariance is too low by this.
     fitted = (root[:, None] * series.fitted[:, :, None]).astype(float)
     normal = np.einsum("tkn,tln->nkl", fitted, fitted)
     taken = np.einsum("nkl,tln->tkn", inverse_normal(normal), fitted)
@@ -125,19 +125,19 @@ def _products(series: LitSeries) -> tuple[F64, F64]:
 
 
 def _of_mean(kept: F64, count: int) -> F64:
-    """Variance of the mean of so many frames, which is taken off, over that of one."""
+    """Variance of the subtracted mean of ``count`` frames, over that of one."""
     k = np.minimum(kept, 1 - 1e-9)
     both = (1 + k) / (1 - k) / count - 2 * k * (1 - k**count) / (count * (1 - k)) ** 2
     return np.asarray(both)
 
 
 def _excess(seen: Moments) -> float:
-    """Variance of the pixels that were chosen beyond the common one, over that."""
+    """Relative excess of the selected pixels' variance over the common one."""
     return float(np.mean(seen.variance[seen.excess > 0])) - 1
 
 
 def _chosen(stays: Stays, seen: Moments) -> tuple[F64, F64]:
-    """Share (place,) of pixels that stood out enough to be chosen; their mean variance (place,)."""
+    """Share (place,) of pixels noisy enough to be selected; their mean variance (place,)."""
     limit = NOISY * np.sqrt(2 / seen.dof) / max(_excess(seen), 1e-9)
     kept = np.broadcast_to(stays.kept(seen.period_s, PLACES), PLACES.shape)
     shown = states(tuple(kept.tolist()), seen.frames, stays.upper)

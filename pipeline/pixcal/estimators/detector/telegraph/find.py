@@ -1,4 +1,4 @@
-"""Telegraph noise: the signs of it, the population of pixels and the time, found together."""
+"""Telegraph noise: its signs, the population of pixels and their dwell time."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,23 +26,23 @@ from pixcal.estimators.detector.telegraph.population import (
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F32, F64, Indices
 
-ROUNDS = 3  # most, in which population and time are found, each with the other known
-# decades over which stays differ where they do, and the chi-square by which frames further apart
-# must say so (equal stays: at most 1.9 in eight draws of 3-sigma jumps in 3 % of 16,000 pixels)
+ROUNDS = 3  # most iterations between population and dwell time
+# range (decades) of unequal dwell times, and the chi-square by which frames further apart must
+# favour it (equal times: at most 1.9 in eight draws of 3-sigma jumps in 3 % of 16,000 pixels)
 SPREAD, DIFFER = 1.5, 2.0
-MOST_OWN = 3000  # pixels that are measured one by one: a millisecond each
-DARKER = 1.5  # variance of fringes over that of frames without light, at least
-SETTLED = 0.5  # change of the time, over its error, after which no other round is needed
+MOST_OWN = 3000  # most pixels measured one by one: a millisecond each
+DARKER = 1.5  # least variance of fringes over that of frames without light
+SETTLED = 0.5  # change of the time, over its error, that ends the iteration
 _RARER = np.array([0.02, 0.035, 0.06, 0.1, 0.17, 0.28])
 SHARES = np.concatenate([_RARER, [0.5], 1 - _RARER[::-1]])  # of the time in the upper level
 AMPLITUDES = np.geomspace(1.0, 60.0, 14)  # over the noise of dark frames
-# by which pixels with unequal levels must make the frames likelier, a pixel that has them: frames
-# near each other are alike, so it rises by more than of independent ones
+# log-likelihood by which unequal levels must be likelier, in all and per pixel: correlated frames
+# raise it more than independent ones
 CLEAR, CLEAR_A_PIXEL = 10.0, 0.1
 MOST_PIXELS = 400
 _TURNS = 60  # of the maximisation
-# of single pixels: shares and amplitudes as above, and by how much the logarithm of the likelihood
-# of two levels must be above that of one
+# for single pixels: shares and amplitudes as above, and by how much the log-likelihood of two
+# levels must exceed that of one
 OWN_SHARES = np.array([0.03, 0.08, 0.2, 0.35, 0.5, 0.65, 0.8, 0.92, 0.97])
 OWN_AMPLITUDES = np.geomspace(1.0, 60.0, 28)
 TWO_LEVELS = 8.0
@@ -59,14 +59,14 @@ class OwnLevels:
 
 @dataclass(frozen=True)
 class Telegraph(Population):
-    """What was found: the population, how its pixels jump, and single ones."""
+    """Telegraph noise found: the population, how its pixels jump, and single pixels."""
 
-    switching_s: float  # mean stay in a level, s; 0: no longer than a frame
-    switching_decades: float  # range of the pixels' times, even in the logarithm
+    switching_s: float  # mean dwell time, s; 0: no longer than a frame
+    switching_decades: float  # range of the pixels' times, uniform in the logarithm
     upper: float  # share of the time in the upper level
     switching_error: float
     signs: Signs  # that noisy pixels jump
-    # own, faintest: levels of single pixels, where the fringes tell; of jumps of so many electrons
+    # own, faintest: levels of single pixels, from fringes; smallest jump measured, e-
     own: OwnLevels | None = None
     faintest: float = 0.0
 
@@ -78,7 +78,7 @@ def find_telegraph(
 ) -> Telegraph | None:
     """Telegraph noise from one or several series of the same pixels; None without samples.
 
-    ``lit``: gives the frames of fringes of some pixels, which tell how long they stay.
+    ``lit``: gives the fringe frames of given pixels, which constrain dwell times.
     """
     parts = [m for s in series if (m := moments_of(s)) is not None]
     if not parts:
@@ -91,7 +91,7 @@ def find_telegraph(
         own = max(series, key=lambda s: len(s.noise))
         upper = _upper(lit, own, longest, told)
         if upper != 0.5:
-            # What looks like a hit is the rarer level.
+            # Apparent hits are the rarer level.
             parts = [m for s in series if (m := moments_of(s, hits=True)) is not None]
             longest = max(parts, key=lambda m: m.frames)
             upper = _upper(lit, own, longest, told)
@@ -124,12 +124,12 @@ def _chosen(m: Moments) -> Indices:
 def _upper(
     lit: Callable[[Indices], Sequence[LitSeries]], own: Series, seen: Moments, told: Signs
 ) -> float:
-    """Share of the time in the upper level: by the fringes, else by the frames without light."""
+    """Share of the time in the upper level: from fringes, else from frames without light."""
     pixels = _chosen(seen)
     upper = find_upper(lit(pixels), seen.sigma)
     if upper != 0.5 or abs(told.one_sided) < SIGNIFICANT:
         return upper
-    # Pixels were chosen for what they do in these, so a rare level is taken for a less rare one.
+    # Pixels were selected in these frames, which biases the share of a rare level high.
     return find_upper([_in_the_dark(own, pixels)], seen.sigma)
 
 
@@ -149,12 +149,12 @@ def _single(
     noisy: Indices | None,
     faintest: float,
 ) -> OwnLevels | None:
-    """Levels of each pixel that jumps so far; None where the fringes do not tell."""
+    """Levels of each pixel that jumps by ``faintest`` or more; None without fringes."""
     pixels = _chosen(seen) if noisy is None else np.union1d(_chosen(seen), noisy)
     bright = lit(pixels) if len(pixels) <= MOST_OWN else ()
     if not bright:
         return None
-    # Without dark frames the series is one of the fringes, which are there already.
+    # Without dark frames the series is one of fringes, already in ``bright``.
     darker = own.sigma**-2 > DARKER * float(np.mean(bright[0].weight))
     dark = [_in_the_dark(own, pixels)] if darker else []
     found = own_levels([*dark, *bright], seen.sigma)
@@ -164,19 +164,19 @@ def _single(
 
 @dataclass(frozen=True)
 class _Found:
-    """A population, and how long its pixels stay."""
+    """A population, and its dwell times."""
 
     population: Population
     stays: Stays
     error: float  # of the mean stay, s
-    later: float  # what frames further apart have in common beyond that, in errors
+    later: float  # excess covariance of frames further apart, in errors
 
 
 def _likeliest(parts: Sequence[Moments], upper: float) -> _Found:
-    """Population and stays, of equal stays or of such that differ, by the same frames."""
+    """Population with equal or with unequal dwell times, from the same frames."""
     even = _of_stays(parts, 0.0, upper)
     if even.stays.mean_s > 0:
-        # Times of traps differ widely, where frames further apart say so.
+        # Unequal dwell times only where frames further apart favour them.
         spread = _of_stays(parts, SPREAD, upper)
         if even.later**2 - spread.later**2 > DIFFER:
             return spread
@@ -184,9 +184,9 @@ def _likeliest(parts: Sequence[Moments], upper: float) -> _Found:
 
 
 def _of_stays(parts: Sequence[Moments], decades: float, upper: float) -> _Found:
-    """The likeliest population with stays that differ by so many decades."""
-    # A pixel's variance is high by telegraph noise or by chance: how much is which, the population
-    # tells; how much of it a few frames hold, the time.
+    """The likeliest population with dwell times over a range of ``decades``."""
+    # The population separates telegraph noise and chance in a pixel's variance; the dwell time
+    # gives the part of it that few frames show.
     found = find_population(parts, Stays(0.0, upper=upper))
     switching, error = find_switching(parts, found, decades, upper)
     for _ in range(ROUNDS):
@@ -207,7 +207,7 @@ def _of_stays(parts: Sequence[Moments], decades: float, upper: float) -> _Found:
 def find_upper(lit: Sequence[LitSeries], noise: float) -> float:
     """Share of the time in the upper level that all pixels have in common; 0.5 unless it is clear.
 
-    ``lit``: frames of fringes, each set by itself. ``noise``: of dark frames, e-.
+    ``lit``: fringe frames, one series per set. ``noise``: of dark frames, e-.
     """
     used = [s for s in lit if s.charge.shape[1] >= FEWEST_PIXELS]
     if not used:
@@ -232,7 +232,7 @@ def find_upper(lit: Sequence[LitSeries], noise: float) -> float:
 
 
 def own_levels(series: Sequence[LitSeries], noise: float) -> OwnLevels:
-    """Levels of the pixels that have two, by all frames together, lit or not.
+    """Levels of the pixels that have two, from all frames, lit or not.
 
     The share of time may differ from series to series; that of the longest is given. ``noise``: of
     frames without light, e-.

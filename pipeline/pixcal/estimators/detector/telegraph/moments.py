@@ -1,8 +1,8 @@
-"""Moments of each pixel's noise, and what they say of jumps.
+"""Moments of each pixel's noise, and evidence of jumps in them.
 
-A pixel that is noisier than others need not jump. Of Gaussian noise of any size the kurtosis and
-the correlation of neighbouring frames, each over the variance, do not depend on it (Basu's
-theorem); so their sums over pixels, weighted by the variance, have known mean and scatter.
+A pixel that is noisier than others need not jump. For Gaussian noise the kurtosis and the
+normalised covariance of neighbouring frames are independent of the variance (Basu's theorem); so
+their sums over pixels, weighted by the variance, have known mean and scatter.
 """
 
 from collections.abc import Sequence
@@ -15,11 +15,11 @@ from pixcal.kernels.frame_order import follows
 from pixcal.kernels.significance import sigmas_of_best
 from pixcal.model.arrays import F64, Indices, Mask
 
-NOISY = 3.0  # excess of the variance, in its own sigmas, from which a pixel's noise is looked at
-LAGS = 1, 4  # frames apart whose products tell how long pixels stay, and how widely that differs
-QUIET = 1 << 14  # pixels of usual noise that tell what noise is usual
+NOISY = 3.0  # excess of the variance, in its own sigmas, from which a pixel is noisy
+LAGS = 1, 4  # frames apart whose products give the dwell time, and its range
+QUIET = 1 << 14  # most pixels of usual noise that are kept
 _OUTLIER = 5.0  # standard deviations
-# by how much the quartiles of n pixels' variances are further apart than those of alike pixels,
+# relative excess of the distance between quartiles of n variances over that of identical pixels,
 # times the root of n: three errors (of normal numbers)
 _DIFFER = 3.5
 _MIN_FRAMES = 8
@@ -27,7 +27,7 @@ _MIN_FRAMES = 8
 
 @dataclass(frozen=True)
 class Series:
-    """Noise of pixels in frames that follow one another."""
+    """Noise of pixels in consecutive frames."""
 
     noise: F64  # (t, n) over the common noise, about the pixel's mean; NaN where there is none
     frame: Indices  # (t,) numbers of the frames
@@ -38,7 +38,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Moments:
-    """Of the noise of each pixel of a series, in units of the common noise."""
+    """Moments of each pixel's noise in a series, in units of the common noise."""
 
     pixel: Indices
     count: F64  # samples
@@ -50,11 +50,11 @@ class Moments:
     products: F64
     pairs: float  # neighbouring frames, over all but one
     samples_dof: float  # of the variance
-    spread: float  # variance from pixel to pixel of the logarithm of the variance that they have
+    spread: float  # variance over pixels of the logarithm of their true variance
     sigma: float
     period_s: float
     frames: int  # that most pixels have
-    stands_for: F64  # (n,) pixels, of those of which some were left out: see `thinned`
+    stands_for: F64  # (n,) number of pixels that each represents: see `thinned`
 
     def of(self, pixels: Indices) -> "Moments":
         """Of some pixels (ascending) alone."""
@@ -73,12 +73,12 @@ class Moments:
 
     @property
     def dof(self) -> float:
-        """Of the variance as it scatters: fewer than the samples have where pixels differ."""
+        """Effective degrees of freedom of the variance: fewer where pixels differ."""
         return self.samples_dof / (1 + self.spread * self.samples_dof / 2)
 
     @property
     def excess(self) -> F64:
-        """Variance beyond the common one; zero where that is not clear."""
+        """Variance beyond the common one; zero where not significant."""
         excess = self.variance - 1
         return np.where(excess > NOISY * np.sqrt(2 / self.dof), excess, 0)
 
@@ -130,7 +130,7 @@ def moments_of(series: Series, *, hits: bool = False) -> Moments | None:
 
 
 def _particles(noise: F64) -> Mask:
-    """Samples (t, n) far beyond all others of their pixel, which two levels do not make."""
+    """Samples (t, n) far beyond all others of their pixel, unlike jumps between two levels."""
     square = np.nan_to_num(noise**2)
     largest, n = square.max(axis=0), np.isfinite(noise).sum(axis=0)
     others = (square.sum(axis=0) - largest) / np.maximum(n - 2, 1)
@@ -139,7 +139,7 @@ def _particles(noise: F64) -> Mask:
 
 
 def thinned(parts: Sequence[Moments]) -> list[Moments]:
-    """All pixels noisy in any series, and `QUIET` of the others, each standing for several."""
+    """All pixels noisy in any series, and `QUIET` others, each representing several."""
     pixels = np.unique(np.concatenate([m.pixel for m in parts]))
     noisy = np.unique(np.concatenate([m.pixel[m.excess > 0] for m in parts]))
     quiet = np.setdiff1d(pixels, noisy, assume_unique=True)
@@ -153,14 +153,14 @@ def thinned(parts: Sequence[Moments]) -> list[Moments]:
 
 @dataclass(frozen=True)
 class Signs:
-    """Of jumps, in sigmas of Gaussian noise of any size, by all pixels together."""
+    """Evidence of jumps in all pixels, in sigmas of Gaussian noise of any size."""
 
     flat_top: float  # two levels that are about equally frequent
-    # outliers that come back to the same pixels to one side alone: a level that is rare, the upper
-    # one (positive) or the lower one
+    # outliers that recur in the same pixels on one side only: a rare level, the upper one
+    # (positive) or the lower one
     one_sided: float
-    staying: float  # neighbouring frames that are alike
-    noisy: int  # pixels that stand out
+    staying: float  # correlation of neighbouring frames
+    noisy: int  # number of noisy pixels
 
     @property
     def significance(self) -> float:
@@ -192,7 +192,7 @@ def signs(parts: Sequence[Moments]) -> Signs:
 
 
 def _come_back(counts: F64) -> tuple[int, float]:
-    """Pixels with several outliers, and how many had them if all pixels were hit alike."""
+    """Number of pixels with several outliers, and that expected from random hits."""
     once = np.count_nonzero(counts == 1) / len(counts)
     # Of a Poisson distribution with this share of ones: the root below one.
     rate = -float(np.real(lambertw(-min(once, np.exp(-1)))))

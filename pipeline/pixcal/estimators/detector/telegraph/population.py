@@ -2,8 +2,8 @@
 
 The distribution of the pixels' variances gives the share of such pixels and their mean amplitude,
 by maximum likelihood: most pixels have the common noise, a share has more, with amplitudes from a
-gamma distribution (an exponential one unless the pixels say otherwise). Neighbouring frames give
-the time.
+gamma distribution (exponential unless the data require another). Neighbouring frames give the dwell
+time.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,19 +25,19 @@ from pixcal.estimators.detector.telegraph.classes import (
 from pixcal.estimators.detector.telegraph.moments import Moments
 from pixcal.model.arrays import F64, Indices
 
-# logarithm of the shape: what is usual, and the most that is tried
+# logarithm of the shape: prior 1-sigma, and largest value
 _USUAL, _MAX_LOG_SHAPE = 1.5, 4.0
-_MOVE = 1e-4  # by which parameters are moved for the slope of the classes' shares
+_MOVE = 1e-4  # step of parameters for derivatives of the classes' shares
 # of the logits of shares, of logarithms of amplitudes over the noise, and of shapes
 _RANGES = (
     (-16.0, 16.0),
     (np.log(AMPLITUDES[0]), np.log(AMPLITUDES[-1])),
     (-_MAX_LOG_SHAPE, _MAX_LOG_SHAPE),
 )
-_CLEAR = 8.0  # by which another shape than the exponential's must be likelier
-# chance of telegraph noise from which a pixel's frames are looked at for how long it stays,
+_CLEAR = 8.0  # log-likelihood by which a shape other than exponential must be better
+# probability of telegraph noise from which a pixel is used for the dwell time,
 LIKELY = 0.1
-_MOST = 0.95  # and the share of these whose variance says how much one may count for at most
+_MOST = 0.95  # and quantile of their variances above which a pixel's weight is reduced
 
 
 @dataclass(frozen=True)
@@ -52,14 +52,14 @@ class Population:
     share_error: float
     amplitude_error: float
     shape_error: float
-    unit: float  # noise that `AMPLITUDES` are over, e-
+    unit: float  # noise that is the unit of `AMPLITUDES`, e-
     weight: F64  # (class,) share of the pixels in each class of amplitudes
-    pixels: Indices  # (n,) all that there are
-    chance: F64  # (n,) that each is one of them
+    pixels: Indices  # (n,) all pixels
+    chance: F64  # (n,) probability that each has telegraph noise
 
 
 def find_population(parts: Sequence[Moments], stays: Stays) -> Population:
-    """Of how many pixels, and how strong, for stays in a level."""
+    """Share and amplitudes of pixels with telegraph noise, for given dwell times."""
     pixels = np.unique(np.concatenate([m.pixel for m in parts]))
     unit = min(m.sigma for m in parts)
     stands_for = np.ones(len(pixels))
@@ -106,7 +106,7 @@ def find_population(parts: Sequence[Moments], stays: Stays) -> Population:
 
 
 def _shape(p: F64) -> float:
-    """Of the gamma distribution: exponential where it is not asked for."""
+    """Shape of the gamma distribution: exponential if it is no parameter."""
     return float(np.exp(np.clip(p[2], -_MAX_LOG_SHAPE, _MAX_LOG_SHAPE))) if len(p) > 2 else 1.0
 
 
@@ -126,9 +126,9 @@ def _curvature(cost: Callable[[F64], float], at: F64, step: float = 0.05) -> F64
 def find_switching(
     parts: Sequence[Moments], population: Population, decades: float, upper: float
 ) -> tuple[float, float]:
-    """Mean stay in a level and its error, s, from neighbouring frames."""
+    """Mean dwell time and its error, s, from neighbouring frames."""
     period = min(m.period_s for m in parts)
-    # The others say nothing of it.
+    # Other pixels do not constrain it.
     few = population.pixels[population.chance > LIKELY]
     if not len(few):
         return 0.0, period
@@ -136,17 +136,17 @@ def find_switching(
     def rest(log_time: float, most: float) -> tuple[float, float]:
         return _rest(parts, population, Stays(float(np.exp(log_time)), decades, upper), 0, most)
 
-    # Of longer stays the frames do not tell how long.
+    # The frames do not constrain longer dwell times.
     longest = max(m.period_s * m.frames for m in parts)
     low, high = np.log(0.1 * period), np.log(max(longest, period))
 
     def solved(more: float) -> float:
-        """Logarithm of the time for which so much more than was measured is expected."""
+        """Logarithm of the time whose expected products exceed those measured by ``more``."""
         if rest(high, most)[0] + more >= 0:
             return float(high)
         return float(brentq(lambda v: rest(v, most)[0] + more, low, high, xtol=3e-3))
 
-    # All pixels count alike where a few hide what the others show.
+    # Then all pixels count equally, as a few may hide the signal of the others.
     for most in (_MOST, 0.0):
         none, error = rest(low, most)
         if none > 3 * error:
@@ -160,7 +160,7 @@ def find_switching(
 
 
 def off_later(parts: Sequence[Moments], population: Population, stays: Stays) -> float:
-    """Products of frames further apart than neighbours beyond those for some stays, in errors."""
+    """Products of frames further apart in excess of those for given stays, in errors."""
     total, error = _rest(parts, population, stays, 1, _MOST)
     return total / error if error > 0 else 0.0
 
@@ -168,7 +168,7 @@ def off_later(parts: Sequence[Moments], population: Population, stays: Stays) ->
 def _rest(
     parts: Sequence[Moments], population: Population, stays: Stays, lag: int, most: float
 ) -> tuple[float, float]:
-    """Products of frames, of one of the lags, beyond those for some stays, and their error."""
+    """Products of frames at one lag in excess of those for given stays, and their error."""
     few = population.pixels[population.chance > LIKELY]
     if not len(few):
         return 0.0, 0.0
@@ -194,7 +194,7 @@ def _rest(
 def _expected(
     pixels: Indices, parts: Sequence[Moments], unit: float, stays: Stays, lag: int
 ) -> tuple[F64, list[F64]]:
-    """What `joined` gives, and the products of frames (n, class) to be expected of each series."""
+    """Result of `joined`, and the expected products of frames (n, class) of each series."""
     totals = [np.zeros((len(m.pixel), len(AMPLITUDES))) for m in parts]
     weight, largest = np.zeros((2, len(pixels), len(AMPLITUDES)))
     largest -= np.inf
