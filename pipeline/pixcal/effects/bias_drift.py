@@ -185,7 +185,7 @@ class BiasDrift(Effect):
             return None
         at = LIGHT_PARTS.index("offset_walk")
         there, sloped, chance = _fits_of_runs(light)
-        # What both explain is given to the walk, which allows for more.
+        # What both explain is attributed to the walk, which is more general.
         rise = _rise(sloped, there)
         law, ramp, errors = "random walk, rms after an hour", 0.0, {}
         if np.sqrt(2 * rise) > STEADY:
@@ -215,7 +215,7 @@ class BiasDrift(Effect):
             return None
         full, drift = _drift(every)
         level = estimate_components(offset_modes(every, [_ramp(s)[:, :0] for s in every]))
-        # The walk being found anew without the ramp: beside a ramp that is a walk little is left.
+        # The walk is refitted without the ramp: a ramp that is a walk then adds little.
         steady = float(np.sqrt(2 * _rise(full, level)))
         best, settling = _settling(every, full)
         found = best.found if best else full

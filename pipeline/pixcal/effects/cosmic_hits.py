@@ -233,7 +233,7 @@ def _searches(evidence: Evidence) -> Iterator[_Search]:
     for f in evidence.fringes.values():
         # As in `CosmicHits.charge`.
         seconds = f.exptime_s if f.exptime_s > 0 else float(np.median(np.diff(f.time_s)))
-        # A pixel that fits badly may have been hit: those that were hit hardest have.
+        # A pixel that fits badly may have been hit, as those hit hardest were.
         residual = np.where(evidence.good & np.isfinite(f.theta).all(axis=0), f.residual, np.nan)
         yield _search(residual, np.sqrt(f.variance), seconds, area)
     for stack in (*evidence.of_kind("bias"), *evidence.of_kind("dark")):
@@ -446,7 +446,7 @@ def _scale(searches: list[_Search], places: list[F64], drawn: _Drawn) -> tuple[f
         total = 0.0
         for s, noise in zip(searches, places, strict=True):
             found = np.sort(drawn.hits(np.exp(log_scale), noise, s.limit).peaks)
-            # Where hardly a drawn track is found, a hit is brighter than they can explain.
+            # Where few drawn tracks are detected, hits are brighter than the law can explain.
             rare = len(found) < _RARE * _DRAWN
             ranks = np.searchsorted(found, s.hits.peaks)
             total += len(ranks) if rare else ranks.sum() / len(found)

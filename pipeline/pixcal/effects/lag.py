@@ -26,7 +26,7 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 TAIL = 1e-3  # share of the charge left behind whose release is brought forward to the last frame
-_TELL_LAMP = 3  # flats of a level from which a lamp that warms up is told from lag
+_TELL_LAMP = 3  # fewest flats of a level to separate a lamp that warms up from lag
 _TURNS = 3  # of the inverse: each gains a factor of the share
 
 
@@ -245,7 +245,7 @@ class Lag(Effect):
         sure, unalike = common.sigmas > CLEAR, uneven.sigmas > CLEAR
         rms = uneven.rms(common.keep, common.share) if unalike else 0.0
         missed = float(np.mean([common.share - seen_share(f, common.share, rms) for f in fringes]))
-        # What the pixels have in common is no less than how much they differ by.
+        # The common share is at least the scatter of the pixels' shares.
         share = float(np.clip(common.share + missed, rms, 0.5))
         pixels = min(int(f.good.sum()) for f in fringes)
         common = replace(common, share_error=float(np.hypot(common.share_error, rms / pixels**0.5)))

@@ -196,7 +196,7 @@ class _Polynomial:
 
     @property
     def size(self) -> dict[str, object]:
-        # A power that the flats do not tell is taken as zero, its error as large.
+        # A power that the flats do not constrain is taken as zero, its error as large.
         terms = (self.top_e / self.level_e) ** np.array([1, 2]) * (self.sizes != 0)
         error = float(np.sqrt(terms @ self.covariance @ terms))
         return _size(self.top_e, self.top_e * float(terms @ self.sizes), self.top_e * error)
@@ -214,7 +214,7 @@ def _polynomial(evidence: Evidence) -> _Polynomial | None:
     """From fringes or, without them, from what flats tell best."""
     level = _full_scale(evidence, Nonlinearity().level_e)
     levels, curve = ladder_response(evidence, level), _of_noise(evidence, level)
-    # Information on the bend alone: the ladder has a cubic term beside it.
+    # Information on the quadratic term alone: the ladder has a cubic term too.
     told = [0.0 if one is None else np.linalg.inv(one[1])[0, 0] for one in (levels, curve)]
     by_levels = told[0] > told[1]
     if evidence.fringes:

@@ -195,7 +195,7 @@ def _edges(rests: Sequence[F32], good: Mask, axis: int) -> tuple[list[tuple[int,
         found.append((edge, sigmas))
         if sigmas < SIGNIFICANT:
             break
-        # Steps that are cut are alike at several places, of which the first need not be the edge.
+        # Clipped steps are equal at several places, of which the first need not be the edge.
         for width, square in free.items():
             for middle in (at, edge):
                 square[max(middle - width, 0) : middle + width + 1] = 0

@@ -84,7 +84,7 @@ class RowNoise(Effect):
         rows = self.row_rms * rng.standard_normal(ny)
         columns = self.column_rms * rng.standard_normal(nx)
         rows += self.interlace_rms * rng.standard_normal() * (1 - 2 * (np.arange(ny) % 2))
-        # Last, so that without it the others are what they are with it.
+        # Last, so that the random numbers of the others do not depend on it.
         if self.flicker_rms:
             rows += self.flicker_rms * flicker(rng, ny)
         if self.alternate_rms:

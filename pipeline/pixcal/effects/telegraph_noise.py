@@ -262,7 +262,7 @@ def _of_stack(stack: Stack, evidence: Evidence) -> Series | None:
         return None
     spread = float(np.sqrt(np.median(rest.var(axis=0, ddof=1))))
     if spread**2 < (DITHER**2 + 1 / 12) * (evidence.gain * evidence.step_adu) ** 2:
-        # Of noise far below a step of the converter the shape is that of the steps.
+        # Noise far below a step of the converter has the shape of the steps.
         return None
     return Series(
         rest / spread, stack.frame, np.flatnonzero(pixels), spread,

@@ -1,8 +1,8 @@
-"""Charge that collected charge turns away from the pixels' boundaries into their neighbours.
+"""Charge that collected charge deflects across pixel boundaries into neighbours.
 
-Electrons in a pixel repel those that follow, so that the boundaries around it move inwards: by an
-amount in proportion to the charge, smaller with distance, along the line from the charge. Of the
-light that falls between the old and the new boundary the neighbour gets the charge. A charge that
+Electrons in a pixel repel those that follow, so that the boundaries around it move inwards, in
+proportion to the charge, less with distance, along the line from the charge. The neighbour collects
+the light that falls between the old and the new boundary. A charge that
 grows steadily through the exposure acts with half of its final value on average (Antilogus et al.
 2014, JINST 9 C03048; Guyonnet et al. 2015, A&A 575, A41; Astier et al. 2019, A&A 629, A36).
 
@@ -72,7 +72,7 @@ def _push(charge: Any, shifts: Any, wide: Any, right: Any, below: Any) -> None:
 
 
 def moved_charge(charge: F32, shifts: F64, along_y: float = 1.0) -> F32:
-    """What each pixel of a frame (y, x), or of frames (t, y, x), gains, e-; its sum is zero.
+    """Charge that each pixel of frames (y, x) or (t, y, x) gains, e-; its sum is zero.
 
     Within `REACH` of the first and last row it is right only if these are edges of the window.
 
@@ -141,7 +141,7 @@ def shared_noise(
 
 
 def _slopes(shifts: F64, dy: int, dx: int, axes: tuple[float, float]) -> F32:
-    """What a pixel gains through each of its boundaries by the charge of another.
+    """Charge that a pixel gains through each of its boundaries by the charge of another.
 
     Through those to the right, to the left, below and above: of each the factor of the two pixels'
     charge beside it, and that of its own shift, which the neighbour across it widens the flux of.
@@ -163,7 +163,7 @@ def _slopes(shifts: F64, dy: int, dx: int, axes: tuple[float, float]) -> F32:
 def _gain(
     q: Any, push_x: Any, push_y: Any, y: int, left: int, right: int, slopes: Any, out: Any
 ) -> None:
-    """Derivative of what pixels of a row gain by the charge of the one that the slopes are of."""
+    """Derivative of the gain of pixels of a row by the charge of the pixel of the slopes."""
     # Views, whose indices are never negative: only then is the loop vectorised.
     here, above, below = q[y, left:right], q[y - 1, left:right], q[y + 1, left:right]
     before, after = q[y, left - 1 : right - 1], q[y, left + 1 : right + 1]

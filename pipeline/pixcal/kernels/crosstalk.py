@@ -1,8 +1,8 @@
-"""Coupling between pixels: what a pixel gives to another it loses, so the total stays.
+"""Coupling between pixels: a pixel loses what it gives to another, so the total is conserved.
 
 Couplings are directed and sparse: the pixels of every n-th row and every m-th column give a share
-of their signal to the pixel so many rows and columns away. Nothing passes the edge of the window: a
-pixel whose partner lies beyond keeps its own (as at the edge of the chip).
+of their signal to the pixel at a fixed step. Nothing crosses the edge of the window: a pixel whose
+partner lies beyond keeps its own (as at the edge of the chip).
 
 A uniform light stays uniform only where every pixel gets what it gives; a kernel that differs from
 row to row leaves rows in a flat.
@@ -34,7 +34,7 @@ FILL_REACH = 16  # and how far it goes
 
 @dataclass(frozen=True)
 class Coupling:
-    """A share of the signal of some pixels that is read at others.
+    """A share of the signal of a class of pixels that is read at others.
 
     Rows and columns are counted from the window's first. The source loses what it gives.
     """
@@ -89,7 +89,7 @@ def _spans(size: int, first: int, every: int, at: int, step: int) -> tuple[slice
 
 @dataclass(frozen=True)
 class _Step:
-    """What sources give to the pixels so many rows and columns away."""
+    """Transfer from sources to the pixels at one step (rows and columns)."""
 
     # sources, receivers, and the share of all of these, or of each (y, x), of the samples' type
     parts: tuple[tuple[Place, Place, Any], ...]
@@ -114,7 +114,7 @@ def _steps(
             for here, _, value in parts:
                 share[here] = value
                 times[here] += 1
-            # Pixels that give several shares over one distance give them one after the other.
+            # Several shares of a pixel over one distance are given one after the other.
             if times.max(initial=0) == 1:
                 here, there = Coupling(dy, dx, 0.0).places(shape, first)
                 parts = [(here, there, share[here])]
@@ -154,7 +154,7 @@ def _move(out: NDArray[Any], step: _Step, moved: Sequence[NDArray[Any]]) -> None
 def couple_fringes(
     theta: F64, couplings: Sequence[Coupling], first: tuple[int, int] = (0, 0)
 ) -> F64:
-    """What becomes of the maps theta (3, y, x), e-, of a fit (physics note, section 5).
+    """Maps theta (3, y, x), e-, of a fit after the couplings (physics note, section 5).
 
     They are as collected: not divided by a flat. A share that changes with the signal is taken at
     frames of intensity and amplitude 1: the mean takes the mean of the squared signal, ``iota² +
@@ -188,7 +188,7 @@ def uncouple_fringes(
 
 
 def _inverse(data: F64, forward: Callable[[F64], F64]) -> F64:
-    """By fixed point: what is left over is given back."""
+    """Inverse by fixed-point iteration: the remainder is added back."""
     # Each step shrinks the rest by the shares that leave a pixel: for a tenth, some 15 steps to the
     # last digit.
     found = data.copy()
@@ -227,7 +227,7 @@ def largest_outflow(couplings: Sequence[Coupling]) -> float:
 def noise_shares(
     couplings: Sequence[Coupling], shape: tuple[int, int], first: tuple[int, int] = (0, 0)
 ) -> tuple[F64, F64]:
-    """Noise of a pixel read through the couplings, and after they are undone, both (y, x).
+    """Noise of a pixel read through the couplings, and after their correction, both (y, x).
 
     The first is the variance for shot noise of 1 in every pixel; the second that of read noise of 1
     after the inverse, to second order in the shares.

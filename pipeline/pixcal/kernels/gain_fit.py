@@ -1,15 +1,15 @@
-"""Gain from a photon-transfer curve that bends as far as its points show.
+"""Gain from a photon-transfer curve whose curvature is inferred from its points.
 
 Variance is ``offset + level (c_0 + c_1 u + c_2 u² + c_3 u³ + c_4 u⁴)``, with u the level over the
 highest one; the gain is ``1 / c_0``. A nonlinear response, or charge that neighbours share in
-proportion to the level, bends the curve. How far is not known beforehand: c_1 to c_4, relative to
-c_0, are normal numbers of a common size, and the size is zero or any below one. The average over
-the sizes, each with the weight of its evidence (MacKay 1992, *Neural Computation* 4, 415), is the
-gain; what remains unknown of the curve is in its error.
+proportion to the level, curves it by an unknown amount: c_1 to c_4, relative to c_0, are normal
+numbers of a common size, and the size is zero or any below one. The gain is the average over the
+sizes, each with the weight of its evidence (MacKay 1992, *Neural Computation* 4, 415); the
+remaining uncertainty of the curve is in its error.
 
 A camera that reads bright pixels with another amplifier (dual gain) has a step in the curve, which
-no such term takes. Points that leave the curve by far more than their noise are therefore fitted up
-to lower levels too, and the gain is that of the range that tells it best.
+no such term describes. Points that leave the curve by far more than their noise are therefore
+fitted up to lower levels too, and the gain is that of the best-determined range.
 """
 
 import math
@@ -21,14 +21,14 @@ from scipy.special import chdtrc
 
 from pixcal.model.arrays import F64
 
-LADDER = 4  # groups of flats from which the curve may bend
+LADDER = 4  # groups of flats from which the curve may be curved
 
-_TERMS = 4  # that bend the curve
-_STRAIGHT = 1e-6  # size of terms that are as good as zero
+_TERMS = 4  # terms of curvature
+_STRAIGHT = 1e-6  # size of terms that is effectively zero
 _SIZES = np.concatenate([[_STRAIGHT], np.geomspace(1e-3, 1.0, 13)])
 _CHANCES = np.concatenate([[0.5], np.full(13, 0.5 / 13)])
-_CURVED = 0.05  # chance of a straight line below which the curve bends
-# points more than terms, and range of levels, that tell a curve from points off a line
+_CURVED = 0.05  # probability of a straight line below which the curve is curved
+# points beyond the terms, and range of levels, that separate a curve from points off a line
 _SPARE, _RANGE = 3, 3.0
 _ITERATIONS = 5
 _OFF_CURVE = 1e-6  # chance of a misfit beyond which a curve may have a step
@@ -78,7 +78,7 @@ def fit_gain(
     sums : (N_BINS, 3) of `photon_transfer.WithNeighbours`
     read_variance : variance at level zero and its error, ADU²
     highest : highest level to use, ADU
-    level_error : by which all levels may be too high or too low, ADU: the bias wanders
+    level_error : common error of all levels, ADU, as the bias drifts
     uneven : spectral density at low frequency of the converter's deviation from its mean line,
         ADU³: with noise of sigma the local slope varies by rms ``sqrt(uneven / (4 sqrt(pi)
         sigma³))``, and the variance by twice that
@@ -143,7 +143,7 @@ def _fit_range(
         slope, expected = float(mean[1]), mean @ design
         if not slope > 0 or not mean[1:].sum() > 0:
             return None
-        # About the loosest curve: that they bend is no scatter.
+        # About the most flexible curve: curvature is no scatter.
         freedom = len(level) - np.array([np.trace(one[1] @ normal) for one in found])
         rest = weight @ (shot - found[-1][0] @ design) ** 2
         chi2 = max(1.0, float(rest / max(freedom[-1], 1)))

@@ -1,4 +1,4 @@
-"""Photon transfer: noise against level, from pairs of frames. `gain_fit` takes the gain from it.
+"""Photon transfer: noise against level, from pairs of frames. `gain_fit` fits the gain to it.
 
 The difference of two frames of the same scene holds no scene and no response map, only noise. Half
 its variance, in ADU, is ``level / gain + read_variance``. It is measured in blocks of pixels, whose
@@ -6,10 +6,10 @@ level may differ within the block: both sides of that equation are means over th
 pixel's mean and difference are uncorrelated for Poisson light (given the sum of two Poisson counts,
 the expected square of their difference is that sum), so structured light does not bias the slope.
 
-Charge that neighbours share lowers the variance of single pixels and raises the gain that comes
-out: in proportion to the signal with crosstalk (Moore, Ninkov & Forrest 2006), bending the curve
-with brighter-fatter. The noise is not lost: it stands in the covariances of neighbours, which are
-measured as far as `REACH` and added as far as they are likely.
+Charge that neighbours share lowers the variance of single pixels and raises the measured gain: in
+proportion to the signal with crosstalk (Moore, Ninkov & Forrest 2006), with a curved relation for
+brighter-fatter. The missing noise is in the covariances of neighbours, which are measured up to
+`REACH` and added with their posterior weight.
 """
 
 import math
@@ -37,12 +37,12 @@ LAGS = np.array(
 COLUMNS = 3 + len(LAGS)
 
 SHARED = 4.0  # errors beyond which neighbours share noise
-_EVERYWHERE = 0.5  # least covariance at any lag over the largest of noise that is not of neighbours
+_EVERYWHERE = 0.5  # least over largest covariance of lags above which noise is common to all pixels
 _SIZES = 12  # of covariances of neighbours that are tried
 # least share of a block's pixels, along each axis, that have a neighbour at a lag in it
 _PAIRED = 1 - REACH / BLOCK
 _CLIP = 5.0
-_MIN_PIXELS = 32  # fewer do not tell outliers from noise
+_MIN_PIXELS = 32  # fewest to separate outliers from noise
 
 
 @kernel(fastmath=FAST, error_model="numpy")
@@ -70,7 +70,7 @@ def _add_blocks(
                 a, b = one[x], two[x]
                 mean, d = np.float32(0.5) * (a + b), a - b
                 sigma = np.sqrt(max(mean, zero) * slope + floor)
-                # The median deviation of whole numbers may be nothing.
+                # The median deviation of integers may be zero.
                 limit = clip * np.sqrt((wide * sigma) ** 2 + step * step) + step
                 inside = abs(d - middle * sigma) <= limit
                 row[x], has[x] = d if inside else zero, inside
@@ -89,7 +89,7 @@ def _add_blocks(
             for i in range(BLOCK * width):
                 pairs += there[i] * are[i]
                 product += used[i] * others[i]
-            # The mean that was taken off is of the same pixels: it takes 1 / n of the variance.
+            # The subtracted mean is of the same pixels: it removes 1 / n of the variance.
             if pairs > 0:
                 out[block, 3 + lag] = np.float32(0.5) * product / pairs + variance / n
 
@@ -121,8 +121,8 @@ def pair_statistics(
     ----------
     first, second : (y, x) frames of the same scene, made equally bright, ADU above bias and dark;
         NaN is not used
-    gain, read_noise : rough guess, e-/ADU and ADU, only to tell outliers from noise where the level
-        changes within a block
+    gain, read_noise : rough guess, e-/ADU and ADU, only to separate outliers from noise where the
+        level changes within a block
     quantum : step of the samples, ADU
     """
     rows, columns = (-(-n // BLOCK) for n in first.shape)
@@ -149,13 +149,13 @@ def bin_pairs(blocks: F64) -> F64:
     dof, level, *_ = blocks.T
     bins = np.minimum(2 * np.sqrt(np.maximum(level, 0)), N_BINS - 1).astype(int)
     sums = (np.bincount(bins, w, N_BINS) for w in (dof, *(dof * v for v in blocks.T[1:])))
-    # Of no blocks numpy counts in whole numbers.
+    # Without blocks numpy counts in integers.
     return np.stack(list(sums), axis=1).astype(float)
 
 
 @dataclass(frozen=True)
 class WithNeighbours:
-    """Noise of pixels with that which they share with their neighbours."""
+    """Noise of pixels, covariances of neighbours included."""
 
     sums: F64  # (N_BINS, 3) degrees of freedom, level and variance, as of `bin_pairs`
     lags: dict[tuple[int, int], float] = field(default_factory=dict)  # (y, x), and significance
@@ -166,7 +166,7 @@ class WithNeighbours:
 
 @dataclass(frozen=True)
 class SharedNoise:
-    """What covariances of neighbours may be, over the shot noise, before they are measured.
+    """Prior of the covariances of neighbours over the shot noise.
 
     Normal numbers that fall off with a power of the distance. Their size is ``nothing``, by that
     chance, or any from the ``smallest``, or from the error if that is less, to the ``largest``.
@@ -180,14 +180,14 @@ class SharedNoise:
     own: float = 0.3
 
     def total(self, shares: F64, error: float) -> tuple[F64, float]:
-        """By how much each of the shares counts in the noise that all share, and its variance.
+        """Weight of each of the shares in the noise that all share, and its variance.
 
         ``shares``: covariances (12,) at `LAGS` over the shot noise, each with this error. The
         average over sizes and powers, each with the weight of its evidence, as of the gain
         (`gain_fit`).
         """
         count = len(LAGS)
-        # The mean that is taken off a block is of noise that is shared, and so larger.
+        # The mean subtracted from a block is of shared noise, and so larger.
         seen, twice = np.eye(count) - 2 / BLOCK**2, 2 * (1 + 1 / BLOCK**2)
         logs, weights, variances = [0.0], [np.zeros(count)], [0.0]
         sizes = np.geomspace(min(error, self.smallest), self.largest, _SIZES)
@@ -212,12 +212,12 @@ SHARED_NOISE = SharedNoise()
 
 
 def add_neighbours(lit: F64, dark: F64, expected: SharedNoise = SHARED_NOISE) -> WithNeighbours:
-    """Noise with that which neighbours share.
+    """Noise of pixels with the covariances of neighbours added.
 
     Covariances beyond those without light are added to the variance of the pixel itself, twice for
-    the two neighbours. Each is too noisy to be told by itself: all lags together say how much of
-    them is likely. The noise of what is added is in the degrees of freedom. Lags that count for
-    more than half come with their significance: one below `SHARED` may be there by chance. The lag
+    the two neighbours. Each is too noisy alone: all lags together give their posterior weights. The
+    noise of the added covariances is in the degrees of freedom. Lags that count for more than half
+    come with their significance: one below `SHARED` may be due to chance. The lag
     is (0, 0) alone where all pixels share noise. ``lit`` and ``dark`` are from `bin_pairs`, of
     flats and of frames without light.
     """

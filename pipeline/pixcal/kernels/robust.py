@@ -2,13 +2,13 @@
 
 The first batch (64 frames or fewer) gives each pixel's median and its noise from the median of the
 absolute deviations; samples further than ``clip`` sigmas are then left out of the running sums.
-What all pixels of a frame have in common (a shift of the bias, the power of a lamp) is taken out
-first, so that it neither widens the limits nor makes a whole frame an outlier, and its mean is put
-back at the end: where no sample is left out, the result is the plain mean.
+The common part of a frame (a shift of the bias, the power of a lamp) is removed first, so that it
+neither widens the limits nor makes a whole frame an outlier. Its mean is added back at the end:
+where no sample is excluded, the result is the plain mean.
 
 Bias of the clipping: on Gaussian noise the mean keeps its value, the variance is too small by
 `clipped_variance_factor` (0.1 % at 4 sigma, 1.5e-5 at 5), for which it is corrected. Limits are
-never closer than the usual noise of the tile asks for, since that of one pixel is known from few
+never closer than the usual noise of the tile requires, since that of one pixel is known from few
 samples only; below 4 sigmas the correction would be too large for that reason. An outlier beyond
 the limit has no weight; one just inside it moves the mean of n frames by ``clip / sqrt(n)`` of the
 mean's own noise.
@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F32, F64, Mask
 
-BATCH = 64  # frames that are looked at together
+BATCH = 64  # frames processed at a time
 _LEVEL_PIXELS = 4096
 _ROUNDING = np.float32(1e-6)
 SIGMA_OF_MAD = 1.482602218505602
-_BRIGHT, _LIT = 0.9, 0.1  # quantile of a tile that sees the lamp if any does; share of its signal
+_BRIGHT, _LIT = 0.9, 0.1  # quantile of a tile that is lit if any pixel is; share of its signal
 
 
 def clipped_variance_factor(clip: float) -> float:
@@ -194,7 +194,7 @@ def _add_frames(
 
 @dataclass(frozen=True)
 class Combined:
-    """What many frames of one scene say of each pixel; all (y, x) float64."""
+    """Statistics of each pixel over many frames of one scene; all (y, x) float64."""
 
     mean: F64  # of the samples within the limits; NaN where there is none
     # of one sample, unbiased, corrected for the clipping; NaN with fewer than two samples
@@ -211,7 +211,7 @@ class Combination:
     Parameters
     ----------
     clip : limit, sigmas
-    lamp : what frames have in common is a factor (a lamp's power); else an offset
+    lamp : whether the common part of a frame is a factor (a lamp's power); else an offset
     quantum : step of the samples, added to the limits, so that noise below it does not close them
     """
 
@@ -228,8 +228,8 @@ class Combination:
     def update(self, frames: F32) -> F32:
         """Add frames (t, y, x), NaN without sample; the first `BATCH` of them, or all, set limits.
 
-        Returns what each frame has in common with the first batch (t,), its factor or offset; NaN
-        for a frame without samples.
+        Returns the factor or offset (t,) of each frame relative to the first batch; NaN for a frame
+        without samples.
         """
         if self._reference is None:
             self._start(frames)
@@ -265,8 +265,8 @@ class Combination:
         return Combined(mean, variance, kurtosis, seen, n)
 
     def _start(self, frames: F32) -> None:
-        # Twice: the frames' common part, which some pixels tell, is taken out before the limits are
-        # measured for good.
+        # Twice: the frames' common part, measured in a sample of pixels, is removed before the
+        # final limits are measured.
         reference, deviation = median_and_deviation(_some(frames)[:, None])
         scale = SIGMA_OF_MAD * len(frames) / max(len(frames) - 0.8, 0.2)
         seen = lit(reference) if self._lamp else np.ones(reference.shape, np.bool_)
@@ -286,7 +286,7 @@ class Combination:
             sigma = np.full_like(sigma, self._sigma)
         sigma = np.maximum(sigma, np.float32(self._sigma))
         rounding = np.float32(self._quantum) + _ROUNDING * np.abs(self._reference)
-        # The median deviation of whole numbers may be nothing.
+        # The median deviation of integers may be zero.
         self._limit = np.float32(self._clip) * np.hypot(sigma, np.float32(self._quantum)) + rounding
         self._sums = np.zeros((6, *frames.shape[1:]))
 
@@ -304,7 +304,7 @@ class Combination:
 
 
 def lit(signal: NDArray[Any]) -> Mask:
-    """Pixels of a tile that see the lamp; those of an overscan do not."""
+    """Lit pixels of a tile; those of an overscan are not."""
     some = _some(signal[None])[0]
     finite = some[np.isfinite(some)]
     rank = int(_BRIGHT * finite.size)

@@ -13,7 +13,7 @@ _FAST = {"reassoc", "contract", "nsz", "arcp"}
 def calm_residuals(
     samples: F32, model: F32, shot: F32, read: F32, good: Mask, most: float, limits: F64
 ) -> tuple[F32, F32, F64, F64]:
-    """Residuals over their noise and as they are, and what else one sweep over them gives.
+    """Residuals with and without division by their noise, and sums from the same sweep.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def _calm_row(
     """Sum of the variances of a row, and how many residuals are to be counted."""
     zero, one = np.float32(0), np.float32(1)
     total = found = zero
-    # Choices instead of conditions that are joined: of these the compiler makes vectors.
+    # Selections instead of joined conditions, as the compiler vectorises them.
     for x in range(samples.size):
         rest = samples[x] - model[x]
         variance = shot[x] * max(model[x], zero) + read[x]
@@ -177,7 +177,7 @@ def _sum_frames(values: Any, good: Mask, sums: F64) -> None:
 
 
 def neighbour_products(values: F32, pairs: F32, steps: Indices, every: int = 1) -> F64:
-    """Sums (step, y) of the products of samples with those some steps on, by their first row.
+    """Sums (step, y) of the products of samples with those a step away, by their first row.
 
     ``pairs``: (step, y, x) weight of each pair, by the place of its first row and of its column
     that is further left; those beyond the edges are not looked at. ``steps``: (step, 2) rows down

@@ -1,4 +1,4 @@
-"""The freedom that free intensities leave, and how it is fixed.
+"""Gauge freedom of free intensities, and how it is fixed.
 
 The data do not change when theta -> Q theta and g -> Q^-T g (physics note, section 2). Of Q's nine
 numbers, four turn up in the phase map, as fringes at the fringe frequency and twice it: with

@@ -1,7 +1,7 @@
-"""Least squares of the modes that the data cannot tell from the bench, from the sums of tiles.
+"""Least squares of the modes that are degenerate with the bench, from the sums of tiles.
 
-Sums of each tile are taken by themselves and added in the order of the tiles, so that the result
-is the same however the work was shared out.
+Sums are made tile by tile and added in the order of the tiles, so that the result does not depend
+on how the work was distributed.
 """
 
 from dataclasses import dataclass

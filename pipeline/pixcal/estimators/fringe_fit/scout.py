@@ -36,14 +36,14 @@ Each = Callable[[Callable[[int], Any], Sequence[int]], list[Any]]
 
 # pixels that frames are solved with: their noise then adds some 2e-4 to a map's variance
 MAX_PIXELS = 20_000
-# of so many of these one is enough to start with: that only gives weights, and the point about
-# which a moving phase is linear
+# interval of these pixels for the start, which only gives weights, and the point about which a
+# moving phase is linearised
 FEW = 4
-MIN_FRAMES = 6  # three unknowns a pixel, and as many again to tell whether they fit
-# departure from the visibility of a tile's pixels, over the usual one, of a pixel not to learn
-# from; some 8 standard deviations
+MIN_FRAMES = 6  # three unknowns per pixel, and as many again to test the fit
+# departure from the visibility of a tile's pixels, over the usual one, above which a pixel is
+# excluded; some 8 standard deviations
 ODD_VISIBILITY = 12.0
-MANY = 3.0  # mean light over that of most pixels, or the reverse, of pixels not to learn from
+MANY = 3.0  # ratio of mean light to that of most pixels, or inverse, above which one is excluded
 # most of the usual distance of the pixels' phases from smooth ones; random ones have 1.57
 FOLLOWS_RAD = 0.8
 TURNS, TURNS_MOVING = 3, 8  # most turns of pixels from frames and frames from pixels

@@ -1,8 +1,8 @@
 """Planes through tiles' phases, and sums from which every shape of the fringes can be fitted.
 
-Whatever shape the fringes have over the window, over a tile it is a polynomial about its centre of
-low degree to far below the noise. Sums over pixels are taken once with these polynomials; every
-shape then is a matter of a few numbers a tile, and no map is read again to fit another.
+Over a tile, any shape of the fringes is a polynomial of low degree about its centre, to far below
+the noise. Sums over pixels are made once with these polynomials; every shape then needs a few
+numbers per tile, and no map is read again to fit another.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,9 +1,9 @@
-"""Offsets of a fit, after an effect that is linear in the intensity was undone on its three maps.
+"""Offsets of a fit, after its three maps were corrected for an effect linear in the intensity.
 
-The change of each pixel's phase is added to the phases that the fit left, and the modes that the
-data cannot tell from the bench are taken off again: the change holds them as well. Sums of pieces
-of the window add up, so a detector is done piece by piece: `phase_sums` of each, `solve_modes` of
-their sum, then `offsets` of each.
+The change of each pixel's phase is added to the fitted phases, and the modes that are degenerate
+with the bench are removed again, as the change contains them. Sums of pieces of the window add up,
+so a detector is corrected piece by piece: `phase_sums` of each, `solve_modes` of their sum, then
+`offsets` of each.
 """
 
 import numpy as np
@@ -56,7 +56,7 @@ def corrected_offsets(delta: F64, sigma: F64, change: F64, modes: F64, k: float)
     return offsets(modes, coefficients, delta, change, k)
 
 
-# What maps hold of frames that some pixels see otherwise than the fit takes them to be
+# Change of maps where frames differ, in some pixels, from those of the fit
 
 
 def usual_fringe(theta: F64, count: int) -> tuple[F64, F64]:
@@ -79,7 +79,7 @@ def imprint(theta: F64, g: F64, change: F64, read_noise_e: float) -> F64:
 
 
 def left_in_samples(theta: F64, g: F64, change: F64, read_noise_e: float) -> float:
-    """Mean square, over the samples' noise, of what maps do not take up; as of `imprint`."""
+    """Mean square, over the samples' noise, of what maps do not absorb; as in `imprint`."""
     _, usual = usual_fringe(theta, PHASES)
     weight = _weight(g @ usual, read_noise_e)
     taken = _taken(g, change, weight)
@@ -92,7 +92,7 @@ def _weight(signal: F64, read_noise_e: float) -> F64:
 
 
 def _taken(g: F64, change: F64, weight: F64) -> F64:
-    """What the fit of a pixel takes of the change: matrices (pixel, 3, 3) on its maps."""
+    """Part of the change that the fit of a pixel absorbs: matrices (pixel, 3, 3) on its maps."""
     normal = np.einsum("tp,ti,tj->pij", weight, g, g, optimize=True)
     right = np.einsum("tp,ti,tj->pij", weight, g, change, optimize=True)
     return np.linalg.solve(normal, right)

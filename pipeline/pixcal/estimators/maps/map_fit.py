@@ -1,8 +1,8 @@
-"""Terms fitted to the maps of several fringe sets at once, with errors that the maps show.
+"""Terms fitted to the maps of several fringe sets at once, with errors from the residuals.
 
-The noise of a map is what the fit leaves, true offsets included: its scatter gives the errors, and
-where what is left is alike in neighbouring pixels, blocks of pixels give larger ones. Blocks of
-several sizes are tried: the foundry's stitching moves whole fields of pixels alike.
+The noise of a map is the residual of the fit, true offsets included: its scatter gives the errors.
+Where residuals of neighbouring pixels are correlated, blocks of pixels give larger ones. Blocks of
+several sizes are tried, as the foundry's stitching moves whole fields of pixels together.
 """
 
 from collections.abc import Sequence
@@ -25,9 +25,9 @@ _MIN_VARIANCE = 1e-30  # variance of a map that its signals fit exactly
 
 @dataclass(frozen=True)
 class MapPart:
-    """One map as a fit sees it; over its good pixels."""
+    """One map as input of a fit; over its good pixels."""
 
-    signals: F64  # (pixel, n) what one unit of each parameter does to the map
+    signals: F64  # (pixel, n) change of the map by one unit of each parameter
     data: F64  # (pixel,)
     blocks: Indices  # (size, pixel) number of the block that a pixel lies in
     dof: int  # pixels less the terms and the fields that were taken off

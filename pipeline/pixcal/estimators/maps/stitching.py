@@ -1,9 +1,9 @@
-"""Fields of a detector whose masks the foundry laid side by side, each off by a little.
+"""Fields of a detector that the foundry stitched from masks with small misalignments.
 
-A field moves all its pixels alike: offsets have steps along a grid of rows and columns, which have
-a share in every smooth pattern. With the fields known, the offset of each is a free term of a fit.
-Lines are found one by one: the score test of a step of its own size in every field that a line
-would cut, smooth terms and the fields so far left free.
+A field displaces all its pixels equally: offsets have steps along a grid of rows and columns, which
+contribute to every smooth pattern. With the fields known, the offset of each is a free term of a
+fit. Lines are found one by one, by the score test of an independent step in every field that a line
+would cut, with smooth terms and the present fields free.
 """
 
 import math

@@ -13,7 +13,7 @@ from pixcal.kernels.robust import median_around, robust_sigma
 from pixcal.model.arrays import C128, F64, Indices, Mask
 
 DEGREE = 3  # of a smooth surface
-_BEYOND = 7  # degree up to which polynomials tell how red true offsets are
+_BEYOND = 7  # degree up to which polynomials measure how red true offsets are
 PERIODS = (2, 3, 4, 5, 6, 8)  # of rows and columns: those of readout circuits
 AROUND = 5  # pixels along the side of a pixel's surroundings
 _CLIP = 6.0
@@ -113,9 +113,8 @@ def redness(values: F64) -> float:
 class OffsetModel:
     """A model of true offsets: the part of a map that is kept, and the scatter of the rest."""
 
-    kept: F64  # (y, x) without bending, repeating rows and columns, and fringes; px
-    # (term, y, x) what was taken out: all that an effect of the bench or the readout would
-    # bring about
+    kept: F64  # (y, x) without curvature, repeating rows and columns, and fringes; px
+    # (term, y, x) removed terms: all that an effect of the bench or the readout could cause
     terms: F64
     # (term, term) root of the covariance of the coefficients of the terms, by chance, in offsets
     # such as those that were kept
@@ -124,7 +123,7 @@ class OffsetModel:
     rms: float  # and offsets are drawn with this rms, px
 
     def drawn(self, rng: np.random.Generator) -> F64:
-        """A map (y, x): kept as it was, and taken out as it may be by chance; px."""
+        """A map (y, x): the kept part, and a random draw of the removed terms; px."""
         size = self.scatter @ rng.standard_normal(len(self.scatter))
         drawn = self.kept + np.tensordot(size, self.terms, 1)
         drawn[self.unknown] += self.rms * rng.standard_normal(np.count_nonzero(self.unknown))
@@ -143,7 +142,7 @@ def _red_lines(values: F64) -> list[float]:
 
 @lru_cache(maxsize=4)
 def bench_patterns(shape: tuple[int, ...]) -> F64:
-    """What bench or readout may do to any map (term, y, x): bending, then repeating lines."""
+    """Effects of bench or readout on any map (term, y, x): curvature, then repeating lines."""
     lines = []
     for axis in (0, 1):
         place = np.expand_dims(np.arange(shape[axis]), 1 - axis)
