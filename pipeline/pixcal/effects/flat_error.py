@@ -217,7 +217,7 @@ def ring_power(power: F64) -> Ring:
     white = np.full(power.size, 1 / power.size)
     data = power.ravel()
     fits = [np.linalg.lstsq(np.stack([white, t], axis=1), data, rcond=None)[0] for t in templates]
-    # Waves that take power away are none.
+    # Waves with negative power are excluded.
     both = zip(fits, templates, strict=True)
     left = [np.sum((data - c[0] * white - max(c[1], 0.0) * t) ** 2) for c, t in both]
     best = int(np.clip(np.argmin(left), 1, len(scales) - 2))
@@ -240,7 +240,7 @@ def ring_power(power: F64) -> Ring:
     # Of the variance that there should be, and that may well be the larger.
     draws = min(float(np.sqrt(2 / modes)), 0.75)
     error = float(np.hypot(noise, variance * draws / (1 - draws)))
-    # Of longer waves a parabola takes more.
+    # A parabola absorbs more of longer waves.
     places = np.clip([best - width / STEP, best + width / STEP], 0, len(scales) - 1)
     ends = [_sum_of_ring(data, templates[int(n)])[0] for n in np.rint(places)]
     error = float(np.hypot(error, np.mean(np.abs(np.array(ends) - variance))))

@@ -123,7 +123,7 @@ def shot_share_of_flats(evidence: Evidence) -> tuple[float, float] | None:
         return pooled
     response = ladder_response(evidence, curve.top)
     straight = None if response is None else _straightened(curve, *response)
-    # Levels of a lamp that was changed in between tell less of the response than the noise does.
+    # Levels of a lamp that was changed constrain the response less than noise does.
     if straight is not None and straight[1] < curve.error:
         return straight
     curved = abs(curve.slope) > _CURVED * curve.slope_error
