@@ -217,7 +217,7 @@ def ring_power(power: F64) -> Ring:
     white = np.full(power.size, 1 / power.size)
     data = power.ravel()
     fits = [np.linalg.lstsq(np.stack([white, t], axis=1), data, rcond=None)[0] for t in templates]
-    # Waves with negative power are excluded.
+    # Waves with negative power count as zero.
     both = zip(fits, templates, strict=True)
     left = [np.sum((data - c[0] * white - max(c[1], 0.0) * t) ** 2) for c, t in both]
     best = int(np.clip(np.argmin(left), 1, len(scales) - 2))
