@@ -1,1 +1,1 @@
-"""The bench in software: what is recorded, and the steps from light to samples."""
+"""The simulated bench: recordings, and the steps from light to samples."""

@@ -1,8 +1,8 @@
 """Deviations of an acquisition from the nominal bench, and how forward models change them.
 
-A change is the difference between frames that are taken again with a model and without. What two
-draws of all that is random have in common is none of it: half their difference is kept beside the
-mean, so that sums of squares are free of what chance adds to them.
+A change is the difference between frames simulated with and without a model. Two draws of
+everything random are made. Their mean estimates the change; half their difference is kept too, so
+that the contribution of chance can be subtracted from sums of squares.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,14 +25,14 @@ from pixcal.simulation.deviations import (
 from pixcal.simulation.forward import ForwardModel, Stage
 from pixcal.simulation.replica import Replica
 
-Key = tuple[str | int, str]  # fringe set or number of a stack, and which of its deviations
+Key = tuple[str | int, str]  # fringe set or number of a stack, and name of its deviation
 Draw = dict[Key, NDArray[Any]]
 
 SEEDS = (1, 2)
-SCATTER_SEEDS = range(3, 11)  # of draws by which it is told how much one differs from another
-FRAMES = 4  # calibration frames of an exposure time that are looked at
-MIXED = 64  # frames of a recording on which a model's hold on the noise is looked at
-COMMON = 0.5  # share of a change that two draws have in common where it is none of chance
+SCATTER_SEEDS = range(3, 11)  # seeds of the draws that measure the scatter of a change
+FRAMES = 4  # calibration frames of an exposure time that are used
+MIXED = 64  # frames of a recording that test how a model changes the noise
+COMMON = 0.5  # least share common to two draws of a change that is not random
 LINEAR = ("residual", "frames", "maps")
 
 
@@ -40,33 +40,33 @@ LINEAR = ("residual", "frames", "maps")
 class Way:
     """How a model shows."""
 
-    random: bool  # its change is another one with other random numbers, and zero on average
-    mixes: bool  # it makes the noise of samples correlated
+    random: bool  # its change depends on the random numbers, and is zero on average
+    mixes: bool  # it correlates the noise of samples
     keys: tuple[Key, ...]  # deviations that it changes
 
 
 @dataclass(frozen=True)
 class Template:
-    """Change of deviations: mean of two draws, and half their difference where they differ."""
+    """Change of deviations: mean of two draws, and half their difference if they differ."""
 
     mean: Mapping[Key, NDArray[Any]]
     half: Mapping[Key, NDArray[Any]]
 
     @classmethod
     def of(cls, one: Draw, other: Draw) -> "Template":
-        """Of two draws; values that both share are none of chance."""
+        """From two draws; identical values are not random."""
         drawn = [k for k in one if one[k] is not other[k]]
         mean = {k: (one[k] + other[k]) / 2 if k in drawn else one[k] for k in one}
         return cls(mean, {k: (one[k] - other[k]) / 2 for k in drawn})
 
     def only(self, keys: Sequence[Key]) -> "Template":
-        """Of some deviations."""
+        """The template of given deviations."""
         return Template(
             *({k: v for k, v in d.items() if k in keys} for d in (self.mean, self.half))
         )
 
     def slope(self, other: "Template", step: float) -> "Template":
-        """Derivative, from this one and that after a step of a parameter."""
+        """Derivative, from this template and ``other``, after a step of a parameter."""
         return Template(
             {k: (v - self.mean[k]) / step for k, v in other.mean.items()},
             {k: (v - self.half[k]) / step for k, v in other.half.items()},
@@ -74,7 +74,7 @@ class Template:
 
 
 class Changes:
-    """Deviations of some evidence, and what forward models make of them."""
+    """Deviations of evidence, and their changes by forward models."""
 
     def __init__(self, evidence: Evidence) -> None:
         self._evidence, self._replica = evidence, Replica(evidence)
@@ -97,7 +97,7 @@ class Changes:
     def product(
         self, keys: Sequence[Key], a: Mapping[Key, NDArray[Any]], b: Mapping[Key, NDArray[Any]]
     ) -> float:
-        """Sum of products of changes over their noise; that of maps is common to them in part."""
+        """Sum of products of changes over their noise, which is correlated between maps."""
         maps = tuple(k for k in keys if k[1] == "maps")
         total = sum(dot(self.measured(k).weight, a[k], b[k]) for k in keys if k not in maps)
         if maps:
@@ -107,7 +107,7 @@ class Changes:
         return total
 
     def _precision(self, maps: tuple[Key, ...]) -> tuple[F64, Mask]:
-        """Inverse covariance of maps, and the pixels that all of them have."""
+        """Inverse covariance of maps, and the pixels common to all of them."""
         if maps not in self._precisions:
             measured = [self.measured(key) for key in maps]
             value, weight = (
@@ -118,7 +118,7 @@ class Changes:
         return self._precisions[maps]
 
     def fits(self, template: Template) -> bool:
-        """Whether a template is of deviations as they are here."""
+        """Whether a template matches these deviations in keys and shapes."""
         return all(
             of in self._looks and self.measured((of, name)).value.shape == value.shape
             for (of, name), value in template.mean.items()
@@ -143,12 +143,12 @@ class Changes:
         return Way(random, mixes, tuple(dict.fromkeys([*keys, *(pairs if mixes else ())])))
 
     def _repeats(self, one: Draw, other: Draw) -> bool:
-        """Whether two draws of a change have most of it in common."""
+        """Whether most of a change is common to two draws."""
         keys = tuple(one)
         return self.product(keys, one, other) > COMMON * self.product(keys, one, one)
 
     def template(self, model: ForwardModel, way: Way) -> Template:
-        """Change by a model that shows in some way."""
+        """Change of deviations by a model, given how it shows."""
         linear = [key for key in way.keys if key[1] in LINEAR]
         pairs = [key for key in way.keys if key[1] == "pairs"]
         one = other = self._linear(model, SEEDS[0], linear)
@@ -161,7 +161,7 @@ class Changes:
         return Template.of(one, other)
 
     def scatter(self, model: ForwardModel, way: Way, template: Template) -> float:
-        """Relative rms of the second moments that single draws of a random model add."""
+        """Relative rms scatter of the second moments that single draws of a random model add."""
         total = {k: self.measured(k).weight * template.mean[k] for k in way.keys}
         sizes = []
         for seed in SCATTER_SEEDS:
@@ -208,7 +208,7 @@ class Changes:
         return found
 
     def _second_moments(self, model: ForwardModel, seed: int, keys: Sequence[Key]) -> Draw:
-        """What a random change adds to quadratic deviations."""
+        """Contribution of a random change to quadratic deviations."""
         needed = [(of, "residual" if name == "pairs" else "frames") for of, name in keys]
         change = self._linear(model, seed, needed)
         return {
@@ -217,7 +217,7 @@ class Changes:
         }
 
     def _mixed(self, model: ForwardModel, seed: int, keys: Iterable[Key]) -> Draw:
-        """Change of quadratic deviations since the model acts on the noise of samples."""
+        """Change of quadratic deviations by the action of the model on the noise of samples."""
         found: Draw = {}
         for of, name in keys:
             noise = self._replica.taken(of, noise=True, seed=seed, most=MIXED)
@@ -233,6 +233,6 @@ def _named(of: str | int, change: Change) -> Draw:
 
 
 def dot(weight: NDArray[Any], a: NDArray[Any], b: NDArray[Any]) -> float:
-    """Weighted sum of products: of each row in the arrays' type, of the rows in float64."""
+    """Weighted sum of products: within rows in the arrays' type, over rows in float64."""
     rows = (v.reshape(len(v), -1) for v in (weight, a, b))
     return float(np.einsum("tn,tn,tn->t", *rows).sum(dtype=float))

@@ -1,9 +1,9 @@
-"""How frames differ from those of the nominal bench, and what a change of the samples makes of it.
+"""Deviations of frames from the nominal bench, and how they change with the samples.
 
-Of a fringe set: residuals, parameters of the frames, maps of the pixels, and second moments of the
-first two. Of calibration frames: change in time, mean, second moments. All are zero on the nominal
-bench, but for known noise and the scatter of pixels. A change of the samples changes the first
-three linearly, with all that the fit absorbs taken off.
+For a fringe set: residuals, parameters of the frames, maps of the pixels, and second moments of the
+first two. For calibration frames: change in time, mean, second moments. All are zero on the nominal
+bench, except for known noise and the scatter of pixels. A change of the samples changes the first
+three linearly, less the part that the fit absorbs.
 """
 
 from collections.abc import Sequence
@@ -30,33 +30,33 @@ from pixcal.estimators.test_statistics.look import Look, neighbour_sums
 from pixcal.kernels.robust import SIGMA_OF_MAD, robust_sigma
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
-# of the smooth surface that maps of the nominal bench may have
+# degree of the smooth surfaces that maps of the nominal bench may contain
 DEGREES = {"offset": 3, "contrast": 2, "light": 3}
 MAPS = tuple(DEGREES)
-WILD_STEP = 5.0  # robust deviations from which a step between neighbours is an outlier
-AROUND = 5  # pixels along the side of a pixel's surroundings
-# share of the changes of pixels by which they may differ from those of their surroundings
+WILD_STEP = 5.0  # robust deviations above which a step between neighbours is an outlier
+AROUND = 5  # side (pixels) of a pixel's surroundings
+# share of the pixels' changes by which they may differ from those of their surroundings
 ALONE = 0.5
-WILD = 8.0  # standard deviations beyond which a residual is an outlier
-HARMONICS = 2  # of the phase, with which parameters of the frames may go for reasons of the fit
-KNOWN = 0.02  # relative error of the variance that the noise model gives to parameters of a frame
+WILD = 8.0  # standard deviations above which a residual is an outlier
+HARMONICS = 2  # harmonics of the phase on which fitted frame parameters may depend
+KNOWN = 0.02  # relative error of the modelled variance of a frame's parameters
 
 Change = dict[str, NDArray[Any]]
-# rows and columns to neighbours in other rows and other columns
+# offsets (rows, columns) to neighbours in other rows and columns
 DIAGONAL = ((1, 1), (1, -1), (1, 2), (1, -2), (2, 1), (2, -1))
 FRAMES_APART = (1, 2, 3, 4)
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """Values that differ from what is nominal, and one over their variance."""
+    """Differences from nominal values, and inverse variances."""
 
     value: NDArray[Any]
     weight: NDArray[Any]
 
 
 def weighed(maps: F64) -> Deviation:
-    """Maps less their smooth surfaces, weighed by what neighbours differ by; NaN by nothing."""
+    """Maps less their smooth surfaces, weighted by differences of neighbours; NaN: weight 0."""
     flat, weight = without_smooth(maps), np.zeros(maps.shape)
     for own, out in zip(maps, weight, strict=True):
         steps = np.diff(own, axis=1)
@@ -69,7 +69,7 @@ def weighed(maps: F64) -> Deviation:
 def common_precision(maps: F64) -> F64:
     """Inverse covariance (m, m) of the noise of maps (m, y, x) of the same pixels.
 
-    By the steps between neighbours along both axes, without those beyond `WILD_STEP` deviations.
+    From steps between neighbours along both axes, without outliers (`WILD_STEP`).
     """
     steps = np.concatenate([np.diff(maps, axis=a).reshape(len(maps), -1) for a in (1, 2)], axis=1)
     steps = steps[:, np.isfinite(steps).all(axis=0)]
@@ -82,19 +82,19 @@ def common_precision(maps: F64) -> F64:
 
 
 def is_smooth(maps: F64, weight: F64) -> bool:
-    """Whether maps (m, y, x) change from pixel to pixel by less than they do at large."""
+    """Whether maps (m, y, x) change less from pixel to pixel than at large scales."""
     around = np.stack([median_filter(own, AROUND, mode="reflect") for own in maps])
     rough, whole = (float((weight * v**2).sum()) for v in (maps - around, maps))
     return rough <= ALONE**2 * whole
 
 
 def change_of_maps(maps: F64, measured: Deviation) -> F64:
-    """Change of maps less smooth surfaces, on the pixels that were measured."""
+    """Change of maps less smooth surfaces, on the measured pixels."""
     return without_smooth(np.where(measured.weight > 0, maps, np.nan))
 
 
 def without_smooth(maps: F64) -> F64:
-    """Maps less their smooth surfaces; zero where there are none."""
+    """Maps less their smooth surfaces; zero where maps are undefined."""
     degrees = [DEGREES[name] for name in MAPS] if len(maps) == len(MAPS) else [DEGREES["light"]]
     return np.nan_to_num(
         np.stack([flattened(own, degree) for own, degree in zip(maps, degrees, strict=True)])
@@ -102,7 +102,7 @@ def without_smooth(maps: F64) -> F64:
 
 
 class _Deviations:
-    """What fringes and calibration frames have in common."""
+    """Common part of fringes and calibration frames."""
 
     linear: tuple[str, ...]
     quadratic: tuple[str, ...]
@@ -120,7 +120,7 @@ class _Deviations:
         return np.asarray(np.sqrt(self.residual.weight))
 
     def over_noise(self, rest: F32) -> F32:
-        """Residuals (t, n) of the first frames over their noise, as frames; zero without weight."""
+        """Residuals (t, n) of the first frames over their noise, as (t, y, x); 0 without weight."""
         values = np.zeros((len(rest), *self.good.shape), np.float32)
         values[:, self.good] = rest * self._root[: len(rest)]
         return values
@@ -132,7 +132,7 @@ class _Deviations:
         return Deviation(pair_sums(values, self.good) - taken, _inverse(variance))
 
     def pairs_between(self, noise: F32, other: F32, per_adu: F32) -> F64:
-        """Change of ``pairs`` where noise (t, y, x) of the first frames, ADU, becomes another.
+        """Change of ``pairs`` if noise (t, y, x) of the first frames, ADU, becomes ``other``.
 
         An ADU is ``per_adu`` (y, x) reduced electrons.
         """
@@ -143,12 +143,12 @@ class _Deviations:
         return np.asarray((after - before) * len(self._root) / len(noise))
 
     def second_moments(self, name: str, change: NDArray[Any]) -> F64:
-        """What a random change of the residuals adds to ``pairs``."""
+        """Contribution of a random change of the residuals to ``pairs``."""
         return pair_sums(self.over_noise(change), self.good)
 
 
 class SetDeviations(_Deviations):
-    """A fringe set against the nominal bench."""
+    """Deviations of a fringe set from the nominal bench."""
 
     linear = ("residual", "frames", "maps")
     quadratic = ("pairs", "power")
@@ -161,12 +161,12 @@ class SetDeviations(_Deviations):
 
     @cached_property
     def freedom(self) -> Freedom:
-        """Of the fit."""
+        """Degrees of freedom of the fit."""
         return Freedom(self.found)
 
     @cached_property
     def residual(self) -> Deviation:
-        """What the fit leaves of the samples (t, n) of good pixels, e-."""
+        """Residuals (t, n) of the fit in good pixels, e-."""
         freedom = self.freedom
         rest = freedom.left_over(freedom.of_good(self.found.residual))
         weight = np.where(rest**2 * freedom.weight < WILD**2, freedom.weight, np.float32(0))
@@ -174,7 +174,7 @@ class SetDeviations(_Deviations):
 
     @cached_property
     def frames(self) -> Deviation:
-        """Parameters (4, t) of the frames; their noise by samples or, if larger, by steps."""
+        """Parameters (4, t) of the frames; noise from samples or, if larger, from steps."""
         series = self._series(self.found.free)
         steps = np.diff(series, axis=1)
         spread = (SIGMA_OF_MAD * np.median(np.abs(steps), axis=1, keepdims=True)) ** 2 / 2
@@ -204,7 +204,7 @@ class SetDeviations(_Deviations):
 
     @cached_property
     def _frame_noise(self) -> F64:
-        """Of the series (4, t), from the noise of the samples."""
+        """Noise of the series (4, t), from the noise of the samples."""
         found, nothing = self.found, np.zeros(len(self.found.g))
         b, a_cos, a_sin = found.g.T
         size = a_cos**2 + a_sin**2
@@ -233,10 +233,10 @@ class SetDeviations(_Deviations):
     def change(
         self, samples: F32, constant: F64, relative: F64, names: Sequence[str] = linear
     ) -> Change:
-        """What a change of the samples does to the linear deviations.
+        """Change of the linear deviations by a change of the samples.
 
-        ``samples``: (t, y, x) e-, as reduced. ``constant, relative``: (y, x) what bias and darks
-        that changed with them take off every frame, e-; and by how much the flats did, relative.
+        ``samples``: (t, y, x) reduced, e-. ``constant, relative``: (y, x) simultaneous change of
+        bias and darks, subtracted from every frame, e-; and relative change of the flats.
         """
         found, good = self.found, self.good
         changed = np.take(samples.reshape(len(samples), -1), np.flatnonzero(good), axis=1)
@@ -245,7 +245,7 @@ class SetDeviations(_Deviations):
         if "residual" in names:
             change["residual"] = self.freedom.left_over(changed)
         if "frames" in names:
-            # What is left once the pixels have taken their part.
+            # Residual change after the fit of the pixels.
             beside = found.model.copy()
             beside[:, good] += changed - found.g.astype(np.float32) @ share
             (free, _), *_ = free_frames(
@@ -272,14 +272,14 @@ class SetDeviations(_Deviations):
         return change_of_maps(out, self.maps)
 
     def second_moments(self, name: str, change: NDArray[Any]) -> F64:
-        """What a random change of residuals adds to ``pairs``, of frames to ``power``."""
+        """Contribution of a random change: of residuals to ``pairs``, of frames to ``power``."""
         if name == "power":
             return band_power(change / self._frame_noise)
         return super().second_moments(name, change)
 
 
 class StackDeviations(_Deviations):
-    """Calibration frames of one kind and exposure time against the nominal bench."""
+    """Deviations of calibration frames of one kind and exposure time."""
 
     linear = ("residual", "maps")
     quadratic = ("pairs",)
@@ -314,11 +314,11 @@ class StackDeviations(_Deviations):
         return self._pairs(nowhere, np.zeros((1, 1)), same)
 
     def pairs_between(self, noise: F32, other: F32, per_adu: F32) -> F64:
-        """As of `SetDeviations`, in ADU."""
+        """As in `SetDeviations`, in ADU."""
         return super().pairs_between(noise, other, np.ones_like(per_adu))
 
     def change(self, samples: F32, bias: F64, names: Sequence[str] = linear) -> Change:
-        """As of `SetDeviations`, ADU; the bias changed with them."""
+        """As in `SetDeviations`, in ADU; ``bias``: its simultaneous change."""
         changed = samples[:, self.good]
         change: Change = {}
         if "residual" in names:
@@ -331,7 +331,7 @@ class StackDeviations(_Deviations):
 
 
 def band_power(series: F64, *, squares: bool = True) -> F64:
-    """Sums of squares (s, band) of cosine modes of series (s, t) in octaves, or their number."""
+    """Sums of squares (s, band) of cosine modes of series (s, t) per octave, or mode counts."""
     power = dct(series, norm="ortho", axis=1)[:, 1:] ** 2 if squares else series[:, 1:]
     return np.asarray(np.add.reduceat(power, _octaves(power.shape[1]), axis=1))
 
@@ -352,8 +352,8 @@ def pair_sums(values: F32, good: Mask) -> F64:
     """Sums (n,) over frames of products of two residuals (t, y, x) over their noise.
 
     Pairs of columns within rows, of rows within columns, of column sums and of row sums (of
-    different rows and columns), neighbours of `DIAGONAL`, samples of `FRAMES_APART`. Values are
-    zero where there is no weight.
+    different rows and columns), neighbours of `DIAGONAL`, samples of `FRAMES_APART`. Values
+    without weight are zero.
     """
     count, ny, nx = values.shape
     rows = values.reshape(-1, nx)
@@ -377,7 +377,7 @@ def pair_variance(frames: int, good: Mask) -> F64:
     there = good.astype(float)
     in_rows, in_columns = there.T @ there, there @ there.T
     columns, rows = there.sum(axis=0), there.sum(axis=1)
-    # A pair of two rows of one column is met twice.
+    # A pair of two rows of one column is counted twice.
     of_columns = np.outer(columns, columns) - in_rows
     of_rows = np.outer(rows, rows) - in_columns
     of_columns[np.diag_indices(len(columns))] *= 2
@@ -388,11 +388,11 @@ def pair_variance(frames: int, good: Mask) -> F64:
 
 
 def taken_by_fit(place: F32, covariance: F64, of_time: F32, good: Mask) -> F64:
-    """What the freedom of frames and pixels leaves of `pair_sums` of independent samples.
+    """Expected `pair_sums` of independent samples after the fit of frames and pixels.
 
-    place : (j, n) functions of place that a frame is free to have, over the noise of good pixels
-    covariance : (j, j) of their shares in a frame: mean over the frames
-    of_time : (k, t) orthonormal functions of time that a pixel is free to have
+    place : (j, n) functions of place fitted to each frame, over the noise of good pixels
+    covariance : (j, j) of their coefficients in a frame: mean over the frames
+    of_time : (k, t) orthonormal functions of time fitted to each pixel
     """
     count, shape = of_time.shape[1], good.shape
     size, axes = np.linalg.eigh(covariance)

@@ -1,8 +1,8 @@
-"""What an effect of the bench or the detector is: a forward model, and what follows from it.
+"""An effect of the bench or the detector: a forward model with estimation and correction.
 
-An effect acts on the frames of a simulation (`pixcal.simulation.forward`). From that alone its
-parameters are learnt from an acquisition (`pixcal.simulation.score`). It may also say what it does
-to the maps of a fit, and how that is undone.
+An effect acts on the frames of a simulation (`pixcal.simulation.forward`). This suffices to
+estimate its parameters from an acquisition (`pixcal.simulation.score`). It may also define its
+action on the maps of a fit, and the inverse.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ from pixcal.simulation.score import score, score_again
 __all__ = ["DOMAINS", "SETS_DISAGREE", "Effect", "Estimate", "FringeMaps", "LightStart", "Stage"]
 
 SETS_DISAGREE = "fringe sets disagree: an effect of the detector acts on all of them alike"
-NONZERO = 3.0  # errors from which a strength of an effect counts as different from zero
+NONZERO = 3.0  # sigma above which a strength of an effect counts as different from zero
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,8 @@ class FittedFrames:
     """The frames that maps were fitted to, for effects that depend on their order."""
 
     g: F64  # (t, 3) intensity, and amplitude times cosine and sine of the phase
-    # first and number of the rows that effects along rows extend over: those of the window or,
-    # where a part is simulated by itself, of the part
+    # first and number of the rows over which effects along rows extend: those of the window or, if
+    # only a part is simulated, of the part
     rows: tuple[int, int]
     read_noise_e: float
     exptime_s: float
@@ -45,7 +45,7 @@ class FittedFrames:
 
 @dataclass(frozen=True)
 class FringeMaps:
-    """What a fit finds of one fringe set, for effects that are linear in the intensity.
+    """Fitted maps of one fringe set, for effects that are linear in the intensity.
 
     Attributes
     ----------
@@ -56,8 +56,8 @@ class FringeMaps:
     origin : (int, int)
         First row and column of these maps in the detector's window.
     flat : (y, x) float64, optional
-        Relative response as flats show it, which samples were divided by; None without flats. An
-        effect that acts on flats as well changes it.
+        Relative response from flats, by which samples were divided; None without flats. An effect
+        that also acts on flats changes it.
     name : str
         Of the fringe set.
     frames : FittedFrames, optional
@@ -71,7 +71,7 @@ class FringeMaps:
     frames: FittedFrames | None = None
 
     def turned(self, phase: F64) -> "FringeMaps":
-        """The same with the phase (y, x) moved, rad; where that is NaN it stays."""
+        """The maps with the phase shifted by (y, x) rad; no shift where that is NaN."""
         iota, sine, cosine = self.theta
         z = (cosine + 1j * sine) * np.exp(1j * np.nan_to_num(phase))
         return dataclasses.replace(self, theta=np.stack([iota, z.imag, z.real]))
@@ -79,7 +79,7 @@ class FringeMaps:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Parameters of an effect, learnt from an acquisition.
+    """Parameters of an effect, estimated from an acquisition.
 
     Attributes
     ----------
@@ -88,28 +88,28 @@ class Estimate:
     errors : mapping
         1-sigma errors of the parameters that were fitted, by field name (``couplings[0].share``).
     significance : float
-        How far from no effect at all, in standard deviations of chance.
+        Deviation from no effect, in sigma.
     why : str
-        One sentence: which frames and which statistic told.
+        One sentence: the frames and the statistic that show it.
     details : mapping
-        Numbers by which several ways of measuring can be compared.
+        Numbers to compare different methods of measurement.
     together : tuple of mapping
-        Steps of several parameters at once, of independent errors of one sigma, where the errors
-        hang together; otherwise each parameter has an error of its own.
+        Joint 1-sigma steps of several parameters, independent of one another, if errors are
+        correlated; otherwise the errors of the parameters are independent.
     law : str
-        The best of the mechanism's laws, in words; empty where the effect is its own law.
+        The best-fitting law of the mechanism, in words; empty if the effect is itself a law.
     by_law : Effect, optional
-        The effect as that law has it.
+        The effect by that law.
     again : Again, optional
-        A shorter way to find just this effect in other frames.
+        A faster way to detect this effect in other frames.
     in_full : Effect, optional
-        The effect with everything that was measured of it, significant or not; None where that is
-        the effect itself.
+        The effect with all measured parameters, significant or not; None if that is the effect
+        itself.
     refused : str
         Why it cannot be a cause, however significant.
     size : mapping
-        The size where the strengths do not say it: ``value``, ``error``, ``unit`` (empty for a
-        ratio), and what it is ``of``, in words that follow the number.
+        The size if the strengths do not give it: ``value``, ``error``, ``unit`` (empty for a
+        ratio), and ``of``, the words that follow the number.
     """
 
     effect: "Effect"
@@ -129,7 +129,7 @@ class Estimate:
     def sure(self) -> "Effect":
         """The effect without strengths and optional parameters that are consistent with zero.
 
-        What is known badly may be tiny in some frames and wild in others.
+        Poorly known parameters may be tiny in some frames and extreme in others.
         """
         nothing = self.effect.scaled(0.0)
         unsure = {n: getattr(nothing, n) for n in self.effect.strengths if not self._is_sure(n)}
@@ -138,9 +138,9 @@ class Estimate:
         return self.effect if pruned.is_null else pruned
 
     def scattered(self, effect: "Effect", seed: int) -> "Effect":
-        """The effect, as it is or in part, with its parameters moved by their errors.
+        """The effect, or a part of it, with its parameters drawn within their errors.
 
-        What is zero in it stays so; beyond the range of a parameter nothing is moved.
+        Zeros stay zero; if a parameter would leave its range, none is moved.
         """
         rng = np.random.default_rng([seed, zlib.crc32(effect.name.encode())])
         values = numbers(effect)
@@ -169,17 +169,17 @@ class Effect(ForwardModel):
     Attributes
     ----------
     absorbed_because : str
-        How the fit absorbs it; empty where it does not.
+        How the fit absorbs it; empty if it does not.
     left_because : str
-        Why maps need no correction for it all the same: it is noise, or small.
+        Why maps still need no correction for it: it is noise, or small.
     remedy : str
-        What to do about it on a detector without fringes; empty where it shows in fringes alone.
+        What to do about it on a detector without fringes; empty if it shows only in fringes.
     is_gain : bool
-        Whether it scales all samples alike, as photon transfer measures.
+        Whether it scales all samples alike, which photon transfer measures.
     fit_model : str
-        Shape of the fringes (`pixcal.estimators.fringe_fit.models`) that takes it up.
+        Shape of the fringes (`pixcal.estimators.fringe_fit.models`) that absorbs it.
     smooth_degree : int
-        Of surfaces that the maps have for other reasons, where ``starts`` are given.
+        Degree of the surfaces that maps have for other reasons; used with ``starts``.
     """
 
     absorbed_because: ClassVar[str] = ""
@@ -189,15 +189,14 @@ class Effect(ForwardModel):
     fit_model: ClassVar[str] = ""
     smooth_degree: ClassVar[int] = 3
 
-    # What is learnt of it, and what becomes of the maps.
+    # Its estimation, and its action on maps.
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Parameters and errors from an acquisition; None where it holds no evidence of it.
+        """Parameters and errors from an acquisition; None without evidence of it.
 
-        By the forward model alone, unless an effect knows a better way: from the series of the
-        frames where it acts on whole frames, from the maps where it gives ``starts``, else from
-        frames that are taken again.
+        Uses the forward model alone, unless an effect overrides it: from series of the frames if it
+        acts on whole frames, from the maps if it gives ``starts``, else from simulated frames.
         """
         if starts := cls.starts(evidence):
             found_light = fit_light(starts, evidence, cls.smooth_degree)
@@ -218,7 +217,7 @@ class Effect(ForwardModel):
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
-        """Significance that `estimate` gives; of most simulations nothing else is needed."""
+        """Significance as in `estimate`; most simulations need nothing else."""
         inherited = all("estimate" not in vars(c) for c in cls.__mro__[: cls.__mro__.index(Effect)])
         if inherited and acts_on_frames_alone(cls) and not cls.starts(evidence):
             return detect_in_frames(cls, evidence)
@@ -227,29 +226,29 @@ class Effect(ForwardModel):
 
     @classmethod
     def starts(cls, evidence: Evidence) -> Sequence[LightStart]:
-        """Where a fit to the maps begins, if it acts on the light of the fringes alone.
+        """Starting points of a fit to the maps, if it acts only on the light of the fringes.
 
-        Those of fewer numbers first; none: its frames are taken again.
+        Those with fewer numbers first; without any, frames are simulated.
         """
         return ()
 
     def replayed(self, evidence: Evidence) -> Self | None:
-        """The same effect doing to each frame what it did to these, whatever its law.
+        """The effect that repeats its measured action on each of these frames, without a law.
 
-        None for effects whose law says all that there is to say of single frames.
+        None for effects whose law describes single frames completely.
         """
         return None
 
     def predict(self, maps: FringeMaps) -> FringeMaps | None:
-        """Maps that a fit finds with the effect on; None where maps alone do not tell."""
+        """Maps that a fit finds with the effect; None if maps alone do not determine them."""
         return None
 
     def undo(self, maps: FringeMaps) -> FringeMaps | None:
-        """Maps without the effect, from those with it; None where that is not possible."""
+        """Maps without the effect, from those with it; None if impossible."""
         return None
 
     def undo_samples(self, charge: F32) -> F32 | None:
-        """Frames without the effect, where it is one of samples and not of maps.
+        """Frames without the effect, if it acts on samples and not on maps.
 
         Parameters
         ----------
@@ -259,7 +258,7 @@ class Effect(ForwardModel):
         return None
 
     def measured_again(self, parts: Iterable[Evidence]) -> Estimate | None:
-        """The effect as a correction needs it, from all frames; None if it is as good as it is.
+        """The effect remeasured on all frames for a correction; None if there is no need.
 
         Parameters
         ----------
@@ -269,7 +268,7 @@ class Effect(ForwardModel):
         return None
 
     def phase_slopes(self, maps: FringeMaps) -> F64 | None:
-        """Change (n, y, x) of the undone phase, rad, by each parameter that has a covariance.
+        """Change (n, y, x) of the corrected phase, rad, by each parameter with a covariance.
 
         Parameters
         ----------
@@ -280,31 +279,31 @@ class Effect(ForwardModel):
 
     @property
     def undo_halo(self) -> int:
-        """Pixels around a piece of the window that undoing the effect on it depends on."""
+        """Width (pixels) of the surroundings needed to undo the effect on part of the window."""
         return 0
 
     def noise_factor(self, charge: float, read_noise: float, maps: FringeMaps) -> F64:
-        """Error (y, x) of a pixel's phase after `undo` over that before.
+        """Ratio (y, x) of the error of a pixel's phase after `undo` to that before.
 
         Parameters
         ----------
         charge, read_noise : float
             Mean signal and read noise, e-.
         maps : FringeMaps
-            That are undone.
+            To undo.
         """
         return np.ones(maps.theta.shape[1:])
 
 
 @dataclass(frozen=True)
 class Again:
-    """An effect as it was found, looked for in other frames by a shorter way.
+    """An effect as measured, with a faster way to detect it in other frames.
 
     Attributes
     ----------
     effect : Effect
     detect : callable
-        Its significance in an evidence; None where that does not tell.
+        Its significance in evidence; None if undetermined.
     """
 
     effect: Effect
@@ -327,7 +326,7 @@ class Again:
 
 
 def _of_light(found: LightFit, degree: int) -> Estimate:
-    """An estimate from the maps; other maps are fitted from there on."""
+    """An estimate from the maps; fits of other maps start from it."""
     here = replace(found.start, model=found.model)
     return Estimate(
         found.model,

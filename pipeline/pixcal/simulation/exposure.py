@@ -1,9 +1,9 @@
-"""From a bench to samples, effects acting between the steps.
+"""From a bench to samples, with effects between the steps.
 
 States of the frames and maps of the pixels → mean electrons → charge (shot noise, full well) →
-signal → ADU → codes. Noise is keyed by frame and place: a piece of some frames by some rows comes
-out the same however the work is cut, and an effect that needs the rows around a piece or the frame
-before it has them made again.
+signal → ADU → codes. Noise is keyed by frame and place, so a piece of frames and rows does not
+depend on how the work is divided. Rows around a piece or preceding frames that an effect needs are
+computed again.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -35,9 +35,9 @@ K = TypeVar("K", tuple[int, int], tuple[int, str])
 
 
 class Camera:
-    """Some rows (first, one after the last) of a bench and its effects; any give the same.
+    """A range of rows (first, one after the last) of a bench with its effects.
 
-    ``maps``: of the whole window, in place of those of the bench.
+    Samples do not depend on the range. ``maps``: of the whole window, instead of the bench's.
     """
 
     def __init__(
@@ -60,29 +60,29 @@ class Camera:
             self.maps = effect.detector(self.maps, bench, self.rows)
 
     def expose(self, recording: Recording, frames: Iterable[int]) -> Iterator[tuple[int, U16]]:
-        """Frames of these numbers as the camera reads them: number and samples, ADU (reused)."""
+        """Frames of these numbers as read out: number and samples, ADU (array reused)."""
         chain = _Chain(self, recording)
         for frame in frames:
             yield frame, chain.samples(frame)[self._kept]
 
     def analogue(self, recording: Recording, frames: Iterable[int]) -> Iterator[F32]:
-        """The same before the converter: float32 (y, x), ADU; a new array each."""
+        """Frames before the converter: float32 (y, x), ADU; a new array for each."""
         chain = _Chain(self, recording)
         for frame in frames:
             yield chain.adu(frame)[self._kept]
 
     @property
     def _kept(self) -> slice:
-        """The rows asked for among those at hand."""
+        """The requested rows among the computed ones."""
         return slice(self.inside[0] - self.rows[0], self.inside[1] - self.rows[0])
 
     def light(self, recording: Recording) -> LightMaps:
-        """Mean and fringe amplitude of a recording on these rows and those around, e-."""
+        """Mean and fringe amplitude of a recording on these and surrounding rows, e-."""
         return _Chain(self, recording).light
 
 
 class _Latest(dict[K, F32]):
-    """Arrays of the last few frames, by a key that begins with the frame; earliest go first."""
+    """Arrays of the last few frames, by a key that begins with the frame; drops earliest first."""
 
     def __init__(self, most: int) -> None:
         super().__init__()
@@ -105,7 +105,7 @@ class _Chain:
         self.dark = camera.maps.dark_rate * np.float32(recording.exptime_s)
         self.well = np.inf if d.full_well_e is None else d.full_well_e
         back = [1 + e.frames_back for e in self.effects if e.frames_back]
-        # Of a frame and of those before it, each before and after the effect that looks back.
+        # Of a frame and preceding ones, each before and after the effect that uses them.
         self._charges = _Latest[tuple[int, int]](2 * max(back, default=1))
         self._kept_normals = _Latest[tuple[int, str]](sum(back))
         self._margins: dict[int, tuple[LightMaps, F32]] = {}
@@ -119,7 +119,7 @@ class _Chain:
         return None if before is None else _Chain(self.camera, before)
 
     def of(self, frame: int) -> "tuple[_Chain, int]":
-        """The chain that makes a frame and its number there, of those before this recording too."""
+        """The chain of a frame and its number there, including frames before this recording."""
         if frame >= 0 or self._before is None:
             return self, frame
         return self._before, frame + self._before.recording.count
@@ -143,14 +143,14 @@ class _Chain:
         return collected
 
     def mean(self, frame: int, upto: int) -> F32:
-        """Mean electrons, by the first ``upto`` effects."""
+        """Mean electrons after the first ``upto`` effects."""
         mean = self._illuminated(self.light, frame, np.empty_like(self.dark))
         for at, effect in enumerate(self.effects[:upto]):
             mean = effect.photons(mean, Shot(self, frame, at))
         return mean
 
     def _illuminated(self, light: LightMaps, frame: int, out: F32, reach: int = 0) -> F32:
-        """Mean electrons of a frame with a margin, into an array, before effects on photons."""
+        """Write mean electrons of a frame with a margin to an array, before effects on photons."""
         states, shape = self.states, self.camera.bench.detector.shape
         columns, lines = states.turns(frame, shape, self.camera.rows, reach)
         synthesis.illuminate(
@@ -160,7 +160,7 @@ class _Chain:
         return out
 
     def beyond(self, frame: int, reach: int) -> F32:
-        """Mean charge of a frame around the rows at hand; in their middle it is undefined."""
+        """Mean charge of a frame around the computed rows; undefined inside them."""
         if reach not in self._margins:
             self._margins[reach] = with_margin(self.light, reach), np.pad(self.dark, reach, "edge")
         light, dark = self._margins[reach]
@@ -168,7 +168,7 @@ class _Chain:
         return np.asarray(np.minimum(wide + dark, np.float32(self.well)))
 
     def charge(self, frame: int, upto: int) -> F32:
-        """Charge, by all that acts on the light and the first ``upto`` effects on charge."""
+        """Charge after all effects on light and the first ``upto`` effects on charge."""
         key = (frame, upto)
         if key in self._charges:
             return self._charges[key]
@@ -185,7 +185,7 @@ class _Chain:
         return charge
 
     def normals(self, effect: str, frame: int, *, keep: bool) -> F32:
-        """Standard normals of an effect in a frame; kept for effects that ask for them again."""
+        """Standard normals of an effect in a frame; cached for effects that reuse them."""
         key = (frame, effect)
         if key in self._kept_normals:
             return self._kept_normals[key]
@@ -222,12 +222,12 @@ class _Chain:
         return self._noise[1]
 
     def _drawn(self, key: Key, frame: int) -> F32:
-        """Two arrays of standard normals (2, y, x) on the rows at hand."""
+        """Two arrays of standard normals (2, y, x) on the computed rows."""
         return pixel_normals(key, frame, self.camera.rows, self.dark.shape[1])
 
 
 def states_of(recording: Recording, effects: Sequence[ForwardModel]) -> FrameStates:
-    """What changes from frame to frame of a recording; of fringes only, with effects."""
+    """States of the frames of a recording; effects act on those of fringes only."""
     if recording.kind != "fringes":
         still, steady = np.zeros(recording.count), np.ones(recording.count)
         return FrameStates(phi=still, level=steady, amplitude=still, dkx=still, dky=still)

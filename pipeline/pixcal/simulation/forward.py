@@ -1,9 +1,9 @@
-"""The forward model of an effect: what it does to the frames of a simulation.
+"""The forward model of an effect: its action on the frames of a simulation.
 
 A frozen dataclass of parameters, made with `pixcal.model.config.quantity`: units, ranges, and
-defaults of the size that the literature gives, cited in ``sources``. A model overrides the steps of
-the exposure that it acts on; the others leave things as they are. The order of the steps is that of
-a camera (`pixcal.simulation.exposure`); within a step, models act in that of `ForwardModel.turn`.
+default sizes from the literature, cited in ``sources``. A model overrides the steps of the exposure
+on which it acts; by default, a step changes nothing. Steps follow the order in a camera
+(`pixcal.simulation.exposure`); within a step, models act in the order of `ForwardModel.turn`.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ class Stage(IntEnum):
     CHARGE = 3  # collected electrons, shot noise included
     SIGNAL = 4  # voltages: coupling between pixels, response of the amplifier
     READOUT = 5  # noise and drift of the electronics
-    CONVERTER = 6  # analogue to digital: the last of all
+    CONVERTER = 6  # analogue to digital: the last step
 
 
 @dataclass(frozen=True)
@@ -46,25 +46,25 @@ class ForwardModel:
     name : str
         In files and reports.
     title : str
-        In a few words, for people.
+        A few words, for readers.
     acts_at : Stage
     order : int
-        Among those of the same stage: lower ones act first.
+        Order within a stage: lower ones act first.
     domains : tuple of str
-        Where it shows: one or more of `DOMAINS`, the first before all.
+        Where it shows: one or more of `DOMAINS`, the main one first.
     strengths : tuple of str
-        Fields that `scaled` multiplies: with all of them zero the effect does nothing.
+        Fields that `scaled` multiplies: if all are zero, the effect has no action.
     optional_parameters : tuple of str
-        Fields beside these that may be zero, with the effect still there in its simplest form.
+        Other fields that may be zero, which leaves the effect in its simplest form.
     frames_needed : tuple of str
-        Frames that tell on it besides fringes of one set: ``dark``, ``flat``, ``ladder`` (of
-        flats), ``baseline`` (a second one along an axis), ``axis`` (another one), ``random``
-        (of the phases); if not said, any but the last.
+        Frames that show it besides fringes of one set: ``dark``, ``flat``, ``ladder`` (flats at
+        several exposure times), ``baseline`` (a second one along an axis), ``axis`` (another
+        one), ``random`` (phases); by default, any but the last.
     sources : tuple of str
         Where the default sizes come from.
     quick : bool
-        Whether `Effect.detect` takes about a second or less for 10⁷ samples, so that it can be used
-        on many simulations.
+        Whether `Effect.detect` takes at most about a second for 10⁷ samples, so that it can be
+        used on many simulations.
     """
 
     name: ClassVar[str]
@@ -79,52 +79,52 @@ class ForwardModel:
     quick: ClassVar[bool] = True
 
     def scaled(self, factor: float) -> Self:
-        """The same effect, ``factor`` times as strong."""
+        """The effect, ``factor`` times as strong."""
         changed = {name: _times(getattr(self, name), factor) for name in self.strengths}
         return dataclasses.replace(self, **changed)
 
     @property
     def turn(self) -> tuple[int, int, str]:
-        """When it acts, among others; those of one order, by their names."""
+        """Sort key of the order of action; ties are sorted by name."""
         return self.acts_at, self.order, self.name
 
     @property
     def is_null(self) -> bool:
-        """Whether it does nothing."""
+        """Whether it has no action."""
         null = self.scaled(0.0)
         return all(getattr(self, name) == getattr(null, name) for name in self.strengths)
 
     @property
     def halo(self) -> int:
-        """Rows above and below a piece of the window that the piece depends on."""
+        """Rows above and below a piece of the window on which the piece depends."""
         return 0
 
     @property
     def frames_back(self) -> int:
-        """Frames before a frame whose charge the frame depends on."""
+        """Number of preceding frames on whose charge a frame depends."""
         return 0
 
-    # What it does to the frames.
+    # Its action on the frames.
 
     def check(self, bench: Bench) -> None:
-        """Raise InputError where a bench and the effect do not go together."""
+        """Raise InputError if a bench and the effect are incompatible."""
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         """Intensity, amplitude, phase and fringe vector of every frame of a fringe set."""
         return states
 
     def detector(self, maps: DetectorMaps, bench: Bench, rows: Rows) -> DetectorMaps:
-        """The detector's maps on some rows of the window (first, one after the last)."""
+        """The detector's maps on a range of rows (first, one after the last)."""
         return maps
 
     def light(self, light: Light, recording: Recording, rows: Rows, maps: DetectorMaps) -> Light:
-        """Beams and other light of a recording on some rows, before the pixels."""
+        """Beams and other light of a recording on a range of rows, before the pixels."""
         return light
 
     def pixels(
         self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
     ) -> LightMaps:
-        """What pixels collect of the light on some rows: mean and fringe amplitude, e-."""
+        """Light that pixels collect on a range of rows: mean and fringe amplitude, e-."""
         return light
 
     def photons(self, mean: F32, shot: Shot) -> F32:
@@ -134,7 +134,7 @@ class ForwardModel:
     def charge(self, charge: F32, shot: Shot) -> F32:
         """Collected electrons (y, x), shot noise and full well included.
 
-        What is given is kept for later frames: give back another array, or the same unchanged.
+        The argument is kept for later frames: return another array, or the same unchanged.
         """
         return charge
 
@@ -148,7 +148,7 @@ class ForwardModel:
 
 
 def _times(value: Any, factor: float) -> Any:
-    """A number, or what says itself how it is ``scaled``, times a factor; of tuples each part."""
+    """A number, an object with ``scaled``, or each part of a tuple, times a factor."""
     if isinstance(value, tuple):
         return tuple(_times(part, factor) for part in value)
     return value.scaled(factor) if hasattr(value, "scaled") else factor * value
@@ -158,7 +158,7 @@ def _times(value: Any, factor: float) -> Any:
 
 
 def numbers(value: Any, key: str = "") -> dict[str, float]:
-    """All real numbers of a model, of its tuples and of the parts in them."""
+    """All real numbers of a model, including those in its tuples and their parts."""
     if isinstance(value, float):
         return {key: value}
     parts: list[tuple[str, Any]] = []
@@ -176,7 +176,7 @@ def field_of(key: str) -> str:
 
 
 def set_of(model: Any, key: str) -> str:
-    """Name of the fringe set that the part of a number is of; empty where it is of all sets."""
+    """Name of the fringe set to which a number applies; empty if to all sets."""
     for name, place in re.findall(r"([a-z]\w*)|\[(\d+)\]", key):
         model = getattr(model, name) if name else model[int(place)]
         if of := getattr(model, "set", ""):
@@ -185,7 +185,7 @@ def set_of(model: Any, key: str) -> str:
 
 
 def with_numbers(model: T, values: Mapping[str, float]) -> T:
-    """The model with other numbers, held within their ranges."""
+    """The model with other numbers, limited to their ranges."""
     changed: T = _changed(model, "", values, {})
     return changed
 
@@ -210,7 +210,7 @@ def _changed(value: Any, key: str, values: Mapping[str, float], limits: Mapping[
 
 
 def within(value: float, limits: Mapping[str, Any]) -> float:
-    """A number that is held within the limits of its field."""
+    """A number limited to the range of its field."""
     low, high, above = (limits.get(name) for name in ("low", "high", "above"))
     if above is not None:
         value = max(value, float(np.nextafter(above, np.inf)))

@@ -1,8 +1,8 @@
-"""What a forward model does to the series of the frames: light, contrast, fringe vector.
+"""Changes of the series of the frames by a forward model: light, contrast, fringe vector.
 
-A model of whole frames needs no samples to be taken again: its `ForwardModel.states` are the change
-of the series, draw by draw. What is the same in all draws is a shape of known course; their scatter
-is a part of the covariance of the series' modes.
+A model of whole frames needs no simulated samples: its `ForwardModel.states` give the change of the
+series for each draw. The part common to all draws is a known shape; their scatter is a part of the
+covariance of the series' modes.
 """
 
 from collections.abc import Sequence
@@ -25,11 +25,11 @@ from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import set_recordings
 
 DRAWS = 64
-KEPT = 256  # parts that are not drawn again in the next simulation of the same frames
-AROUND = 1.1  # ratio of frequencies over which the power of a change hardly differs
-UNIT = 1e-3  # size at which a strength is looked at that is zero by default
-# factor on parameters to see what depends on them, and on frequencies, of which an exposure might
-# be whole periods
+KEPT = 256  # parts cached for later simulations of the same frames
+AROUND = 1.1  # ratio of frequencies over which the power of a change is nearly constant
+UNIT = 1e-3  # trial size of a strength that is zero by default
+# factor on parameters to test dependence on them, and on frequencies, in case an exposure is a
+# whole number of periods
 OTHER = 1 / np.sqrt(2)
 LIGHT, MOTION = (0, 1), (2, 3)  # (B over its mean less one, log A/B), and (kx, ky)
 
@@ -40,8 +40,8 @@ class Watched:
 
     series: FrameSeries = field(compare=False)
     channels: tuple[int, int]
-    recording: Recording | None  # None: frames without light, which no state changes
-    frames: tuple[int, ...]  # places of the series' values in the recording
+    recording: Recording | None  # None: frames without light, which have no states
+    frames: tuple[int, ...]  # indices of the series' values in the recording
 
     def changes(self, model: ForwardModel, draws: int) -> F64:
         """Change of the series by each draw (r, t, 2)."""
@@ -60,7 +60,7 @@ class Watched:
 
     @lru_cache(maxsize=KEPT)  # noqa: B019
     def part(self, model: ForwardModel) -> F64:
-        """Covariance (t - 1, 2, 2) of the modes by a random model; the same for like frames."""
+        """Covariance (t - 1, 2, 2) of the modes by a random model; cached for equal frames."""
         modes = self.series.walk_modes.of(self.changes(model, DRAWS).transpose(1, 0, 2))
         modes -= modes.mean(axis=1, keepdims=True)
         power = np.einsum("kra,krb->kab", modes, modes) / (DRAWS - 1)
@@ -78,13 +78,13 @@ class Strength:
     model: ForwardModel  # of this strength alone
     key: str  # as errors name it
     unit: float  # the strength in `model`
-    shape: str | None  # the parameter, no strength, that changes how it shows
-    steady: bool  # whether draws are the same: a shape, and no part of a covariance
-    power: float  # of the strength, that the part goes with
+    shape: str | None  # parameter, not a strength, that changes how it shows
+    steady: bool  # whether all draws are equal: a shape instead of a part of a covariance
+    power: float  # exponent of the strength to which the part is proportional
 
     @property
     def field(self) -> str:
-        """That it is a number of."""
+        """Field that contains the number."""
         return field_of(self.key)
 
     @property
@@ -93,13 +93,13 @@ class Strength:
         return self.shape is not None and unit_of(self.model, self.shape) == "Hz"
 
     def at(self, shape: float | None) -> ForwardModel:
-        """Its model with another value of the shape parameter."""
+        """The model with another value of the shape parameter."""
         if self.shape is None or shape is None:
             return self.model
         return replace(self.model, **{self.shape: shape})
 
     def value(self, size: float) -> float:
-        """Of a size of the part or shape."""
+        """Value of the strength for a size of the part or shape."""
         if self.steady:
             return self.unit * size
         return float(self.unit * max(size, 0.0) ** (1 / self.power))
@@ -119,7 +119,7 @@ def strengths_of(
 
 
 def _heard(start: ForwardModel) -> ForwardModel:
-    """The model with frequencies of which an exposure is no whole number of periods."""
+    """The model with frequencies such that an exposure is no whole number of periods."""
     lines = [f.name for f in fields(start) if unit_of(start, f.name) == "Hz"]
     return replace(start, **{name: OTHER * getattr(start, name) for name in lines})
 
@@ -139,7 +139,7 @@ def _strength(every: Sequence[Watched], own: ForwardModel, key: str, unit: float
                 break
     steady, power = all(np.array_equal(*v) for v in drawn), 1.0
     if not steady:
-        # Of the same random numbers: two draws tell.
+        # With the same random numbers, two draws suffice.
         half = with_numbers(own, {key: unit / 2})
         less = [w.changes(half, 2) for w in every]
         whole, part = (sum(float(np.diff(v, axis=0).var()) for v in d) for d in (drawn, less))
@@ -168,7 +168,7 @@ class FrameChanges:
             self._lines.append(light.line)
 
     def series(self, start: ForwardModel) -> list[Watched]:
-        """Series of the kinds that a model changes when it is strong."""
+        """Series of the kinds that a strong model changes."""
         strong = _heard(start)
         return [
             w
@@ -178,7 +178,7 @@ class FrameChanges:
         ]
 
     def line(self, of: Strength) -> Line | None:
-        """The strongest line of the series that a strength changes."""
+        """Strongest line of the series that a strength changes."""
         for every, line in zip(self._every, self._lines, strict=True):
             if any(w.changes(of.model, 1).any() for w in every):
                 return line

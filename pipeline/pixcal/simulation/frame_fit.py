@@ -1,10 +1,9 @@
-"""Parameters of an effect that acts on whole frames, from the series of the frames.
+"""Estimate parameters of an effect on whole frames from the series of the frames.
 
-What it does to light, contrast and fringe vector follows from its forward model (`frame_changes`):
-steady strengths are shapes, random ones parts of the covariance. Sizes are those of restricted
-maximum likelihood beside all else that moves frames (`FrameBasis`) and the noise that two halves of
-the pixels show. A parameter that is no strength is profiled; one in Hz is that of the strongest
-line.
+Its changes of light, contrast and fringe vector follow from its forward model (`frame_changes`):
+steady strengths are shapes, random ones parts of the covariance. Sizes are restricted
+maximum-likelihood estimates, jointly with nuisance effects on frames (`FrameBasis`) and noise from
+two halves of the pixels. Other parameters are profiled; one in Hz is set to the strongest line.
 """
 
 from collections.abc import Mapping, Sequence
@@ -44,11 +43,11 @@ from pixcal.simulation.frame_changes import (
 )
 
 MOTION_PARTS = ("jitter_x", "jitter_y", "walk_x", "walk_y", "walk_k")
-SAME = 0.8  # share of a nuisance that the effect explains, from which it is the effect's own
-# frames of the shortest time constant tried, of random changes and of steady ones; how many
+SAME = 0.8  # share of a nuisance explained by the effect above which it is part of the effect
+# shortest time constant tried (frames), for random and for steady changes; number of trials
 FASTEST, QUICKEST, TRIALS = 0.3, 3.0, 9
-SLOW = 0.1  # share of the modes, the lowest, that hold most of what is slow
-ROUGH = 0.5  # scatter of draws beyond that of normal ones, over it, from which they are others
+SLOW = 0.1  # share of the modes, the lowest, that hold most of a slow change
+ROUGH = 0.5  # relative excess scatter of draws above which they are not normal
 ALIKE = (
     "; with fringes of one direction, motion of the fibres along the fringe axis and drift of the "
     "wavelength look the same"
@@ -56,7 +55,7 @@ ALIKE = (
 
 
 class FrameBasis:
-    """Parts and shapes of strengths and nuisances in some series."""
+    """Parts and shapes of strengths and nuisances in the series."""
 
     def __init__(
         self, changes: FrameChanges, every: Sequence[Watched], strengths: Sequence[Strength]
@@ -108,11 +107,11 @@ class FrameBasis:
 
     @property
     def step_s(self) -> float:
-        """From frame to frame."""
+        """Time between frames, s."""
         return min(w.series.step_s for w in self.every if w.recording is not None)
 
     def own(self, of: Strength, shape: float | None) -> list[F64]:
-        """Parts, or shapes, of all series by a strength."""
+        """Parts or shapes of a strength in all series."""
         if (of, shape) not in self._made:
             model = of.at(shape)
             self._made[of, shape] = [
@@ -133,10 +132,10 @@ class FrameBasis:
         *,
         by_set: bool = False,
     ) -> Components:
-        """Sizes of strengths, random ones first in ``size``, steady ones in ``beta``.
+        """Sizes of strengths: random ones first in ``size``, steady ones first in ``beta``.
 
-        Shape parameters are by the field of the strength. With ``by_set`` there follow in ``beta``
-        the departures of each later set from the first.
+        ``shapes``: shape parameters by the field of the strength. With ``by_set``, the differences
+        of each later set from the first follow in ``beta``.
         """
         own = [(s.steady, self.own(s, shapes.get(s.field))) for s in strengths]
         parts = [*(v for steady, v in own if not steady), *self._nuisances.values()]
@@ -159,7 +158,7 @@ class FrameBasis:
         return estimate_components(modes, (), start, steps)
 
     def slow(self, random: Sequence[Strength], shapes: Mapping[str, float]) -> list[int]:
-        """Places of the parts that few modes tell, and whose sizes are badly known."""
+        """Indices of the parts with few modes, whose sizes are poorly determined."""
         found = []
         parts = [*(self.own(s, shapes.get(s.field)) for s in random), *self._nuisances.values()]
         for n, part in enumerate(parts):
@@ -170,7 +169,7 @@ class FrameBasis:
         return found
 
     def rough(self, of: Strength, shape: float | None, found: Components) -> float:
-        """Relative scatter of a strength's size beyond that of normal draws."""
+        """Relative scatter of a strength's size in excess of normal draws."""
         normal = square = seen = 0.0
         sizes = np.maximum(found.size, 0.0)
         covariance = (sizes @ found.modes.flat).reshape(found.modes.parts.shape[1:])
@@ -216,21 +215,21 @@ def _nuisance_shapes(changes: FrameChanges, of: Watched) -> F64:
 
 @dataclass(frozen=True)
 class FrameFit:
-    """What the series of the frames let know of an effect."""
+    """Estimate of an effect from the series of the frames."""
 
     model: Any
     errors: dict[str, float]
     significance: float
     why: str
-    details: dict[str, float]  # standard deviations by which each field is there
-    # standard deviations by which each set has strengths of its own, of those that are steady
+    details: dict[str, float]  # significance of each field, sigma
+    # significance (sigma) of different steady strengths in each set
     sets_differ: float = -np.inf
 
 
 def fit_frames(
     kind: type[ForwardModel], evidence: Evidence, leave: Sequence[str] = ()
 ) -> FrameFit | None:
-    """Parameters of a model of whole frames, but strengths to ``leave``; None without evidence."""
+    """Parameters of a model of whole frames, except ``leave``; None without evidence."""
     found = _taken(kind, evidence, leave)
     if found is None:
         return None
@@ -256,14 +255,14 @@ def fit_frames(
 def detect_in_frames(
     kind: type[ForwardModel], evidence: Evidence, leave: Sequence[str] = ()
 ) -> float | None:
-    """Significance that `fit_frames` gives, without sizes and errors."""
+    """Significance as in `fit_frames`, without sizes and errors."""
     found = _taken(kind, evidence, leave, halvings=1)
     return None if found is None else found.significance
 
 
 @dataclass(frozen=True)
 class _Taken:
-    """Strengths of a model as the series of the frames show them."""
+    """Strengths of a model, as determined by the series of the frames."""
 
     fit: "_Fit"
     changes: FrameChanges
@@ -271,7 +270,7 @@ class _Taken:
 
     @property
     def chances(self) -> dict[str, float]:
-        """Logarithm of the chance of each field where there is none of it."""
+        """Log p-value of each field if its strength is zero."""
         of_lines = {
             own[0].field: 0.0 if line is None else line.log_chance for own, line in self.lines
         }
@@ -279,7 +278,7 @@ class _Taken:
 
     @property
     def significance(self) -> float:
-        """Of all fields, sigma."""
+        """Significance of all fields, sigma."""
         return sigmas(log_chance_of_any(list(self.chances.values())))
 
 
@@ -301,18 +300,18 @@ def _taken(
 
 
 class _Fit:
-    """Strengths of a model, taken in field by field."""
+    """Fit of a model's strengths, added field by field."""
 
     def __init__(self, start: ForwardModel, basis: FrameBasis, halvings: int) -> None:
         self.start, self.basis, self._halvings = start, basis, halvings
         self.taken: list[Strength] = []
-        self.chances: dict[str, float] = {}  # logarithm, of each field where there is none of it
-        # of each field with a shape: the profile, and how many strengths were fitted with it
+        self.chances: dict[str, float] = {}  # log p-value of each field if its strength is zero
+        # for each field with a shape: the profile, and the number of strengths fitted with it
         self.profiles: dict[str, tuple[Profiled, int]] = {}
         self.shapes: dict[str, float] = {}
 
     def take(self, own: Sequence[Strength]) -> None:
-        """Take in a field; beside others, one of a shape of its own only where it is sure."""
+        """Add a field; after others, one with its own shape only if it is significant."""
         field, before = own[0].field, self.basis.components(self.taken, self.shapes)
         profile = None if own[0].shape is None else self._profiled(own, before)
         if profile is None:
@@ -324,7 +323,7 @@ class _Fit:
             chance = log_chance(_likelihood(own, after, before), (len(own) + 2) // 2)
         self.chances[field] = chance
         if profile is not None and self.taken and not own[0].steady:
-            # Together: what one of them takes of another is the effect's all the same.
+            # Jointly: what one of them absorbs of another still belongs to the effect.
             growth = after.likelihood - self.basis.components((), {}).likelihood
             self.chances["all"] = log_chance(growth, (len(self.taken) + len(own) + 2) // 2)
         if profile is None or not self.taken or sigmas(chance) > SIGNIFICANT:
@@ -334,7 +333,7 @@ class _Fit:
                 self.shapes[field] = profile.value
 
     def _profiled(self, own: Sequence[Strength], before: Components) -> Profiled:
-        """Best value of a field's shape parameter; zero where that is its default and does."""
+        """Best value of a field's shape parameter; zero if that is its default and suffices."""
         field, steady, every = own[0].field, own[0].steady, [*self.taken, *own]
 
         def fit(value: float, start: Components | None, steps: int = MAX_STEPS) -> Components:
@@ -349,7 +348,7 @@ class _Fit:
         return found
 
     def values(self) -> tuple[ForwardModel, dict[str, float]]:
-        """The model of the sizes found, and errors by parameter."""
+        """The model with the fitted sizes, and errors by parameter."""
         found = self.basis.components(self.taken, self.shapes)
         random = [s for s in self.taken if not s.steady]
         spread = found.shape_covariance(self.basis.slow(random, self.shapes))
@@ -368,7 +367,7 @@ class _Fit:
                 less = size - float(np.hypot(np.sqrt(found.covariance[n, n]), rough))
                 here = s.value(size)
                 error = max(s.value(more) - here, here - s.value(max(less, 0.0)))
-            # What it owes to shape parameters that it was found with.
+            # Errors from the shape parameters with which it was fitted.
             owed = [
                 profile.slope([self._value(s, side) for side in profile.sides])
                 for profile, fitted in self.profiles.values()
@@ -379,7 +378,7 @@ class _Fit:
         return model, {key: error for key, error in errors.items() if error > 0}
 
     def sets_differ(self) -> float:
-        """Standard deviations by which sets have steady strengths of their own."""
+        """Significance (sigma) of different steady strengths in the sets."""
         steady = sum(s.steady for s in self.taken)
         sets = sum(w.recording is not None for w in self.basis.every)
         if not steady or sets < 2:
@@ -401,11 +400,11 @@ class _Fit:
 def _swung(
     model: ForwardModel, own: Sequence[Strength], line: Line, basis: FrameBasis
 ) -> tuple[ForwardModel, dict[str, float]]:
-    """The model with a line, whose strengths are those of its amplitude in the series."""
+    """The model with a line, with strengths set by its amplitude in the series."""
     name = own[0].shape or ""
     model, errors = with_numbers(model, {name: line.hz}), {name: line.hz_error}
     for s in own:
-        # rms over draws of a random phase, in the channel that the line is in.
+        # rms over draws of a random phase, in the channel of the line.
         drawn = [w.changes(s.at(line.hz), 8) for w in basis.every if w.recording is not None]
         rms = np.sqrt(np.mean([(v**2).mean(axis=(0, 1)) for v in drawn], axis=0))
         channel = int(np.argmax(rms * (line.amplitude_error > 0)))
@@ -416,14 +415,14 @@ def _swung(
 
 
 def _likelihood(own: Sequence[Strength], one: Components, other: Components) -> float:
-    """Growth of the logarithm, not restricted where shapes differ."""
+    """Rise of the log-likelihood; not restricted if shapes differ."""
     if own[0].steady:
         return one.profile - other.profile
     return one.likelihood - other.likelihood
 
 
 def _chance(own: Sequence[Strength], at: int, before: Components, after: Components) -> float:
-    """Logarithm of the chance of a field's sizes, from a place on, where there is nothing of it."""
+    """Log p-value of a field's sizes, from index ``at`` on, if they are zero."""
     here, count = slice(at, at + len(own)), len(own)
     if own[0].steady:
         beta, spread = after.beta[here], after.beta_covariance[here, here]

@@ -1,8 +1,8 @@
-"""Parameters of an effect that acts on the light of the fringes alone, from the maps of the fit.
+"""Estimate parameters of an effect that acts only on the light of the fringes, from fitted maps.
 
-What the effect does to mean light, visibility and phase of every pixel follows from its forward
-model (`ForwardModel.light`), without a frame being simulated. Its numbers are fitted to the maps of
-all sets by Gauss-Newton steps, beside smooth surfaces and the fringe modes that a fit leaves open.
+The changes of mean light, visibility and phase of every pixel follow from the forward model
+(`ForwardModel.light`), without simulated frames. Its numbers are fitted to the maps of all sets by
+Gauss-Newton steps, jointly with smooth surfaces and the degenerate fringe modes of a fit.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,30 +30,30 @@ from pixcal.simulation.forward import ForwardModel, field_of, numbers, set_of, w
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import set_recordings
 
-CLIP = 8.0  # medians of the differences of pixels side by side, beyond which they do not count
+CLIP = 8.0  # clip of differences of neighbouring pixels, over their median
 SAME = 0.98  # cosine of the angle below which two sets measure along one axis
 KINDS = ("the mean light", "the visibility", "the phase")
 PHASE = KINDS.index("the phase")
 MIN_PIXELS, MIN_SIDE = 200, 9
 ROUNDS = 3  # Gauss-Newton steps
 # change of a map (relative, or rad) by a step for a derivative; the first such step, and how often
-# and by how much it is lengthened
+# and by what factor it is lengthened
 SEEN, STEP, LONGER, MOST = 1e-4, 1e-3, 3, 1e3
-# chi-square, and share of all of it, by which a start of more numbers must explain more
+# chi-square, and share of the total, by which a start with more numbers must improve
 APART, MODEL = 25.0, 0.02
-STRAIGHT = 0.02  # part of a step's change by which derivatives may fail to tell it
-# share of an effect's largest signal in any kind of map, below which a kind is left out: all have
-# much the same noise, so a signal this small carries no information
+STRAIGHT = 0.02  # largest error of the linear prediction of a step's change, relative
+# share of an effect's largest signal in any kind of map, below which a kind is left out: with
+# similar noise in all, so small a signal carries no information
 LEAST = 0.01
-UNTOLD = 1e-8  # share of a signal's square that is left where smooth surfaces take all of it
+UNTOLD = 1e-8  # residual share of a signal's square below which smooth surfaces absorb it
 LOWEST = -3.0  # lowest significance, standard deviations
-# of what an effect must do to a map, as much has to be there; where it shows by so many errors
+# least observed share of the predicted change of a map; errors that the prediction must exceed
 AGREED, SHOWN = 0.5, 2.0
 
 
 @dataclass(frozen=True)
 class LightStart:
-    """Where a fit begins, and what it may change."""
+    """Starting point of a fit, and its free fields."""
 
     model: Any
     free: tuple[str, ...]  # fields whose numbers are fitted
@@ -62,21 +62,21 @@ class LightStart:
 
 @dataclass(frozen=True)
 class LightFit:
-    """What the maps let know of an effect."""
+    """Estimate of an effect from the maps."""
 
     start: LightStart
     model: Any
     errors: dict[str, float]  # 1-sigma errors of the numbers that were fitted
-    gain: float  # fall in chi-square from none of it
-    agreed: dict[str, float]  # share of what it must do that is there, by kind of map
+    gain: float  # fall in chi-square relative to no effect
+    agreed: dict[str, float]  # observed share of the predicted change, by kind of map
     dof: int  # numbers that the maps determine
 
     @property
     def significance(self) -> float:
-        """In standard deviations; zero where a map that must show the effect does not."""
+        """Significance, sigma; zero if a map that must show the effect does not."""
         if min(self.agreed.values(), default=1.0) < AGREED:
             return 0.0
-        # A gain of zero would be -37, and one such simulation would dominate the scatter of all.
+        # Zero gain would give -37 sigma, and one such simulation would dominate the scatter.
         return max(sigmas_of_chi2(self.gain, max(self.dof, 1)), LOWEST)
 
     @property
@@ -87,7 +87,7 @@ class LightFit:
 
 
 def fit_light(starts: Sequence[LightStart], evidence: Evidence, degree: int) -> LightFit | None:
-    """The best of some starts, those of fewer numbers first; None without enough pixels."""
+    """Best fit over the starts, those with fewer numbers first; None with too few pixels."""
     lit = evidence.once("light of the pixels", make=lambda: _lit(evidence))
     best: LightFit | None = None
     for start in starts if lit else ():
@@ -105,23 +105,23 @@ class _Lit:
     rows: tuple[int, int]
     first: int  # column
     good: Mask
-    # (3, y, x) of `KINDS`: logarithms, and rad; the light without what noise it shares with the
-    # visibility
+    # (3, y, x) of `KINDS`: logarithms, and rad; the light is without the noise it has in common
+    # with the visibility
     data: F64 = field(repr=False)
-    shared: float  # share of the visibility that is taken off the light
-    gauge: F64 = field(repr=False)  # (4, y, x) fringe modes that the fit leaves open
+    shared: float  # share of the visibility that is subtracted from the light
+    gauge: F64 = field(repr=False)  # (4, y, x) fringe modes that are degenerate in the fit
     light: Light = field(repr=False)  # of all columns up to the part's last
     maps: DetectorMaps = field(repr=False)
     stitched: Indices | None = field(default=None, repr=False)  # (y, x) fields of offsets
 
     @property
     def name(self) -> str:
-        """Of the set."""
+        """Name of the set."""
         return self.recording.set_name
 
     @classmethod
     def of(cls, found: FringeEvidence, recording: Recording) -> "_Lit":
-        """A set, by places in its whole window."""
+        """A set, placed in its whole window."""
         (y0, x0), (ny, nx) = found.origin, found.good.shape
         alpha = np.hypot(found.theta[1], found.theta[2])
         good = found.good & (alpha > 0) & (found.theta[0] > 0)
@@ -151,7 +151,7 @@ class _Lit:
         )
 
     def change(self, model: ForwardModel) -> F64:
-        """What a model does to the maps (3, y, x)."""
+        """Change of the maps (3, y, x) by a model."""
         own, light = model.light(self.light, self.recording, self.rows, self.maps), self.light
         found = np.zeros((3, *light.mean.shape))
         lit = np.where(light.mean > 0, light.mean, np.inf)
@@ -168,7 +168,7 @@ class _Lit:
 
 
 def _shared(light: F64, visibility: F64, good: Mask) -> float:
-    """Slope of the light's noise against the visibility's, from pixels side by side."""
+    """Slope of the light's noise against the visibility's, from neighbouring pixels."""
     used = good[:, 1:] & good[:, :-1]
     steps = [np.diff(own, axis=1)[used] for own in (light, visibility)]
     kept = np.all([abs(own) < CLIP * np.median(abs(own)) for own in steps], axis=0)
@@ -177,7 +177,7 @@ def _shared(light: F64, visibility: F64, good: Mask) -> float:
 
 
 def _bent(turn: C128) -> F64:
-    """Phase (y, x) less its mean and slopes, rad: a fit has them free, and they may be large."""
+    """Phase (y, x) less its mean and slopes, rad: free in a fit, and possibly large."""
     for axis in (0, 1):
         one, other = turn.swapaxes(0, axis)[:-1], turn.swapaxes(0, axis)[1:]
         step = np.angle(np.vdot(one, other))
@@ -199,8 +199,8 @@ def _lit(evidence: Evidence) -> list[_Lit]:
 
 
 def _stitched(lit: Sequence[_Lit], vectors: Sequence[tuple[float, float]]) -> Indices | None:
-    """Fields (y, x) of the foundry's stitching in the phases of all sets; None without any."""
-    # Sets along one axis see the same offsets, whose scatter is most of the noise: their mean.
+    """Stitching fields (y, x) of the foundry in the phases of all sets; None without any."""
+    # Average sets along one axis: they measure the same offsets, which dominate the noise.
     axes: dict[tuple[float, ...], list[tuple[float, _Lit]]] = {}
     for one, vector in zip(lit, np.array(vectors), strict=True):
         unit = vector / np.linalg.norm(vector)
@@ -246,7 +246,7 @@ def _slopes(
     here: Sequence[F64],
     lengths: dict[str, float],
 ) -> list[F64]:
-    """Derivatives (n, 3, y, x) of the maps of each set by numbers, in steps kept for next time."""
+    """Derivatives (n, 3, y, x) of the maps of each set by numbers; keeps the step lengths."""
     found = [np.zeros((len(values), *at.shape)) for at in here]
     for n, (key, value) in enumerate(values.items()):
         step, of = lengths.get(key, STEP * max(abs(value), 1.0)), set_of(model, key)
@@ -265,7 +265,7 @@ def _slopes(
 
 
 def _moved(model: Any, key: str, value: float, step: float) -> tuple[Any, float]:
-    """The model with a number moved by a step, or back at the end of its range; by how much."""
+    """The model with a number moved by a step (backwards at the end of its range), and the step."""
     for own in (step, -step):
         moved = with_numbers(model, {key: value + own})
         size = numbers(moved)[key] - value
@@ -275,7 +275,7 @@ def _moved(model: Any, key: str, value: float, step: float) -> tuple[Any, float]
 
 
 def _is_straight(change: F64, expected: F64) -> bool:
-    """Whether maps (3, y, x) changed as their derivatives said, but for a constant."""
+    """Whether maps (3, y, x) changed as their derivatives predict, up to a constant."""
     off = change - expected
     off = off - off.mean(axis=(1, 2), keepdims=True)
     size = expected - expected.mean(axis=(1, 2), keepdims=True)
@@ -289,7 +289,7 @@ def _least_squares(
     degree: int,
     kinds: Sequence[int] = range(len(KINDS)),
 ) -> MapFit:
-    """Fit of signals (n, 3, y, x) to maps (3, y, x) of all sets; errors are zero of the untold."""
+    """Fit signals (n, 3, y, x) to maps (3, y, x) of all sets; undetermined ones have zero error."""
     parts = []
     whole, left = np.zeros((2, len(signals[0])))
     for one, data, own in zip(lit, rest, signals, strict=True):
@@ -297,7 +297,7 @@ def _least_squares(
         for kind in (k for k in kinds if _shows(largest, k)):
             free = np.concatenate([polynomial(one.good.shape, degree), one.gauge])
             stitched = one.stitched if kind == PHASE else None
-            # A number of one set leaves the maps of the others as they are.
+            # A number of one set does not change the maps of other sets.
             some = largest[:, kind] > 0
             part = MapPart.of(own[some, kind], data[kind], free, one.good, stitched)
             shown = np.zeros((len(part.data), len(own)))
@@ -317,14 +317,14 @@ def _least_squares(
 
 
 def _shows(largest: F64, kind: int) -> bool:
-    """Whether signals show in a kind of map at all, by the largest value (n, 3) of each."""
+    """Whether signals show in a kind of map, given the largest value (n, 3) of each."""
     return bool((largest[:, kind] > LEAST * largest.max(axis=1)).any())
 
 
 def _gain(
     lit: Sequence[_Lit], changes: Sequence[F64], degree: int
 ) -> tuple[float, dict[str, float]]:
-    """Chi-square by which changes are there, and their share in each kind of map."""
+    """Fall in chi-square by the changes, and their observed share in each kind of map."""
     data, signals = [one.data for one in lit], [change[None] for change in changes]
     gain, agreed = 0.0, {}
     for kind, name in enumerate(KINDS):

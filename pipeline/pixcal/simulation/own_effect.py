@@ -1,6 +1,6 @@
-"""An effect of the user's own: a Python file, looked at before it is used.
+"""A user's own effect: a Python file, checked before use.
 
-Its mistakes are told by its file, whether they show at once or when a step fails.
+Errors name the file, whether the check finds them or a step fails later.
 """
 
 import dataclasses
@@ -18,14 +18,14 @@ from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError, PixcalError
 from pixcal.simulation.effect import DOMAINS, Effect, Estimate, LightStart, Stage
 
-# steps of the exposure: each gives back what it is given first, changed
+# steps of the exposure: each returns its first argument, changed
 STEPS = ("states", "detector", "light", "pixels", "photons", "charge", "signal", "readout")
 OTHERS = ("__post_init__", "check", "predict", "undo", "undo_samples", "noise_factor")
 MAX_AROUND = 4096  # rows around a piece, or frames before one, that an effect may ask for
 
 
 def effect_of_file(path: Path) -> type[Effect]:
-    """The effect of a Python file of the user's own; InputError if it does not hold just one."""
+    """The effect of a user's Python file; InputError unless it holds exactly one."""
     if not path.is_file():
         raise InputError(f"{path}: not found; give a Python file that holds an effect")
     spec = importlib.util.spec_from_file_location(f"pixcal_effect_{path.stem}", path)
@@ -44,7 +44,7 @@ def effect_of_file(path: Path) -> type[Effect]:
 
 
 def only_effect(module: ModuleType) -> type[Effect]:
-    """The effect that a module defines; TypeError unless it is just one."""
+    """The effect that a module defines; TypeError unless there is exactly one."""
     own = [
         cls
         for _, cls in inspect.getmembers(module, inspect.isclass)
@@ -56,7 +56,7 @@ def only_effect(module: ModuleType) -> type[Effect]:
 
 
 def checked(effect: type[Effect], file: Path) -> type[Effect]:
-    """The class, its steps naming the file when they fail; InputError if it is no proper effect."""
+    """The class, with steps that name the file on failure; InputError if it is invalid."""
     for name in (*STEPS, *OTHERS):
         if name in vars(effect):
             setattr(effect, name, _told(vars(effect)[name], file, name in STEPS))
@@ -93,7 +93,7 @@ def _check(effect: type[Effect]) -> None:
 
 
 def _told(step: Callable[..., Any], file: Path, gives_back: bool) -> Callable[..., Any]:
-    """A method that raises InputError where it fails, or gives back another thing."""
+    """A method that raises InputError if it fails or returns a wrong result."""
 
     @functools.wraps(step)
     def told(self: Effect, *args: Any) -> Any:
@@ -130,7 +130,7 @@ def _asked(name: str, method: Any, check: Callable[[Any, type[Effect]], None], f
 
 
 def _check_starts(found: Any, effect: type[Effect]) -> None:
-    """Raise TypeError or ValueError unless a fit can begin there."""
+    """Raise TypeError or ValueError unless a fit can start there."""
     fields = {field.name for field in dataclasses.fields(effect)}
     for start in found:
         if not isinstance(start, LightStart) or not isinstance(start.model, effect):
@@ -140,7 +140,7 @@ def _check_starts(found: Any, effect: type[Effect]) -> None:
 
 
 def _check_estimate(found: Any, effect: type[Effect]) -> None:
-    """Raise TypeError or ValueError unless all that an estimate says can be used."""
+    """Raise TypeError or ValueError unless all fields of an estimate are usable."""
     if not isinstance(found, Estimate) or not isinstance(found.effect, effect):
         raise TypeError(f"gives no Estimate of a {effect.__name__}")
     try:
@@ -160,7 +160,7 @@ def _check_estimate(found: Any, effect: type[Effect]) -> None:
 
 
 def _compare(result: Any, given: Any) -> None:
-    """Raise TypeError unless a result is of the kind, the shape, and finite."""
+    """Raise TypeError unless a result has the type and shape of the argument and is finite."""
     if dataclasses.is_dataclass(given):
         if type(result) is not type(given):
             raise TypeError(f"returns {type(result).__name__}, not {type(given).__name__}")

@@ -1,4 +1,4 @@
-"""What a bench records: sequences of frames, in order of time."""
+"""Recordings of a bench: sequences of frames, in order of time."""
 
 from dataclasses import dataclass, field
 from zlib import crc32
@@ -31,11 +31,11 @@ class Recording:
     period_s: float
     # electrons for unit light: of a flat its mean, of fringes as in `electrons_per_unit`
     electrons: float
-    # which, where several windows of a detector are simulated by themselves: they share what
-    # happens to a frame, and not the noise of their pixels
+    # number of the window, if several windows of a detector are simulated separately: they share
+    # changes of whole frames, but not the noise of their pixels
     window: int = 0
-    before: "Recording | None" = None  # that ended when this one began, where it is known
-    # start of each frame after the first, where frames were lost or late; else a period apart
+    before: "Recording | None" = None  # recording that ended when this one began, if known
+    # start of each frame after the first, if frames were lost or late; else one period apart
     stamps_s: tuple[float, ...] = field(default=(), repr=False, hash=False)
 
     @property
@@ -56,11 +56,11 @@ class Recording:
         return KINDS.index(self.kind), self.number
 
     def rng(self, effect: str, *key: int) -> np.random.Generator:
-        """Random numbers of an effect, the same whoever asks, in whatever order."""
+        """Random numbers of an effect, independent of caller and order."""
         return self._rng(self.bench.seed, effect, *key)
 
     def pixel_rng(self, effect: str, *key: int) -> np.random.Generator:
-        """As `rng`, of what differs from pixel to pixel."""
+        """As `rng`, for quantities that differ from pixel to pixel."""
         return self._rng(self._pixel_seed, effect, *key)
 
     @property
@@ -74,7 +74,7 @@ class Recording:
 
     @property
     def _pixel_seed(self) -> int:
-        """Seed of what differs from pixel to pixel, and so from window to window."""
+        """Seed of quantities that differ from pixel to pixel, and so from window to window."""
         return self.bench.seed + SEEDS_APART * self.window
 
     def _rng(self, seed: int, effect: str, *key: int) -> np.random.Generator:

@@ -1,8 +1,8 @@
-"""The frames of an acquisition taken again: its bench as the fit has it, sample by sample.
+"""Simulate the frames of an acquisition sample by sample, with its bench as fitted.
 
-Light, phases, fringe vectors and offsets are those that were fitted, calibration maps those that
-were measured: without effects and noise, the frames come out as the fit's own model. What an effect
-changes of them is then the derivative that a score test needs.
+Light, phases, fringe vectors and offsets are fitted, and calibration maps are measured. Without
+effects and noise, the frames equal the model of the fit. Their change by an effect is the
+derivative that a score test needs.
 """
 
 from collections.abc import Sequence
@@ -28,13 +28,13 @@ from pixcal.simulation.exposure import Camera
 from pixcal.simulation.forward import ForwardModel, Stage
 from pixcal.simulation.recording import Recording
 
-MIN_S = 1e-6  # exposure time and period where none is known
+MIN_S = 1e-6  # exposure time and period if unknown
 TOP_ADU = 65535.0
 
 
 @dataclass(frozen=True)
 class Fitted(ForwardModel):
-    """The light and the pixels of an acquisition, as its fit has them."""
+    """The light and the pixels of an acquisition, as fitted."""
 
     name = " fitted"
     title = "as fitted"
@@ -46,7 +46,7 @@ class Fitted(ForwardModel):
     maps: DetectorMaps
     theta: tuple[F64, ...]  # maps of each fringe set, e-, for unit response
     k: tuple[tuple[float, float], ...]  # fringe vector of each, rad/px
-    frames: tuple[FrameStates, ...]  # of each set, from the first frame of its recording on
+    frames: tuple[FrameStates, ...]  # of each set, from the first frame of its recording
 
     @property
     def is_null(self) -> bool:
@@ -54,7 +54,7 @@ class Fitted(ForwardModel):
         return False
 
     def light(self, light: Light, recording: Recording, rows: Rows, maps: DetectorMaps) -> Light:
-        """As in `ForwardModel.light`; offsets that were changed change it."""
+        """As in `ForwardModel.light`; changes of offsets change the light."""
         if recording.kind != "fringes":
             return light
         iota, of_sine, of_cosine = self.theta[recording.number]
@@ -68,7 +68,7 @@ class Fitted(ForwardModel):
 
 
 class Replica:
-    """The frames of some evidence, taken again."""
+    """Simulation of the frames of evidence."""
 
     def __init__(self, evidence: Evidence) -> None:
         sets = list(evidence.fringes.values())
@@ -92,8 +92,8 @@ class Replica:
     ) -> F32:
         """Samples (t, y, x) before they are rounded, ADU, of a fringe set (name) or stack (number).
 
-        ``models`` act on them, refused where one and the bench do not go together; ``most``:
-        frames.
+        ``models`` act on them and are refused if incompatible with the bench; ``most``: largest
+        number of frames.
         """
         detector = replace(self._bench.detector, seed=seed)
         bench = replace(self._bench, seed=seed, detector=detector)
@@ -110,7 +110,7 @@ class Replica:
 
 
 def set_recordings(evidence: Evidence) -> dict[str, Recording]:
-    """The recording of each fringe set, up to the last frame there is of it."""
+    """The recording of each fringe set, up to its last available frame."""
     sets = list(evidence.fringes.values())
     bench, starts = _bench(evidence, sets), _starts(evidence, sets)
     return {s.name: _of_set(bench, n, s, starts[s.name]) for n, s in enumerate(sets)}
@@ -138,7 +138,7 @@ def _fitted(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Fitted:
 
 
 def _states(found: FringeEvidence) -> FrameStates:
-    """Of all frames of the recording; of those left out they are nothing in particular."""
+    """States of all frames of the recording; arbitrary for frames left out."""
 
     def every(values: F64, other: float) -> F64:
         states = np.full(found.frame[-1] + 1, other)
@@ -160,7 +160,7 @@ def _period(time_s: F64) -> float:
 
 
 def _starts(evidence: Evidence, sets: Sequence[FringeEvidence]) -> dict[str | int, float]:
-    """Start of each recording after that of the acquisition, s; in order where unknown."""
+    """Start of each recording after that of the acquisition, s; in order if unknown."""
     known = [*(s.start_s for s in evidence.stacks), *(s.start_s for s in sets)]
     in_order = not np.isfinite(known).all()
     found: dict[str | int, float] = {}
@@ -200,7 +200,7 @@ def _of_stack(
 
 
 def _bench(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Bench:
-    """What effects ask a bench for; its own pixels and light are those of `Fitted`."""
+    """Bench properties that effects use; `Fitted` replaces the pixels and light."""
     exposures = [s.exptime_s for s in sets if np.isfinite(s.exptime_s)]
     contrast = [np.median(np.hypot(*s.theta[1:])[s.good] / s.theta[0][s.good]) for s in sets]
     return plain_bench(
@@ -229,7 +229,7 @@ def plain_bench(
     times_s: tuple[float, float],
     sets: Sequence[tuple[str, tuple[float, float], int, float]],
 ) -> Bench:
-    """What effects ask a bench for, where its pixels and light come from an acquisition.
+    """Bench properties that effects use, for pixels and light from an acquisition.
 
     ``times_s``: exposure time and period. ``sets``: name, baseline (mm), frames and brightest
     fringe (e-) of each fringe set. The bias is that of the evidence.

@@ -1,9 +1,9 @@
-"""Parameters of an effect from its forward model alone: score test and Gauss-Newton steps.
+"""Estimate an effect from its forward model alone: score test and Gauss-Newton steps.
 
-The frames are taken again without noise (`pixcal.simulation.replica`), with and without the effect.
-How this changes the `deviations` from the nominal bench, held against those measured, weighed by
-their noise, is the score test of strength zero (Rao 1948, Proc. Camb. Phil. Soc. 44, 50). An effect
-drawn at random, or one that mixes the noise of samples, is known by what it adds to second moments
+The frames are simulated without noise (`pixcal.simulation.replica`), with and without the effect.
+The change of the `deviations` from the nominal bench, compared with those measured and weighted by
+their noise, gives the score test of zero strength (Rao 1948, Proc. Camb. Phil. Soc. 44, 50). A
+random effect, or one that mixes the noise of samples, is detected by its second moments
 (Lin 1997, Biometrika 84, 309). Parameters follow by Gauss-Newton steps on simulations with the same
 random numbers (indirect inference: Gourieroux, Monfort & Renault 1993, J. Appl. Econometrics 8,
 S85).
@@ -26,30 +26,30 @@ from pixcal.simulation.changes import LINEAR, Changes, Key, Template, Way
 from pixcal.simulation.forward import ForwardModel, field_of, numbers, with_numbers
 
 STEP = 1.1  # factor on a parameter for its derivative
-# factors on the default of a parameter that is no strength, where the score test is made too, and
-# on the best of them
+# factors on the default of a parameter other than a strength for further score tests, then on the
+# best of these
 GRID = ((1 / 9, 1 / 3, 3.0, 9.0), (1 / 1.7, 1.7))
-HINT = 2.0  # standard deviations from which parameters are fitted
+HINT = 2.0  # sigma above which parameters are fitted
 ROUNDS = 4  # steps, each halved up to
 HALVINGS = 4  # times, until the misfit falls by less than
 CONVERGED = 0.05
-MAX_FACTOR = 3.0  # factor by which a step changes a parameter at most
-TELLING = 0.02  # share of the information from which a deviation is looked at again
-SINGULAR = 1e-6  # share of the largest eigenvalue below which parameters are not told apart
+MAX_FACTOR = 3.0  # largest factor by which a step changes a parameter
+TELLING = 0.02  # share of the information above which a deviation is used again
+SINGULAR = 1e-6  # share of the largest eigenvalue below which parameters are degenerate
 RANDOM = "changes in the second moments of frames, as its forward model predicts"
 STEADY = "changes in frames and maps that the fit does not absorb, as its forward model predicts"
 
 
 @dataclass(frozen=True)
 class Scored:
-    """What the forward model lets know of an effect's parameters."""
+    """Estimate of an effect by its forward model."""
 
     model: Any
     errors: dict[str, float]  # 1-sigma errors of the parameters that were fitted
     significance: float
     why: str
-    way: Way  # how it shows, in the deviations that tell most
-    # what it changes of them, where that holds for other frames too: second moments
+    way: Way  # how it shows, in the most informative deviations
+    # its change of these, if valid for other frames too: second moments
     template: Template | None = None
 
 
@@ -66,7 +66,7 @@ def score(kind: type[ForwardModel], evidence: Evidence) -> Scored | None:
     way = changes.way(start)
     fit = _Fit(changes, way, names)
     if way.random or way.mixes:
-        # Frames without light may tell it all: then the others need not be taken again.
+        # If frames without light hold all information, the others need not be simulated.
         keys, _ = fit.telling(start)
         fit = _Fit(changes, dataclasses.replace(way, keys=keys), names)
     return fit.result(start)
@@ -75,8 +75,8 @@ def score(kind: type[ForwardModel], evidence: Evidence) -> Scored | None:
 def score_again(
     model: ForwardModel, way: Way, evidence: Evidence, template: Template | None = None
 ) -> float:
-    """Significance of an effect in other frames, with the parameters that it has."""
-    # Its template is made anew where it is not of these pixels.
+    """Significance of an effect in other frames, with its parameters fixed."""
+    # Compute the template again if it does not match these pixels.
     changes = _changes(evidence)
     fit = _Fit(changes, way, ())
     if template is None or not changes.fits(template):
@@ -105,7 +105,7 @@ class _Fit:
     ) -> tuple[F64, F64, F64]:
         """Right-hand side, normal matrix, and variance of the right-hand side.
 
-        Where draws are random, the normal matrix is without what chance adds to it.
+        The normal matrix excludes the contribution of random draws.
         """
         count = len(templates)
         right, normal, variance = np.zeros(count), np.zeros((count, count)), np.zeros((count,) * 2)
@@ -125,11 +125,11 @@ class _Fit:
         return right, normal, variance
 
     def amplitudes(self, alone: Sequence[ForwardModel]) -> tuple[F64, F64, float]:
-        """Of models that act together: over what they are, errors, and the significance of all."""
+        """Relative amplitudes of jointly acting models, errors, and joint significance."""
         return self.together([self.template(one) for one in alone])
 
     def together(self, templates: Sequence[Template]) -> tuple[F64, F64, float]:
-        """As `amplitudes`, of what each model changes."""
+        """As `amplitudes`, given the change by each model."""
         right, normal, variance = self.sums(templates)
         inverse = inverse_normal(normal, SINGULAR)
         size = inverse @ right
@@ -144,7 +144,7 @@ class _Fit:
         return [with_numbers(null, {key: values[key]}) for key in self.strengths]
 
     def result(self, start: ForwardModel) -> Scored | None:
-        """The fit, from the effect as it is by default."""
+        """The fit, from the default effect."""
         shape, (size, error, found), tried = self._best_shape(start)
         if not np.any(error > 0):
             return None
@@ -153,7 +153,7 @@ class _Fit:
         if significance > HINT and not model.is_null:
             model, errors = self._fitted(model, errors)
         if self.way.random:
-            # One acquisition holds one draw: where it is well seen, that decides.
+            # An acquisition holds a single draw, whose scatter dominates at high significance.
             scatter = self.changes.scatter(model, self.way, self.template(model)) / 2
             for name in set(errors) & set(self.strengths):
                 errors[name] = float(np.hypot(errors[name], scatter * abs(numbers(model)[name])))
@@ -163,7 +163,7 @@ class _Fit:
         return Scored(model, errors, significance, why, telling, template)
 
     def _best_shape(self, start: ForwardModel) -> tuple[ForwardModel, tuple[F64, F64, float], int]:
-        """Parameters that are no strengths, one after the other on a grid; how many were tried."""
+        """Best other parameters than strengths, one by one on a grid; and the number of trials."""
         best, found, tried = start, self.amplitudes(self._each_strength(start)), 1
         for name in _shapes(start):
             for factors in GRID:
@@ -181,14 +181,14 @@ class _Fit:
         return best, found, tried
 
     def telling(self, model: ForwardModel) -> tuple[tuple[Key, ...], Template | None]:
-        """Deviations that hold most of the information, and their change if it holds elsewhere."""
+        """Most informative deviations, and their change if it is valid for other frames."""
         template = self.template(model)
         mean, every = template.mean, self.way.keys
         sizes = {k: self.changes.product((k,), mean, mean) for k in every}
         least, whole = TELLING * sum(sizes.values()), self.changes.product(every, mean, mean)
 
         def lost(key: Key) -> float:
-            """Without it: a map that an effect leaves alone tells the noise of others."""
+            """Information lost without it: a map without the effect still shows common noise."""
             return whole - self.changes.product([k for k in every if k != key], mean, mean)
 
         keys = tuple(k for k in every if max(sizes[k], lost(k)) >= least)
@@ -198,7 +198,7 @@ class _Fit:
     def _scaled(
         self, shape: ForwardModel, size: F64, error: F64
     ) -> tuple[ForwardModel, dict[str, float]]:
-        """A model of these amplitudes: roots, where second moments tell of it."""
+        """A model of these amplitudes: square roots if they are from second moments."""
         power = 0.5 if self.way.random else 1.0
         values, errors, usual = {}, {}, numbers(shape)
         for name, a, da in zip(self.strengths, size, error, strict=True):
@@ -210,7 +210,7 @@ class _Fit:
     def _fitted(
         self, model: ForwardModel, errors: dict[str, float]
     ) -> tuple[ForwardModel, dict[str, float]]:
-        """Gauss-Newton steps of all parameters."""
+        """Fit all parameters by Gauss-Newton steps."""
         names = [n for n in self.strengths if numbers(model)[n]] + _shapes(model)
         at = self.template(model)
         misfit = self._misfit(at)
@@ -249,7 +249,7 @@ class _Fit:
         return slopes
 
     def _misfit(self, at: Template) -> float:
-        """Weighted square of what a model leaves, but for that of the deviations themselves."""
+        """Weighted square of the residuals of a model, less that of the deviations."""
         keys, product = self.way.keys, self.changes.product
         rest = {k: at.mean[k] - 2 * self.changes.measured(k).value for k in keys}
         drawn = [k for k in keys if k in at.half]
@@ -257,12 +257,12 @@ class _Fit:
 
 
 def _shapes(model: ForwardModel) -> list[str]:
-    """Numbers that are no strengths and can be fitted."""
+    """Numbers that can be fitted, other than strengths."""
     return [k for k, v in numbers(model).items() if v and field_of(k) not in model.strengths]
 
 
 def _moved(model: ForwardModel, step: Mapping[str, float]) -> ForwardModel:
-    """The model with parameters moved, none by more than a factor of `MAX_FACTOR`."""
+    """The model with parameters changed, each by at most a factor of `MAX_FACTOR`."""
     new, values = {}, numbers(model)
     for name, size in step.items():
         value = values[name]

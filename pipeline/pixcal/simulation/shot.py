@@ -1,4 +1,4 @@
-"""A frame being made, as an effect sees it."""
+"""A frame in simulation, as presented to an effect."""
 
 from typing import Any
 
@@ -12,17 +12,17 @@ from pixcal.simulation.recording import Recording
 
 
 class Shot:
-    """Where, when and of what a frame is taken, seen by the effect at a place among the others.
+    """Context of a simulated frame for the effect at one place in the chain.
 
     Attributes
     ----------
     bench : Bench
     recording : Recording
-        That the frame belongs to; ``recording.kind`` tells bias, dark, flat and fringes apart.
+        Recording of the frame; ``recording.kind`` distinguishes bias, dark, flat and fringes.
     frame : int
         Its number in the recording.
     rows : (int, int)
-        Rows of the window at hand: first, and one after the last.
+        Present rows of the window: first, and one after the last.
     maps : DetectorMaps
         Of these rows.
     """
@@ -38,12 +38,12 @@ class Shot:
 
     @property
     def time_s(self) -> float:
-        """Start of the frame after that of the acquisition."""
+        """Start of the frame, from the start of the acquisition."""
         return self.recording.start_s + float(self.recording.times_s[self.frame])
 
     @property
     def states(self) -> FrameStates:
-        """Of all frames of the recording."""
+        """States of all frames of the recording."""
         states: FrameStates = self._chain.states
         return states
 
@@ -61,7 +61,7 @@ class Shot:
     def charge(self, frame: int) -> F32 | None:
         """Charge of another frame, without this effect; None outside the recording.
 
-        Frames -1, -2, ... are the last ones of the recording before, where it is known.
+        Frames -1, -2, ... are the last ones of the preceding recording, if known.
         """
         chain, frame = self._chain.of(frame)
         inside = 0 <= frame < chain.recording.count
@@ -70,8 +70,8 @@ class Shot:
     def surrounded(self, charge: F32, reach: int) -> F32:
         """Charge (y, x) of this frame with ``reach`` more pixels on every side, e-.
 
-        Beyond the rows at hand and the window's columns lies what the light of the frame collects
-        there: fringes go on, pixels are like those at the edge, without noise.
+        The added pixels hold the mean charge from the light of the frame: fringes continue, pixels
+        are like those at the edge, and there is no noise.
         """
         wide: F32 = self._chain.beyond(self.frame, reach)
         inside = slice(reach, -reach)
@@ -81,14 +81,14 @@ class Shot:
     def rng(self, effect: str, *key: int) -> np.random.Generator:
         """Random numbers of an effect in this frame, the same for all rows.
 
-        What differs from pixel to pixel is drawn with ``recording.pixel_rng``.
+        Quantities that differ from pixel to pixel are drawn with ``recording.pixel_rng``.
         """
         return self.recording.rng(effect, self.frame, *key)
 
     def normals(self, effect: str, frame: int | None = None) -> F32:
-        """Standard normals (y, x) of an effect, the same however rows are cut; read only.
+        """Standard normals (y, x) of an effect, independent of the range of rows; read only.
 
-        Of this frame, or of another one of the recording.
+        For this frame, or another one of the recording.
         """
         chain, frame = self._chain.of(self.frame if frame is None else frame)
         looks_back = chain.effects[self._at].frames_back > 0

@@ -1,4 +1,4 @@
-"""What was measured of single frames of a fringe set, for simulations that repeat just that."""
+"""Measured time series of a fringe set, for simulations that repeat it."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from pixcal.simulation.recording import Recording
 
 @dataclass(frozen=True)
 class Track:
-    """A quantity of the frames of a fringe set, straight between points, constant beyond them."""
+    """A quantity of the frames of a fringe set, linear between points, constant beyond them."""
 
     set: str = quantity(doc="name of the fringe set")
     time_s: tuple[float, ...] = quantity(
@@ -31,12 +31,12 @@ class Track:
         return cls(name, tuple(map(float, time_s)), tuple(map(float, values)))
 
     def scaled(self, factor: float) -> Self:
-        """The same course, ``factor`` times as large."""
+        """The same series, ``factor`` times as large."""
         return replace(self, value=tuple(factor * v for v in self.value))
 
 
 def at(tracks: Iterable[Track], name: str, time_s: F64 | float) -> F64:
-    """Sum of the tracks of a set at some times."""
+    """Sum of the tracks of a set at given times."""
     found = np.zeros(np.shape(time_s))
     for track in tracks:
         if track.set == name and track.time_s:

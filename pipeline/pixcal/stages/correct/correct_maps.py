@@ -1,11 +1,11 @@
-"""The maps of a sweep, corrected for effects: new phases of the pixels and new sums of the tiles.
+"""Correct the maps of a sweep for effects: new phases of the pixels and new sums of the tiles.
 
-The result is a sweep like that of the cube, to which the shapes of the fringes are fitted. Its
-batches are variants: each half of the frames, corrected by itself, and the map with each of the
-effects left in.
+The result is in the format of a sweep of the cube, and the shapes of the fringes are fitted to it.
+Its batches are variants: each half of the frames, corrected separately, and the map with each of
+the effects left in.
 
-A tile is corrected with the pixels around it that the effects reach over. Tiles are the columns of
-chunks of the cube, so results depend neither on memory nor on workers.
+A tile is corrected together with the surrounding pixels that the effects involve. Tiles are the
+columns of chunks of the cube, so results depend neither on memory nor on workers.
 """
 
 from collections.abc import Sequence
@@ -48,13 +48,13 @@ from pixcal.storage.cube import (
 from pixcal.storage.folder import link_files
 from pixcal.storage.manifest import read_json, write_json
 
-SAME = ("chi2", "mask", "g", "dk", "time")  # arrays of a sweep that stay
-# lines of pixels that tell what the one at the border should be; those beside it do not count
+SAME = ("chi2", "mask", "g", "dk", "time")  # unchanged arrays of a sweep
+# lines of pixels that predict the line at the border, and lines next to it that are left out
 DEPTH, SKIPPED = 24, 4
-ALONG = 1024  # pixels along a side that tell whether it is open
-# difference of chi-square by which one side is told by itself; others go by all together
+ALONG = 1024  # pixels along a side that test whether it is open
+# difference of chi-square above which a side is decided alone; the sum decides the others
 CLEAR = 9.0
-# of neighbours, so that the errors of any two of them add up in squares on average
+# signs of neighbours, chosen so that the errors of any two add in quadrature on average
 SIGNS = ((0, 0), (0, 1), (1, 0), (1, 1))
 
 
@@ -107,7 +107,7 @@ def _finish(writers: dict[str, ArrayWriter]) -> None:
 
 
 def _halve(swept: Swept, writers: dict[str, ArrayWriter], middle: int, at: tuple[int, int]) -> None:
-    """Phases of the halves of the frames relative to the whole, and their errors, from batches."""
+    """Phases of the halves of the frames relative to all frames, and their errors, from batches."""
     y, x = swept.source.ranges(at)
     batches = (0, swept.n_batches)
     phase, sigma = (
@@ -120,7 +120,7 @@ def _halve(swept: Swept, writers: dict[str, ArrayWriter], middle: int, at: tuple
 
 
 def mean_of(maps: F32, sigma: F32) -> tuple[F32, F32]:
-    """Weighted mean (y, x) of maps (batch, y, x) and its error; NaN where there is none."""
+    """Weighted mean (y, x) of maps (batch, y, x) and its error; NaN without data."""
     mean, error, _ = weighted_mean(maps.astype(float), sigma.astype(float))
     return mean.astype(np.float32), error.astype(np.float32)
 
@@ -170,7 +170,7 @@ def _correct_tile(
 def _of_neighbours(
     swept: Swept, maps: FringeMaps, after: FringeMaps, known: Mask, part: Part
 ) -> F64:
-    """Error (y, x) of a pixel's phase that comes from neighbours whose light is not known, rad."""
+    """Error (y, x) of a pixel's phase from neighbours of unknown light, rad."""
     if known.all() or not any(effect.undo_halo for effect in swept.effects):
         return np.zeros(known.shape)
     within = padded(np.ones([b - a for a, b in swept.within(part)], bool), swept, part, False)
@@ -182,7 +182,7 @@ def _of_neighbours(
 
 
 def _noise_factor(swept: Swept, maps: FringeMaps) -> F64:
-    """Noise (y, x) after the correction over that before."""
+    """Ratio (y, x) of the noise after the correction to that before."""
     light = maps.theta[0] if maps.flat is None else maps.theta[0] * maps.flat
     factor = np.ones(light.shape)
     for effect in swept.effects:
@@ -193,7 +193,7 @@ def _noise_factor(swept: Swept, maps: FringeMaps) -> F64:
 def _sums(
     swept: Swept, at: tuple[int, int], phase: F32, sigma: F32, ratio: F64, good: Mask, variants: F32
 ) -> F64:
-    """What shapes are fitted to, as the sweep leaves it."""
+    """Sums to which shapes are fitted, in the format of the sweep."""
     stored = ArrayReader(swept.folder / "sums").read((at[0], at[0] + 1), (at[1], at[1] + 1))
     (old,) = TileSums.of_rows(stored.reshape(1, -1)).planes
     k, ratios = (old.kx, old.ky), ratio.astype(np.float32)
@@ -201,14 +201,14 @@ def _sums(
     return sum_row(phase, sigma, good, variants, swept.carrier, plane)
 
 
-# What lies around the pixels of a tile: flagged pixels, and what is beyond the window
+# Surroundings of the pixels of a tile: flagged pixels, and pixels beyond the window
 
 
 def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, phase: F64) -> list[FringeMaps]:
     """The maps with unknown pixels perturbed by their errors, in the patterns of `SIGNS`.
 
-    ``unknown``: of any light up to twice that around them; ``beyond``: the window, of unknown
-    offsets that scatter as a ``phase`` (y, x), rad, does.
+    ``unknown``: pixels with any light up to twice that around them; ``beyond``: pixels outside the
+    window, whose unknown offsets scatter like ``phase`` (y, x), rad.
     """
     scatter = np.nan_to_num(robust_sigma(np.diff(phase, axis=1)) / np.sqrt(2))
     y, x = np.indices(unknown.shape)
@@ -233,7 +233,7 @@ def sides_of(sets: Sequence[Swept]) -> Sides:
 
 
 def _misfit(swept: Swept, side: int, is_open: bool) -> float:
-    """Misfit of the pixels at one side, that being open or not."""
+    """Misfit of the pixels at one side, assumed open or closed."""
     axis, last = divmod(side, 2)
     shape, (kx, ky) = swept.source.shape, swept.k
     length = shape[1 - axis]
@@ -254,7 +254,7 @@ def _misfit(swept: Swept, side: int, is_open: bool) -> float:
 
 
 def border_misfit(theta: F64, k: tuple[float, float], good: Mask) -> float:
-    """Chi-square of the first line of a strip (3, line, pixel) against the next ones' trend.
+    """Chi-square of the first line of a strip (3, line, pixel) against the trend of the next lines.
 
     ``k``: along the lines and from line to line, rad/px.
     """
@@ -275,7 +275,7 @@ def border_misfit(theta: F64, k: tuple[float, float], good: Mask) -> float:
         if not (error > 0 and np.isfinite(mean).all()):
             continue
         slope, start = np.polyfit(depth, mean[depth], 1)
-        # What an effect that is not quite known leaves in lines is no sign of a border.
+        # Residuals of an imperfectly known effect in lines do not indicate a border.
         lines_apart = robust_sigma(mean[depth] - start - slope * depth)
         total += float((mean[0] - start) ** 2 / (error**2 + lines_apart**2))
     return total

@@ -1,6 +1,6 @@
-"""Effect of the correction: change of the maps, periodic patterns, agreement of sets and halves.
+"""Result of the correction: change of the maps, periodic patterns, agreement of sets and halves.
 
-Everything is measured on pixels that are good before and after.
+All statistics use pixels that are good before and after.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,8 +21,8 @@ from pixcal.stages.evidence import Part
 from pixcal.storage.cube import ArrayReader
 
 PERIOD = 4  # rows or columns after which patterns repeat (paper, section 5.1: period of four rows)
-WORSE = 4.0  # errors from which a pattern, or a disagreement of sets, is larger than before
-ALIGNED = 0.985  # cosine between the axes of sets that see the same offsets (10 degrees)
+WORSE = 4.0  # sigma above which a pattern, or a disagreement of sets, is larger than before
+ALIGNED = 0.985  # least cosine between axes of sets that measure the same offsets (10 degrees)
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class Maps:
     before: Path  # before, after: `fit.zarr` and `corrected.zarr`
     after: Path
     sets: Mapping[str, Swept]  # by name, as they were corrected
-    axes: Mapping[str, tuple[float, float]]  # unit vector (x, y) that each measures along
+    axes: Mapping[str, tuple[float, float]]  # unit vector (x, y) along which each set measures
 
     @property
     def pairs(self) -> list[tuple[str, str, float]]:
-        """Sets along one axis, and the sign of the second one's offsets to those of the first."""
+        """Pairs of sets along one axis, and relative sign of their offsets."""
         both = combinations(self.sets, 2)
         pairs = [(a, b, float(np.dot(self.axes[a], self.axes[b]))) for a, b in both]
         return [(a, b, float(np.sign(along))) for a, b, along in pairs if abs(along) > ALIGNED]
@@ -50,14 +50,14 @@ class SetSums(NamedTuple):
     """Sums over the pixels of one set."""
 
     pixels: int
-    # (1 + effect, 2) sum of squares and largest of the change of offsets: of all, then of each
-    # effect on maps; last of those on samples
+    # (1 + effect, 2) sum of squares and largest change of offsets: total, then of each effect on
+    # maps; last, of the effects on samples
     moved: F64
-    # rows, columns: (3, n) sums over each row and column of the offsets before and after, and
-    # the count
+    # rows, columns: (3, n) sums of the offsets over each row and column, before and after, and the
+    # count
     rows: F64
     columns: F64
-    # (2, 3) before and after: squares of half the difference, what errors let expect of them, count
+    # (2, 3) before and after: squares of half the difference, values expected from errors, count
     halves: F64
     square: float  # sum of the squared offsets after
 
@@ -86,9 +86,9 @@ def measure_gain(maps: Maps, runtime: Runtime) -> dict[str, Any]:
 
 
 def worsened(sets: Mapping[str, Any], pairs: Sequence[Mapping[str, Any]]) -> str:
-    """Where the corrected maps are worse than those before; empty where they are not."""
-    # A wrong correction leaves a periodic pattern in a map, or makes sets disagree that measure the
-    # same offsets.
+    """Where the corrected maps are worse than those before; empty if nowhere."""
+    # A wrong correction leaves a periodic pattern in a map, or causes disagreement of sets that
+    # measure the same offsets.
     for name, facts in sets.items():
         for lines in ("rows", "columns"):
             own = facts[lines]
@@ -106,7 +106,7 @@ def worsened(sets: Mapping[str, Any], pairs: Sequence[Mapping[str, Any]]) -> str
         )
         pixels = min(sets[name]["pixels"] for name in pair["sets"])
         chance = pair["after_expected_px"] ** 2 * np.sqrt(2 / max(pixels, 1))
-        # Errors fall with a correction, so sets that are closer than before may exceed them more.
+        # A correction reduces errors, so sets may agree better yet exceed their errors by more.
         apart = pair["after_px"] > pair["before_px"]
         if apart and after > max(before, 0.0) + WORSE * chance:
             return (
@@ -162,7 +162,7 @@ def _of_set(maps: Maps, name: str, delta: Sequence[F64], part: Part) -> SetSums:
 
 
 def _of_halves(maps: Maps, name: str, masked: F64, part: Part) -> F64:
-    """Of half the difference between the halves of the frames, which is the noise of the map."""
+    """Sums of half the difference of the halves of the frames, which is the noise of the map."""
     batches, arrays = maps.batches(name), ("batch_delta", "batch_sigma")
     stored = [ArrayReader(maps.before / name / n).read((0, batches), *part) for n in arrays]
     parts = (slice(batches // 2), slice(batches // 2, None))
@@ -174,7 +174,7 @@ def _of_halves(maps: Maps, name: str, masked: F64, part: Part) -> F64:
 
 
 def _squares(apart: Sequence[F64], expected: Sequence[F64] | F64) -> F64:
-    """Sums (before or after; square, expected square, count) over pixels that have all."""
+    """Sums (before or after; square, expected square, count) over pixels valid in all maps."""
     good = np.isfinite(np.stack([*apart, *expected])).all(axis=0)
     both = zip(apart, expected, strict=True)
     return np.array([[(a[good] ** 2).sum(), v[good].sum(), good.sum()] for a, v in both])
@@ -208,7 +208,7 @@ def _described(
 
 
 def _patterns(profile: F64, chance: float) -> dict[str, Any] | None:
-    """Rms (px) of what repeats every `PERIOD` rows, and by chance; None in a small window."""
+    """Rms (px) of the pattern of period `PERIOD`, and by chance; None in a small window."""
     if profile.shape[1] < 3 * PERIOD:
         return None
     before, after = map(repeating, profile[:2] / np.where(profile[2] > 0, profile[2], np.nan))
@@ -216,9 +216,9 @@ def _patterns(profile: F64, chance: float) -> dict[str, Any] | None:
 
 
 def repeating(profile: F64) -> float | None:
-    """Rms of what repeats every `PERIOD` places of a profile; NaN are left out."""
-    # What changes slowly is taken off first: the mean over a period about each place, which is that
-    # of any pattern that repeats.
+    """Rms of the part of a profile with period `PERIOD`; NaN are left out."""
+    # First subtract slow changes: the mean over a period about each place, which is constant for a
+    # repeating pattern.
     half = PERIOD // 2
     kernel = np.ones(PERIOD + 1)
     kernel[[0, -1]] = 0.5
@@ -233,7 +233,7 @@ def repeating(profile: F64) -> float | None:
 
 
 def _agreement(sums: F64) -> dict[str, float]:
-    """Rms (px) before and after, and that expected from the errors."""
+    """Rms (px) before and after, and rms expected from the errors."""
     rms = np.sqrt(sums[:, :2] / np.maximum(sums[:, 2:], 1))
     names = ("before_px", "before_expected_px", "after_px", "after_expected_px")
     return dict(zip(names, rms.ravel().tolist(), strict=True))

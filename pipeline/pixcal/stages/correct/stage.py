@@ -1,7 +1,7 @@
-"""The fit with a diagnosis: identified effects are corrected where possible.
+"""The fit with a diagnosis: correct identified effects where possible.
 
-The ordinary fit and its products stay as they are. Effects on samples are corrected in a
-second sweep of the cube; effects on maps, on the maps of the sweep. The code of the fit then fits
+The ordinary fit and its products stay unchanged. Effects on samples are corrected in a second sweep
+of the cube; effects on maps are corrected on the maps of the sweep. The code of the fit then fits
 the shapes of the fringes and combines the sets.
 """
 
@@ -51,7 +51,7 @@ from pixcal.storage.products import Card
 from pixcal.storage.stage import make, require
 
 Json = dict[str, Any]
-SAMPLES = 5_000_000  # of each fringe set that are in memory at a time
+SAMPLES = 5_000_000  # samples of each fringe set in memory at a time
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -92,7 +92,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
 
 def attempt(run_dir: Path, config: Config, runtime: Runtime) -> str | None:
-    """As `run`, but what makes a correction impossible is returned, and stale maps are removed."""
+    """As `run`, but if correction is impossible, return the reason and remove stale maps."""
     try:
         run(run_dir, config, runtime)
     except (InputError, ArithmeticError, LookupError, MemoryError, ValueError) as error:
@@ -167,7 +167,7 @@ def _corrected_maps(
 def _swept_sets(
     run_dir: Path, made: Build, plan: Treatments, acquisition: Acquisition, runtime: Runtime
 ) -> tuple[dict[str, Swept], Mapping[str, Json]]:
-    """The sweeps to correct and their summaries: those of the fit, unless samples change."""
+    """Sweeps to correct and their summaries: those of the fit, unless samples are corrected."""
     of_fit, ingested = require(run_dir, "sweep"), Ingested(run_dir / "ingest")
     reduced, calibration = (run_dir / "reduce" / f"{n}.zarr" for n in ("reduced", "calibration"))
     noise = float(read_json(run_dir / "reduce" / "reduce.json")["read_noise_e"]["used"])
@@ -206,7 +206,7 @@ def _of_set(fitted: FittedSet, totals: Totals, gain: Json, before: Json, plan: T
     )
     on_samples = gain.pop("change_on_samples")
     if plan.on_samples:
-        # They are corrected together, in one sweep.
+        # Effects on samples are corrected together, in one sweep.
         by_effect[" and ".join(e.name for e in plan.on_samples)] = on_samples
     after = describe(fitted, summary.masked, summary.sigma_px)
     return gain | {
@@ -218,7 +218,7 @@ def _of_set(fitted: FittedSet, totals: Totals, gain: Json, before: Json, plan: T
 
 
 def _publish(run_dir: Path) -> None:
-    """Write the products; with nothing to correct, ``correction.json`` alone."""
+    """Write the products; only ``correction.json`` if there is nothing to correct."""
     folder = run_dir / "corrected"
     result = read_json(folder / "correction.json")
     cards: list[Card] = []
@@ -237,12 +237,12 @@ def _publish(run_dir: Path) -> None:
     write_json(run_dir / "products" / "correction.json", result)
 
 
-# Effects measured again on all frames: the diagnosis fits half of them
+# Effects remeasured on all frames, because the diagnosis fits half of them
 
 
 def remeasured(run_dir: Path, plan: Treatments, runtime: Runtime) -> Treatments:
     """The same treatments, with effects on maps remeasured on all frames where possible."""
-    # Where the memory does not suffice, effects stay as the diagnosis found them.
+    # If memory does not suffice, effects stay as the diagnosis measured them.
     chosen = [
         t
         for t in plan.every
@@ -255,7 +255,7 @@ def remeasured(run_dir: Path, plan: Treatments, runtime: Runtime) -> Treatments:
     try:
         refined = {t.effect.name: _again(t, _parts(run_dir, runtime)) for t in chosen}
     except (InputError, FileNotFoundError, np.linalg.LinAlgError):
-        # Frames are missing, or too large: what the diagnosis found is good, only less precise.
+        # Frames are missing or too large: the diagnosis's values are valid, only less precise.
         return plan
     return Treatments(tuple(refined.get(t.effect.name, t) for t in plan.every))
 
@@ -275,7 +275,7 @@ def _again(treatment: Treatment, parts: Iterator[Evidence]) -> Treatment:
 
 
 def _parts(run_dir: Path, runtime: Runtime) -> Iterator[Evidence]:
-    """Frames in turn, of the window that effects are fitted on."""
+    """Evidence of successive parts of the frames, in the window to which effects are fitted."""
     ingested = Ingested(run_dir / "ingest")
     part: Part = chosen_windows(ingested.shape)[0]
     pixels = (part[0][1] - part[0][0]) * (part[1][1] - part[1][0])

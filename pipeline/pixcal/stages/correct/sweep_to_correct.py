@@ -24,15 +24,15 @@ from pixcal.stages.treatment import Treatment
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.manifest import read_json
 
-HALVES = 2  # parts of the frames that are corrected each for itself
-BEYOND = 8  # pixels beyond an open side that are taken to be there
-# flags of pixels whose fit tells nothing of their light
+HALVES = 2  # parts of the frames that are corrected separately
+BEYOND = 8  # pixels assumed to exist beyond an open side
+# flags of pixels whose fit does not give their light
 UNKNOWN = int(PixelFlag.SATURATED | PixelFlag.NO_DATA)
 
 # top, bottom, left and right of the window, rows counted from the top
 Sides = tuple[bool, bool, bool, bool]
 CLOSED: Sides = (False, False, False, False)
-STRETCH = 1.25  # range of the codes over that of the set: undoing may take samples beyond it
+STRETCH = 1.25  # range of the codes over that of the set, which corrected samples may exceed
 FRAME_BYTES = 40  # arrays of a frame while effects are undone on it
 
 
@@ -42,20 +42,20 @@ class Swept:
 
     folder: Path  # `sweep.zarr/<set name>`
     source: ReducedSet  # for the tiles
-    treatments: tuple[Treatment, ...]  # in the order of the corrections
+    treatments: tuple[Treatment, ...]  # in order of correction
     k: tuple[float, float]  # fringe vector at the centre, rad/px
-    flat: Path | None  # map that samples were divided by
+    flat: Path | None  # map by which samples were divided
     read_noise: float  # e-
-    # corrected on samples, as if nothing were beyond the window
+    # effects corrected on samples, as if the detector ended with the window
     samples: tuple[Effect, ...] = ()
-    raw: Path | None = None  # the sweep before that
+    raw: Path | None = None  # the sweep before this correction
     exptime_s: float = 0.0
-    # where the detector goes on beyond the window: top, bottom, left, right
+    # sides at which the detector extends beyond the window: top, bottom, left, right
     open_sides: Sides = CLOSED
 
     @property
     def effects(self) -> tuple[Effect, ...]:
-        """To correct, in that order."""
+        """Effects to correct, in order."""
         return tuple(t.effect for t in self.treatments)
 
     @property
@@ -96,20 +96,20 @@ class Swept:
         return any(effect.undo_halo for effect in (*self.effects, *self.samples))
 
     def around(self, y: tuple[int, int], x: tuple[int, int]) -> Part:
-        """A tile with its halo, as far as the detector goes: beyond the window at open sides."""
+        """A tile with its halo, which extends beyond the window at open sides only."""
         ny, nx = self.source.shape
         top, bottom, left, right = (BEYOND * is_open for is_open in self.open_sides)
         rows = (max(-top, y[0] - self.halo), min(ny + bottom, y[1] + self.halo))
         return rows, (max(-left, x[0] - self.halo), min(nx + right, x[1] + self.halo))
 
     def within(self, part: Part) -> Part:
-        """The share of the window in a part."""
+        """The overlap of a part with the window."""
         (y0, y1), (x0, x1) = part
         ny, nx = self.source.shape
         return (max(0, y0), min(ny, y1)), (max(0, x0), min(nx, x1))
 
     def inside(self, y: tuple[int, int], x: tuple[int, int]) -> tuple[slice, slice]:
-        """Where a tile lies in its surroundings."""
+        """Position of a tile in its surroundings."""
         rows, columns = self.around(y, x)
         return slice(y[0] - rows[0], y[1] - rows[0]), slice(x[0] - columns[0], x[1] - columns[0])
 
@@ -120,7 +120,7 @@ def usable(theta: F64, mask: U8) -> Mask:
 
 
 def maps_of(swept: Swept, part: Part) -> tuple[FringeMaps, Mask, Mask]:
-    """Maps of a part, unknown pixels interpolated; pixels with an offset, and of known light."""
+    """Maps of a part, unknown pixels interpolated; pixels with an offset, and with known light."""
     there = swept.within(part)
     theta = fitted_theta(swept.folder, there, swept.carrier.reference)
     mask = ArrayReader(swept.folder / "mask").read(*there)
@@ -137,7 +137,7 @@ def maps_of(swept: Swept, part: Part) -> tuple[FringeMaps, Mask, Mask]:
 
 
 def free_of_samples(swept: Swept, part: Part) -> tuple[FringeMaps, Mask]:
-    """Maps of a part as a fit gives them without effects on samples; pixels (y, x) with offset."""
+    """Maps of a part as fitted without effects on samples; pixels (y, x) with an offset."""
     maps, good, _ = maps_of(replace(swept, folder=swept.raw or swept.folder), part)
     for effect in swept.samples:
         maps = undone_on_samples(effect, maps) or maps
@@ -145,7 +145,7 @@ def free_of_samples(swept: Swept, part: Part) -> tuple[FringeMaps, Mask]:
 
 
 def border_change(swept: Swept, part: Part) -> F64:
-    """Change (y, x) of the phase at open sides: charge that comes from beyond, rad."""
+    """Change (y, x) of the phase by charge from beyond open sides, rad."""
     there = swept.within(part)
     if there == part or not any(effect.undo_halo for effect in swept.samples):
         return np.zeros([b - a for a, b in part])
@@ -157,7 +157,7 @@ def border_change(swept: Swept, part: Part) -> F64:
 
 
 def padded(values: NDArray[Any], swept: Swept, part: Part, fill: float = np.nan) -> NDArray[Any]:
-    """Values (..., y, x) of the window's share in a part, with what lies beyond filled."""
+    """Values (..., y, x) of a part, given those within the window; the rest is filled."""
     pads = [(0, 0)] * (values.ndim - 2)
     pads += [(t[0] - p[0], p[1] - t[1]) for p, t in zip(part, swept.within(part), strict=True)]
     return np.pad(values, pads, constant_values=fill)
@@ -165,7 +165,7 @@ def padded(values: NDArray[Any], swept: Swept, part: Part, fill: float = np.nan)
 
 def corrected(maps: FringeMaps, effects: Sequence[Effect]) -> tuple[FringeMaps, list[F64]]:
     """Maps corrected for effects, and the change (y, x) of the phase by each, rad."""
-    # An effect that does not return finite maps of the same pixels is refused.
+    # Refuse an effect that does not return finite maps of the same pixels.
     steps = []
     for effect in effects:
         after = effect.undo(maps)
@@ -182,10 +182,10 @@ def corrected(maps: FringeMaps, effects: Sequence[Effect]) -> tuple[FringeMaps, 
 
 @dataclass
 class RestoredSet(ReducedSet):
-    """A set as `ReducedSet`, its samples freed of ``effects``, in order, as they are read.
+    """A `ReducedSet` whose samples are corrected for ``effects``, in order, when read.
 
-    ``folder``: ``RUN/reduce/reduced.zarr/<set name>``. ``calibration``: whose flat and dark samples
-    have without. ``exptime_s``: (t,).
+    ``folder``: ``RUN/reduce/reduced.zarr/<set name>``. ``calibration``: source of the flat and dark
+    that were applied to samples. ``exptime_s``: (t,).
     """
 
     effects: tuple[Effect, ...]
@@ -199,7 +199,7 @@ class RestoredSet(ReducedSet):
 
     @property
     def more_bytes(self) -> int:
-        """As in `ReducedSet.more_bytes`: a block with its surroundings, and a frame at work."""
+        """As in `ReducedSet.more_bytes`: a block with its surroundings, and a frame in progress."""
         cy, cx = self.signal.chunks[1:]
         around = (cy + 2 * self.halo) * (cx + 2 * self.halo) / (cy * cx)
         return int(around * (2 * 2 * self.block + FRAME_BYTES * (1 + len(self.effects))))
@@ -244,7 +244,7 @@ class RestoredSet(ReducedSet):
         stored, new = super().coding, self.coding
         missing = codes == stored.fill
         charge = stored.electrons(codes) * flat + dark
-        # What lies there is not known; to its neighbours it is like the frame.
+        # Missing samples act on their neighbours like the mean of the frame.
         charge[missing] = charge[~missing].mean() if not missing.all() else 0.0
         frames = np.asarray(charge[None], np.float32)
         for effect in self.effects:

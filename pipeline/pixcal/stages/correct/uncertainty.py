@@ -19,14 +19,14 @@ from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages.correct.sweep_to_correct import Swept, corrected, maps_of
 from pixcal.stages.fit.sweep import scout_tiles
 
-# peak of a tile's task for each of its pixels, those around it included (measured),
+# peak memory of a tile's task per pixel, surroundings included (measured),
 PIXEL_BYTES = 500
-EFFECT_BYTES = 40  # for each effect,
-SLOPE_BYTES = 24  # and for each parameter whose slope is taken
+EFFECT_BYTES = 40  # per effect,
+SLOPE_BYTES = 24  # and per parameter with a slope
 
 
 def moved(effect: Effect, errors: Mapping[str, float]) -> list[Effect]:
-    """The effect with each parameter in turn off by its error; names as ``couplings[0].share``."""
+    """The effect with each parameter moved by its error; keys as in ``couplings[0].share``."""
     variants: list[Effect] = []
     for name, error in errors.items():
         for step in (error, -error):
@@ -35,13 +35,13 @@ def moved(effect: Effect, errors: Mapping[str, float]) -> list[Effect]:
                 _add(plain, re.findall(r"\w+", name), step)
                 variants += parse_effects({effect.name: plain}, name, {effect.name: type(effect)})
             except (InputError, LookupError, TypeError):
-                continue  # beyond what the parameter may be: to the other side
+                continue  # outside the range of the parameter: try the other side
             break
     return variants
 
 
 def _add(plain: Any, path: Sequence[str], step: float) -> None:
-    """Add to a number of nested plain data."""
+    """Add a step to a number in nested plain data."""
     first, *rest = path
     key: Any = int(first) if isinstance(plain, list) else first
     if rest:
@@ -51,7 +51,7 @@ def _add(plain: Any, path: Sequence[str], step: float) -> None:
 
 
 def parameter_errors(swept: Swept, runtime: Runtime) -> dict[str, float | None]:
-    """Rms error (px) of a set's offsets by the parameters of each effect; None without errors."""
+    """Rms error (px) of a set's offsets from each effect's parameters; None without errors."""
     tiles = scout_tiles(swept.source.grid, 9)  # spread over the window
     runtime = within_memory("errors of the parameters", task_bytes(swept), 0, runtime)
     total = np.sum(run_tasks(partial(_tile, swept), tiles, runtime, label="parameters"), axis=0)
@@ -87,8 +87,8 @@ def parameter_variance(
 ) -> list[F64]:
     """Variance of the phase (y, x), rad², from the errors of each effect's parameters.
 
-    All together where covariance and `Effect.phase_slopes` are known, else one by one; less the
-    modes that the fit removes, of the tile ``inside`` the maps.
+    With covariances if these and `Effect.phase_slopes` are known, else parameter by parameter;
+    without the modes that the fit removes from the tile ``inside`` the maps.
     """
     variances = []
     for treatment in swept.treatments:

@@ -7,7 +7,7 @@ from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.comparison import Trial
 from pixcal.stages.diagnose.trial import Effects
 
-NEARLY_ALL = 0.9  # share of its significance from which a candidate is not scaled down
+NEARLY_ALL = 0.9  # share of its significance above which a candidate is not scaled down
 
 
 @dataclass
@@ -17,38 +17,38 @@ class Candidate:
     name: str
     estimate: Estimate | None  # from the fitted frames
     reason: str = ""  # why it was rejected; empty when it was accepted
-    needs: tuple[str, ...] = ()  # frames that would give an estimate, where there is none
+    needs: tuple[str, ...] = ()  # frames needed for an estimate, if there is none
     alone: Trial | None = None  # the bench with this effect only
-    ways: int = 1  # number of variants that were simulated; the likeliest one counts
-    # fraction of its significance that the causes accepted before it do not produce
+    ways: int = 1  # number of variants simulated; the likeliest one counts
+    # fraction of its significance that the previously accepted causes do not produce
     share: float = 1.0
-    replay: Effect | None = None  # the effect as measured, whatever its law
+    replay: Effect | None = None  # the effect as measured, without a law
 
     @property
     def significance(self) -> float:
-        """Of the estimate, sigma; zero without one."""
+        """Significance of the estimate, sigma; zero without one."""
         return 0.0 if self.estimate is None else self.estimate.significance
 
     @property
     def usable(self) -> bool:
-        """Whether there is an estimate of something."""
+        """Whether there is an estimate that can be simulated."""
         return self.estimate is not None and not self.estimate.refused and self.significance > 0
 
     @property
     def in_maps_alone(self) -> bool:
-        """Whether it shows in static maps alone, whose pattern all frames have in common."""
-        # What offsets look like by chance is then the same in the held-out frames.
+        """Whether it changes only static maps, which are common to all frames."""
+        # The chance pattern of the offsets is then the same in the held-out frames.
         return self.estimate is not None and self.estimate.effect.domains == ("space",)
 
     @property
     def law(self) -> Effect | None:
-        """The best of its laws, where the estimate is a measured curve instead."""
+        """The best-fitting law, if the estimate is a measured curve."""
         return None if self.estimate is None else self.estimate.by_law
 
     def variants(self, share: float) -> list[Effect]:
-        """Effects to simulate: as estimated, sure parameters alone, by law, scaled down, replayed.
+        """Effects to simulate: as estimated, significant part, by law, scaled down, replayed.
 
-        ``share``: fraction of its significance that the causes before it do not produce.
+        ``share``: fraction of its significance that the accepted causes do not produce.
         """
         assert self.estimate is not None
         laws = [self.law] if self.law else []
@@ -61,7 +61,7 @@ class Candidate:
         return ways
 
     def by_law(self, effect: Effect) -> Effect | None:
-        """The effect as the best of its laws describes it; None where it is its own law."""
+        """The effect by its best-fitting law; None if the effect is itself a law."""
         assert self.estimate is not None
         if effect == self.replay:
             return self.estimate.effect
@@ -75,10 +75,10 @@ class Addition:
     name: str
     effect: Effect  # as simulated
     trial: Trial
-    gain: float  # in log-likelihood, over the causes without it in as many simulations
+    gain: float  # in log-likelihood, over as many simulations of the causes without it
 
 
-Additions = dict[str, Addition]  # of every candidate the likeliest, by its name
+Additions = dict[str, Addition]  # likeliest addition of each candidate, by its name
 
 
 @dataclass
@@ -86,7 +86,7 @@ class Accepted:
     """Causes accepted so far."""
 
     current: Trial  # the bench with all of them
-    # fraction of the significance of each remaining candidate that they do not produce
+    # fraction of each remaining candidate's significance that the causes do not produce
     shares: dict[str, float]
     effects: dict[str, Effect] = field(default_factory=dict)  # by name, in the order of acceptance
     # by the name of a cause, the candidates that fit about as well
@@ -100,7 +100,7 @@ class Accepted:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Causes that were accepted, and the simulations that decided."""
+    """Accepted causes, and the simulations that the decisions rest on."""
 
     nominal: Trial  # nominal, final: the bench without effects, and with all causes
     final: Trial
@@ -109,13 +109,13 @@ class SearchResult:
     candidates: Mapping[str, Candidate]
     # by the name of a cause, the candidates that fit about as well
     alike: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    # the bench with one cause as the best of its laws describes it, by its name. A cause that is
-    # its own law is left out.
+    # the bench with one cause by its best-fitting law, by the name of the cause. A cause that is
+    # itself a law is left out.
     by_law: Mapping[str, Trial] = field(default_factory=dict)
 
 
 def likeliest(additions: Iterable[Addition]) -> Additions:
-    """Of every candidate the addition that gains most."""
+    """For each candidate, the addition with the largest gain."""
     best: Additions = {}
     for one in additions:
         if one.name not in best or one.gain > best[one.name].gain:

@@ -1,4 +1,4 @@
-"""Simulated benches compared with the held-out frames, and how far the gap shrinks by effects."""
+"""Compare simulated benches with the held-out frames; how much of the gap effects close."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,16 +25,16 @@ from pixcal.estimators.test_statistics.gap import (
 from pixcal.model.arrays import F64
 from pixcal.stages.diagnose.trial import Curves, Effects
 
-MIN_LOGLIK_GAIN = 5.0  # by which an effect must raise the log-likelihood of unseen data
+MIN_LOGLIK_GAIN = 5.0  # least rise of the log-likelihood of held-out data for an effect
 DRAWS = 200
-# share of the significance of the value that differs most, from which it is not explained. Of 107
-# benches with one or two known effects it was at most 0.38, of four with an unknown one 0.5 to 1
+# residual share of the largest difference above which it is not explained. The share was at most
+# 0.38 on 107 benches with one or two known effects, 0.5 to 1 on four with an unknown effect
 STAYS = 0.5
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A bench held against the data."""
+    """A simulated bench compared with the data."""
 
     effects: Effects
     expected: Expectation
@@ -43,7 +43,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Shrinkage:
-    """How far the gap shrinks."""
+    """How much of the gap effects close."""
 
     before: Mapping[Key, Difference]  # before, after: differences of the curves
     after: Mapping[Key, Difference]
@@ -52,14 +52,14 @@ class Shrinkage:
 
 
 def shrinkage(data: Mapping[Key, F64], nominal: Trial, other: Trial, where: set[Key]) -> Shrinkage:
-    """The gap with some effects, against the nominal bench's."""
+    """The gap with the effects of a bench, relative to that of the nominal bench."""
     before = compare(data, nominal.expected)
     after = compare(data, other.expected)
     return Shrinkage(before, after, where, remaining(before, after, where))
 
 
 def gap_interval(data: Mapping[Key, F64], shrunk: Shrinkage, other: Trial) -> tuple[float, float]:
-    """Interval (5 to 95 %) of the gap that effects leave in all curves, by their scatter."""
+    """Interval (5 to 95 %) of the residual gap over all curves, from their scatter."""
     total = shrunk.gap.total
     if not shrunk.where:
         return min(0.0, total), total
@@ -78,13 +78,13 @@ def gap_interval(data: Mapping[Key, F64], shrunk: Shrinkage, other: Trial) -> tu
 
 
 def differing(nominal: Trial, final: Trial, data: Mapping[Key, F64]) -> set[Key]:
-    """Curves that make up the gap: those that differ, and those by which causes were told."""
+    """Curves that make up the gap: those that differ, and those that identified causes."""
     where = flagged(compare(data, nominal.expected))
     if not final.effects:
         return where
     gains = likelier(data, nominal.expected, final.expected)
     where |= {key for key, gain in gains.items() if gain > MIN_LOGLIK_GAIN / 2}
-    # A cause that many curves tell a little each is still told by the one that does it best.
+    # If each of many curves favours a cause only slightly, the one that favours it most counts.
     return where or {max(gains, key=lambda key: gains[key])}
 
 
@@ -94,7 +94,7 @@ LAW_ERROR = 0.25
 
 
 class Comparison:
-    """Likelihoods and residual gaps of simulated benches, on the scales of the nominal one."""
+    """Likelihoods and residual gaps of simulated benches, on the scales of the nominal bench."""
 
     def __init__(self, reference: Reference, data: Mapping[Key, F64]) -> None:
         self.reference, self.data = reference, data
@@ -109,14 +109,14 @@ class Comparison:
     ) -> Trial:
         """A bench with effects, from the curves of its simulations.
 
-        What is added to ``beside`` has a strength known to one over its ``significance``, sigma.
+        The effect added to ``beside`` has a relative error of 1 / ``significance`` in strength.
         """
         error = 1 / max(significance, 1.0)
         start = None if beside is None else beside.expected
         return self._trial(effects, expect_with(self.reference, curves, error, start))
 
     def allowing_for_laws(self, trial: Trial, accepted: Trial) -> Trial:
-        """A trial that allows for other laws of the effects accepted before."""
+        """A trial that allows for other laws of the previously accepted effects."""
         if not accepted.effects:
             return trial
         nominal, variance = self.nominal.expected.mean, dict(trial.expected.variance)
@@ -125,12 +125,12 @@ class Comparison:
         return self._trial(trial.effects, replace(trial.expected, variance=variance))
 
     def gain_over(self, fewer: Trial, trial: Trial) -> float:
-        """Rise of the log-likelihood by a cause, allowing for other laws of those without it."""
+        """Rise of the log-likelihood by a cause, allowing for other laws of the other causes."""
         with_it, without = (self.allowing_for_laws(t, fewer) for t in (trial, fewer))
         return with_it.log_likelihood - without.log_likelihood
 
     def gain_where_differing(self, start: Trial, trial: Trial, own: Key) -> float:
-        """Rise of the log-likelihood by what differs from ``start``; ``own``: its significance."""
+        """Rise of the log-likelihood in curves that differ in ``start``, and in ``own``."""
         gains = likelier(self.data, start.expected, trial.expected)
         differences = compare(self.data, start.expected)
         where = flagged(differences)
@@ -139,20 +139,20 @@ class Comparison:
         return sum(gains[key] for key in where)
 
     def differs(self, trial: Trial) -> bool:
-        """Whether any test statistic of the data differs from a bench by more than chance."""
+        """Whether any test statistic of the data differs significantly from a bench."""
         return bool(flagged(compare(self.data, trial.expected)))
 
     def residual(self, trial: Trial, where: set[Key]) -> float:
-        """Fraction of the gap, in the test statistics ``where``, that a bench leaves."""
+        """Residual fraction of the gap, in the test statistics ``where``, with a bench."""
         before = compare(self.data, self.nominal.expected)
         return remaining(before, compare(self.data, trial.expected), where).total
 
     def gap_of(self, *trials: Trial) -> set[Key]:
-        """Test statistics that make up the gap, for these benches together."""
+        """Test statistics that make up the gap for any of these benches."""
         return set().union(*(differing(self.nominal, trial, self.data) for trial in trials))
 
     def strongest_stays(self, trial: Trial) -> bool:
-        """Whether the value that differs most from the nominal bench still does, by half of it."""
+        """Whether the largest difference from the nominal bench keeps over half of its size."""
         before = compare(self.data, self.nominal.expected)
         after = compare(self.data, trial.expected)
         where = self.gap_of(trial) & after.keys()
@@ -164,7 +164,7 @@ class Comparison:
         return left > STAYS * sizes[top]
 
     def replay_fits_better(self, replay: Trial, law: Trial) -> bool:
-        """Whether a replay is likelier than the law, or leaves less of the gap."""
+        """Whether a replay is likelier than the law, or leaves a smaller residual gap."""
         if replay.log_likelihood > law.log_likelihood:
             return True
         where = self.gap_of(replay, law)

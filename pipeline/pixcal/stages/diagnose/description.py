@@ -1,4 +1,4 @@
-"""What effects ask a bench for, and when its frames were taken: as an acquisition tells."""
+"""Bench properties that effects use, and times of the frames, from an acquisition."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -18,8 +18,8 @@ from pixcal.simulation.replica import plain_bench
 from pixcal.stages.diagnose.nominal import SetTruth
 from pixcal.stages.diagnose.parts import Half, Table, groups
 
-_LATE = 0.05  # of a period, from which frames are late
-_LIFTED = 8.0  # read noise that the level without light is lifted to
+_LATE = 0.05  # fraction of a period above which a frame counts as late
+_LIFTED = 8.0  # level without light after the pedestal, in units of the read noise
 
 
 def bench_of(
@@ -30,7 +30,7 @@ def bench_of(
     sets: Sequence[SetTruth],
     dtypes: Mapping[str, np.dtype[Any]],
 ) -> Bench:
-    """What effects ask a bench for; its own pixels and light are replaced by `Measured`."""
+    """Bench properties that effects use; `Measured` replaces the pixels and light."""
     d = acquisition.detector
     listed = [f"fringes/{s.name}" for s in acquisition.frames.fringes]
     table = tables[listed[0]] if listed else next(iter(tables.values()))
@@ -64,7 +64,7 @@ def bench_of(
 def pedestal_of(
     evidence: Sequence[Evidence], dtypes: Mapping[str, np.dtype[Any]], step: int
 ) -> int:
-    """Steps (ADU) that lift the noise without light above zero, where samples may be negative."""
+    """Pedestal (ADU) that keeps noise without light above zero, if samples may be negative."""
     low = min(float(np.min(e.bias[e.good], initial=0.0)) for e in evidence)
     noise = max(e.read_noise / e.gain for e in evidence)
     if all(dtype.kind == "f" for dtype in dtypes.values()) and noise < 0.5:
@@ -85,7 +85,7 @@ def recordings_of(
     evidence: Sequence[Evidence],
     halves: Sequence[Half],
 ) -> tuple[list[Recording], list[tuple[str, Indices]], dict[int, F64]]:
-    """Recordings, where their frames are, and light of each flat: e- for unit response, or NaN."""
+    """Recordings, places of their frames, and light of each flat: e- for unit response, or NaN."""
     start = _start(tables)
     listed = {f"fringes/{s.name}": n for n, s in enumerate(acquisition.frames.fringes)}
     recordings, places, light = [], [], {}
@@ -103,7 +103,7 @@ def recordings_of(
                 step = int(table["step"][numbers[0]]) if "step" in table else 0
                 light[n] = _light(evidence, halves, name, numbers, (exposure, step))
                 lit = np.isfinite(light[n])
-                # Of flats that are not looked at nothing is known.
+                # The light of flats outside the evidence is unknown.
                 electrons = float(light[n][lit].mean()) if lit.any() else 0.0
             after = times[numbers] - times[numbers[0]]
             known = bool(np.isfinite(after).all())
@@ -125,7 +125,7 @@ def _in_sequence(
     places: Sequence[tuple[str, Indices]],
     tables: Mapping[str, Table],
 ) -> list[Recording]:
-    """Each recording with the one before it, where time stamps tell which it is."""
+    """Each recording linked to the preceding one, if time stamps identify it."""
     stamps = [np.array(tables[name]["mjd"], float)[numbers] for name, numbers in places]
     found = []
     for recording, own in zip(recordings, stamps, strict=True):
@@ -140,7 +140,7 @@ def _in_sequence(
 
 
 def _start(tables: Mapping[str, Table]) -> dict[str, float]:
-    """Time of each array's first frame after the first of all, s; in order where unknown."""
+    """Start of each array after the first frame of the acquisition, s; in order if unknown."""
     stamps = {name: np.array(table["mjd"], float) for name, table in tables.items()}
     if all(np.isfinite(s).all() for s in stamps.values()):
         first = min(float(s.min()) for s in stamps.values())

@@ -1,4 +1,4 @@
-"""A fringe set as the fit describes it, to be simulated again."""
+"""A fringe set as fitted, for simulation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,25 +21,25 @@ from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.bench import SimulatedDetector
 from pixcal.simulation.effect import Effect, FittedFrames, FringeMaps
 
-ACROSS = 9  # pixels along the side of a frame whose level is undone
-MAP_PHASES = 12  # spread over a fringe, at which an effect on samples is undone
+ACROSS = 9  # side (pixels) of the uniform frames on which effects are undone
+MAP_PHASES = 12  # phases, evenly spread over a fringe, at which an effect on samples is undone
 _PHASES = 2 * np.pi * np.arange(MAP_PHASES) / MAP_PHASES
 _EVEN = np.stack([np.ones(MAP_PHASES), np.cos(_PHASES), np.sin(_PHASES)], axis=1)
-TURNS = 5  # of the fits of pixels and frames: each gains a factor of three or more
-# degree, over a window, of the logarithm of the contrast of two Gaussian beams (their intensities'
-# ratio is the exponential of a quadratic form)
+TURNS = 5  # iterations of the fits of pixels and frames: each gains a factor of three or more
+# polynomial degree of the logarithm of the contrast of two Gaussian beams (the ratio of their
+# intensities is the exponential of a quadratic form)
 TWO_BEAMS = 2
 
 
 @dataclass(frozen=True)
 class IntensityBeforeEffects:
-    """Levels of even light as they were before effects that are undone on samples."""
+    """Levels of uniform light before the effects that are undone on samples."""
 
     effects: Sequence[Effect]
     detector: SimulatedDetector
 
     def levels(self, levels: F64) -> F64:
-        """Even frames of these levels (e-) without the effects."""
+        """Levels (e-) of uniform frames without the effects."""
         frames = np.broadcast_to(levels[:, None, None], (len(levels), ACROSS, ACROSS))
         found = start = np.asarray(frames, np.float32)
         for effect in sorted(self.effects, key=lambda e: e.turn, reverse=True):
@@ -53,13 +53,13 @@ class IntensityBeforeEffects:
 def undone_on_samples(
     effect: Effect, maps: FringeMaps, fit: "FitOfFrames | None" = None, *, beyond: bool = False
 ) -> FringeMaps | None:
-    """Maps that a fit finds in frames without noise that an effect was undone on.
+    """Maps fitted to noise-free frames after an effect on them was undone.
 
-    None where the effect is not one of samples.
+    None if the effect does not act on samples.
 
-    fit : of the frames that the maps were fitted to; by default their phases are spread evenly
-    beyond : the fringes go on beyond the edges of the maps, as where an effect is simulated; by
-        default the effect is undone on frames that end there
+    fit : of the frames that the maps were fitted to; default: evenly spread phases
+    beyond : fringes continue beyond the edges of the maps, as in a simulation; by default the
+        effect is undone on frames that end there
     """
     flat = np.ones(maps.theta.shape[1:]) if maps.flat is None else maps.flat
     margin = effect.undo_halo if beyond else 0
@@ -77,22 +77,22 @@ def undone_on_samples(
 
 @dataclass(frozen=True)
 class FitOfFrames:
-    """What a joint fit of pixels and frames takes up of a change that depends on the phase.
+    """The part of a phase-dependent change that a joint fit of pixels and frames absorbs.
 
-    Where phases are few or not spread evenly, harmonics of a change have a part in the maps: by the
-    pixels' fit directly, and by the frames' parameters that the fit finds beside.
+    If phases are few or unevenly spread, harmonics of a change leak into the maps: directly by the
+    fit of the pixels, and by the parameters of the frames that are fitted jointly.
     """
 
     psi: F64  # (y, x) phase of the pixels, rad
-    # by_pixel, by_frames: (3, MAP_PHASES, y, x) weights by which a change at each of the phases is
-    # summed into the maps: that of the pixel itself, and that of all pixels against the phase of
-    # their own fringe
+    # by_pixel, by_frames: (3, MAP_PHASES, y, x) weights that sum a change at each phase into the
+    # maps: the change of the pixel itself, and the change of all pixels against the phase of their
+    # own fringe
     by_pixel: F32
     by_frames: F32
 
     @classmethod
     def of(cls, maps: FringeMaps, g: F64) -> Self:
-        """From the maps, and (B, A cos phi, A sin phi) of the frames, (t, 3)."""
+        """From the maps and the frame parameters (B, A cos phi, A sin phi), (t, 3)."""
         light = (maps.theta * (1.0 if maps.flat is None else maps.flat)).reshape(3, -1)
         weight = 1 / np.maximum(g @ light, MIN_SIGNAL)
         frames = _taken_by_frames(g, light)
@@ -107,7 +107,7 @@ class FitOfFrames:
         return cls(np.arctan2(*maps.theta[1:]), by_pixel, by_frames)
 
     def taken_up(self, change: F64) -> F64:
-        """Part (3, y, x) of the maps in a change (phase, y, x) of samples, in its unit."""
+        """Change (3, y, x) of the maps by a change (phase, y, x) of samples, in the same unit."""
         orders = np.arange(MAP_PHASES // 2 + 1)[:, None, None]
         turned = np.fft.rfft(change, axis=0) * np.exp(-1j * orders * self.psi)
         of_all = np.fft.irfft(turned.mean(axis=(1, 2)), MAP_PHASES)
@@ -122,7 +122,7 @@ def _phase(g: F64) -> F64:
 
 
 def _between(phase: F64) -> F64:
-    """Weights (..., MAP_PHASES) that interpolate to some phases by all harmonics."""
+    """Weights (..., MAP_PHASES) that interpolate to given phases with all harmonics."""
     apart = phase[..., None] - _PHASES
     orders = np.arange(1, MAP_PHASES // 2).reshape(-1, *[1] * apart.ndim)
     last = np.cos(MAP_PHASES // 2 * apart)
@@ -130,7 +130,7 @@ def _between(phase: F64) -> F64:
 
 
 def _taken_by_frames(g: F64, light: F64) -> F64:
-    """What the parameters (t, 3) of frames take of a change at each phase (MAP_PHASES)."""
+    """Part of a change at each phase (MAP_PHASES) that parameters (t, 3) of frames absorb."""
     psi, usual = usual_fringe(light, 2 * MAP_PHASES)
     weight = 1 / np.maximum(g @ usual, MIN_SIGNAL)
     of_pixels = np.einsum("tp,ti,tj->pij", weight, g, g)
@@ -147,7 +147,7 @@ def _taken_by_frames(g: F64, light: F64) -> F64:
 
 @dataclass(frozen=True)
 class FittedSet:
-    """What was fitted of a fringe set."""
+    """Fitted quantities of a fringe set."""
 
     theta: F64  # (3, y, x) NaN in bad pixels
     delta: F64  # delta, sigma: (y, x) offset and its error, px; NaN in bad pixels
@@ -156,14 +156,13 @@ class FittedSet:
     origin: tuple[int, int]
     flat: F64 | None = None  # (y, x)
     name: str = ""  # of the set
-    # light, contrast: (y, x) what mean and contrast of the fringes are times those that were
-    # measured
+    # light, contrast: (y, x) mean and contrast of the fringes relative to those measured
     light: F32 | float = 1.0
     contrast: F32 | float = 1.0
     frames: FittedFrames | None = None
 
     def without(self, effects: Sequence[Effect]) -> "FittedSet":
-        """The same with effects undone that act on maps: offsets as fitted with them known."""
+        """The set with effects on maps undone: offsets as fitted with the effects known."""
         maps = before = self.maps
         for effect in sorted(effects, key=lambda e: e.turn, reverse=True):
             maps = self.undone(effect, maps) or maps
@@ -190,17 +189,17 @@ class FittedSet:
 
     @cached_property
     def _untouched(self) -> "FittedSet":
-        # One for all benches whose effects leave the maps alone: its model of offsets is kept.
+        # Benches whose effects do not change the maps share one set: its offset model is cached.
         return replace(self, flat=None)
 
     @cached_property
     def maps(self) -> FringeMaps:
-        """As fitted; bad pixels are like those around them."""
+        """Fitted maps; bad pixels are filled from their neighbours."""
         theta = filled(self.theta, self.k)
         return FringeMaps(theta, self.k, self.origin, self.flat, self.name, self.frames)
 
     def undone(self, effect: Effect, maps: FringeMaps) -> FringeMaps | None:
-        """Maps without an effect, as a fit of the same frames gives them; None where none tell."""
+        """Maps without an effect, as a fit of the same frames gives them; None if unknown."""
         return effect.undo(maps) or undone_on_samples(effect, maps, self._fit, beyond=True)
 
     @cached_property
@@ -209,7 +208,7 @@ class FittedSet:
 
     @cached_property
     def offsets(self) -> OffsetModel:
-        """Offsets that can be true."""
+        """Model of the possible true offsets."""
         return true_offsets(self.delta, self.sigma, np.arctan2(*self.maps.theta[1:]))
 
 
@@ -219,7 +218,7 @@ def light_surface(theta: F64, good: Mask) -> F64:
 
 
 def contrast_surface(theta: F64, good: Mask) -> F64:
-    """Contrast (y, x) of a fit's maps as two Gaussian beams can make it over a window."""
+    """Contrast (y, x) of a fit's maps, as a smooth surface for two Gaussian beams."""
     alpha = np.hypot(*theta[1:])
     used = good & (alpha > 0) & (theta[0] > 0)
     contrast = np.divide(alpha, theta[0], out=np.full_like(alpha, np.nan), where=used)

@@ -1,4 +1,4 @@
-"""The light of the flats as it was: a lamp is no part of the detector, and none is quite steady."""
+"""Measured light of the flats: lamps are never quite steady, and not part of the detector."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from pixcal.model.arrays import F64
 from pixcal.simulation.recording import Recording
 from pixcal.stages.diagnose.fitted_set import IntensityBeforeEffects
 
-SERIES = 8  # frames of a series whose light is taken as it was in each; of fewer it is drawn
+SERIES = 8  # least frames of a series to use the measured light of each; otherwise it is drawn
 
 _FLICKER, _RISE = 103, 104  # keys of random numbers
 
@@ -21,23 +21,23 @@ _FLICKER, _RISE = 103, 104  # keys of random numbers
 class FlatLight:
     """Light of the flats."""
 
-    # flicker, wander: relative rms from frame to frame, and of levels about the line over exposure
-    # time
+    # flicker, wander: relative rms from frame to frame, and of levels about a straight line in
+    # exposure time
     flicker: float = 0.0
     wander: float = 0.0
     # relative rise of the light from frame to frame of each level, and its error
     rise: tuple[float, float] = (0.0, 0.0)
-    # whether the levels are those of one lamp; else they are taken as measured
+    # whether all levels are of one lamp; otherwise the measured levels are used
     one_lamp: bool = False
-    off: frozenset[float] = frozenset()  # exposure times (s) of levels that are of another lamp
-    freedom: float = math.inf  # degrees of freedom that ``flicker`` is known by
+    off: frozenset[float] = frozenset()  # exposure times (s) of levels from another lamp
+    freedom: float = math.inf  # degrees of freedom of ``flicker``
     # by the number of a recording, the light (t,) of each frame over the mean; NaN for frames that
     # are drawn: the first, which may lack what stayed behind, and those not looked at
     frames: Mapping[int, F64] = field(default_factory=dict)
 
     @classmethod
     def of(cls, evidence: Sequence[Evidence], light: Mapping[int, F64]) -> "FlatLight":
-        """As several parts of the frames show it; of the frames (t,) by recording, NaN unseen."""
+        """From parts of the frames; ``light`` of frames (t,) by recording, NaN if not measured."""
         found = [ladder(one) for one in evidence]
         frames = {}
         for number, own in light.items():
@@ -48,7 +48,7 @@ class FlatLight:
         return cls(
             float(np.mean(flickers)),
             float(np.mean([LAMP if one is None else one.wander for one in found])),
-            # Of all frames of a level: a part may have two of them.
+            # From all frames of a level: a part may have only two.
             rise_of(list(light.values())),
             all(one is not None for one in found),
             frozenset(float(t) for one in found if one is not None for t in one.off),
@@ -57,7 +57,7 @@ class FlatLight:
         )
 
     def factor(self, recording: Recording, frame: int) -> float:
-        """Of the light of a frame, over its recording's."""
+        """Light of a frame over that of its recording."""
         known = self.frames.get(recording.number)
         if known is not None and np.isfinite(known[frame]):
             return float(known[frame])
@@ -71,12 +71,12 @@ class FlatLight:
         return float(of_frame * (1 + self.wander * recording.rng("lamp").standard_normal()))
 
     def _rise(self, seed: int) -> float:
-        """Rise of the light in a simulation, as it may be within its error."""
+        """Rise of the light in a simulation, drawn within its error."""
         rise, error = self.rise
         return float(rise + error * np.random.default_rng([seed, _RISE]).standard_normal())
 
     def _flicker(self, seed: int) -> float:
-        """Flicker in a simulation, as it may be within its error."""
+        """Flicker in a simulation, drawn within its error."""
         if math.isinf(self.freedom):
             return self.flicker
         square = np.random.default_rng([seed, _FLICKER]).chisquare(self.freedom) / self.freedom
@@ -85,7 +85,7 @@ class FlatLight:
     def levels(
         self, recordings: Sequence[Recording], before: IntensityBeforeEffects
     ) -> dict[int, float]:
-        """Electrons of the flats, by number, before effects; of one lamp, linear in time."""
+        """Electrons of each flat, by number, before effects; linear in time if of one lamp."""
         flats = [r for r in recordings if r.kind == "flat" and r.electrons > 0]
         if not flats:
             return {}

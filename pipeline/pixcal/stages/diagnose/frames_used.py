@@ -12,14 +12,14 @@ from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.parts import Half, Table
 from pixcal.stages.evidence import Part
 
-# of an array: first and last frame, and how many
+# first frame, last frame and count, by array
 Frames = dict[str, tuple[int, int, int]]
 SAME_AXIS = 0.98  # cosine of the angle below which two sets measure along one axis
 LADDER = 3  # exposure times of flats for a linearity curve
-# equal phase steps do not show light of neighbouring frames
+# with equal phase steps, light of neighbouring frames cannot be detected
 RANDOM = "fringes with random phases"
 MORE = "more frames of the same kind"
-FRINGES = "fringes"  # for what shows in nothing else
+FRINGES = "fringes"  # for effects that other frames do not show
 
 
 def frames_of(half: Half) -> Frames:
@@ -78,7 +78,7 @@ class FramesUsed:
 def missing_frames(
     acquisition: Acquisition, tables: Mapping[str, Table], steps: Sequence[float]
 ) -> dict[str, str]:
-    """Kinds of frames that would be of use, by kind (`Effect.frames_needed`), each in words.
+    """Kinds of frames that would help, by kind (`Effect.frames_needed`), each in words.
 
     ``steps``: of each set's phase, rad; zero where phases are random.
     """
@@ -103,7 +103,7 @@ def missing_frames(
 def recommend_frames(
     missing: Mapping[str, str], kinds: Iterable[type[Effect]] = (Effect,)
 ) -> list[str]:
-    """Missing frames that tell effects apart, or else all that tell on them (default: any)."""
+    """Missing frames that separate effects, or else all that show them (default: any effect)."""
     told = [set(kind.frames_needed) for kind in kinds]
     some, every = told[0].union(*told), told[0].intersection(*told)
     for wanted in (some - every, some):

@@ -1,4 +1,4 @@
-"""A reduced run is looked at, its nominal bench simulated, and causes of the gap are searched."""
+"""Analyse a reduced run, simulate its nominal bench, and search for causes of the gap."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -44,9 +44,9 @@ CLEAR = 20.0  # significance above which a slow estimate is no test statistic
 
 @dataclass(frozen=True)
 class Inquiry:
-    """A search, and all that it was made of."""
+    """A search and its inputs."""
 
-    base: Effects  # that the nominal bench has from the start
+    base: Effects  # effects that the nominal bench includes
     look: DiagnosisInput
     trials: Trials
     reference: Reference
@@ -58,9 +58,9 @@ class Inquiry:
 def inquire(
     run_dir: Path, kinds: Mapping[str, type[Effect]], base: Effects, scratch: Path, runtime: Runtime
 ) -> Inquiry:
-    """Look at a reduced run, simulate its nominal bench, and search for causes among ``kinds``.
+    """Analyse a reduced run, simulate its nominal bench, and search for causes among ``kinds``.
 
-    ``base``: effects the bench has from the start. ``scratch``: keeps simulations, to go on with.
+    ``base``: effects that the nominal bench includes. ``scratch``: keeps simulations to resume.
     """
     candidates: dict[str, Candidate] = {}
     signatures: tuple[Signature, ...] = ()
@@ -98,7 +98,7 @@ def inquire(
 def _nominal(
     trials: Trials, look: DiagnosisInput, base: Effects, run_dir: Path
 ) -> tuple[Reference, dict[Key, F64]]:
-    """What the nominal bench lets expect, and the curves of the data on its scales."""
+    """Null distribution from the nominal bench, and the curves of the data on its scales."""
     (nominal,) = trials.curves([base], REFERENCES, "nominal bench")
     if isinstance(nominal, str):
         where = "--nominal" if base else f"{run_dir}: its nominal bench"
@@ -109,20 +109,20 @@ def _nominal(
 
 @dataclass(frozen=True)
 class _Asking:
-    """What a search asks for: simulations, and estimates on the first frames taken again."""
+    """Services for a search: simulations, and estimates on simulations of the fitted frames."""
 
     look: DiagnosisInput
     base: Effects
     kinds: Mapping[str, type[Effect]]
     candidates: Mapping[str, Candidate]
     trials: Trials
-    # significances that were found beside simulations
+    # significances that were computed in parallel with simulations
     answers: dict[tuple[Effects, tuple[str, ...]], dict[str, float]] = field(default_factory=dict)
 
     def simulate(
         self, benches: Sequence[Effects], seeds: int, label: str, asked: Sequence[str]
     ) -> list[list[Curves] | str]:
-        """Curves of benches; what is asked of the first is answered meanwhile, if there is room."""
+        """Curves of benches; meanwhile, memory permitting, ``asked`` estimates on the first one."""
 
         def answer() -> None:
             one = Runtime(cluster="sync")
@@ -132,7 +132,7 @@ class _Asking:
         return self.trials.curves([(*self.base, *b) for b in benches], seeds, label, beside)
 
     def again(self, on: Effects, names: Sequence[str]) -> dict[str, float]:
-        """Significance of candidates on the first frames taken again with some effects."""
+        """Significance of candidates on simulations of the fitted frames with given effects."""
         answer = self.answers.pop((on, tuple(names)), None)
         return self._estimated(on, names, self.look.few) if answer is None else answer
 
@@ -143,14 +143,14 @@ class _Asking:
             by_law = tuple(laws.get(effect, effect) for effect in on)
             evidence = window.evidence(window.learn, (*self.base, *by_law), LEARN_SEED)
         except InputError:
-            return {}  # These frames do not tell what the effects look like.
+            return {}  # These frames cannot show how the effects appear.
         asked = {n: _again(self.candidates[n]) or self.kinds[n] for n in names}
         found = _each_of(asked, partial(detect, evidence), few, "estimate again")
         return {name: size for name, size in found.items() if size is not None}
 
 
 def places(made: Inquiry) -> list[dict[str, Any]]:
-    """How far each window is off by itself, unless one is all there is."""
+    """Deviations of each window alone; empty if one window covers the detector."""
     look, trials = made.look, made.trials
     if len(look.windows) == 1 and look.windows[0].part == whole_of(look.windows[0].whole):
         return []
@@ -183,17 +183,17 @@ def _candidates(
 
 
 def _needs(kind: type[Effect], facts: FramesUsed) -> tuple[str, ...]:
-    """Frames that would give an estimate of an effect."""
+    """Frames needed to estimate an effect."""
     if not facts.sets and not kind.remedy:
         return (FRINGES,)
     missing = facts.missing_frames
     frames = tuple(words for name, words in missing.items() if name in kind.frames_needed)
-    # What fringes tell best may show in any frames of a sensor.
+    # Without fringes, any missing frames of a sensor may show the effect.
     return frames or (() if facts.sets else tuple(missing.values())) or (MORE,)
 
 
 def _replayed(candidate: Candidate, unseen: Evidence) -> Effect | None:
-    """The effect as measured, in full or frame by frame; None where its law says all."""
+    """The effect as measured, in full or frame by frame; None if its law is complete."""
     found = candidate.estimate
     if found is None or found.refused or found.significance < SIGNIFICANT:
         return None
@@ -213,11 +213,11 @@ def _again(candidate: Candidate) -> Again | None:
 def weakly_seen(
     candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]], *, slow: bool = True
 ) -> tuple[Signature, ...]:
-    """Candidates seen in the fitted frames; a slow one only if it is weak and none is stronger."""
-    # Flats and darks tell by themselves what slow estimates look for in fringes.
+    """Candidates significant in the fitted frames; a slow one only if weak and the strongest."""
+    # Flats and darks alone show the effects that slow estimates search for in fringes.
     seen = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
     most = max((e.significance for e in seen.values()), default=0.0)
-    # By name: the order of candidates is none of curves.
+    # Sorted by name, since the order of candidates must not affect the curves.
     return tuple(
         estimate.again or kinds[name]
         for name, estimate in sorted(seen.items())
@@ -238,7 +238,7 @@ def needs_slow(
 def _each_of(
     kinds: Mapping[str, K], ask: Callable[..., R], runtime: Runtime, label: str
 ) -> dict[str, R]:
-    """What is asked of each effect, by its name."""
+    """Result of ``ask`` for each effect, by its name."""
     bound = replace(OF_ESTIMATE, memory=runtime.memory, beside=runtime.beside)
     asked = partial(ask, bound=bound)
     results = run_tasks(asked, list(kinds.values()), runtime.here, label=label)

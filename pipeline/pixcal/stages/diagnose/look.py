@@ -1,4 +1,4 @@
-"""What a diagnosis looks at: windows of a reduced run, their nominal bench, their statistics."""
+"""Input of a diagnosis: windows of a reduced run, their nominal bench, their statistics."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -28,29 +28,28 @@ from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.manifest import read_json
 from pixcal.storage.stage import read_acquisition, require
 
-# evidence in memory and the run that it is made of, for each sample of all fringe sets (measured,
-# as the next two)
+# evidence in memory and its run, for each sample of all fringe sets (measured, like the next two)
 EVIDENCE_BYTES = 34
-# a sample of bias, dark or flat: as it was read, in the run made of it, and as a real number
+# a sample of bias, dark or flat: as read, in its run, and as a real number
 CALIBRATION_BYTES = 12
-LOOK_BYTES = 50  # what the statistics of one set need beside it, for each sample of the largest set
-ESTIMATE_BYTES = 130  # what the hungriest estimate, that of crosstalk, needs beside it
+LOOK_BYTES = 50  # additional, for the statistics of one set: for each sample of the largest set
+ESTIMATE_BYTES = 130  # additional, for the largest estimate, which is that of crosstalk
 FEWEST_FRAMES = 24  # fringe frames in each half
 
 
 @dataclass(frozen=True)
 class DiagnosisInput:
-    """What is looked at."""
+    """Windows, frames and statistics of a diagnosis."""
 
-    first: Window  # that effects are fitted on
-    windows: tuple[Window, ...]  # that they are tried on
+    first: Window  # window to which effects are fitted
+    windows: tuple[Window, ...]  # windows on which they are tested
     each: tuple[Curves, ...]  # curves of the test frames of each window
     measured: Curves  # their mean
     facts: FramesUsed
-    # runtime, few: with as many workers as fit the memory: of simulations, and of estimates
+    # runtime, few: with as many workers as fit in memory, for simulations and for estimates
     runtime: Runtime
     few: Runtime
-    # whether estimates on frames that are taken again fit in beside simulations, here
+    # whether memory suffices to run estimates in this process in parallel with simulations
     room: bool = False
 
 
@@ -59,10 +58,10 @@ def look_at(
     runtime: Runtime,
     learnt: Callable[[Evidence, Evidence, Runtime], Sequence[Signature]] = lambda *_: (),
 ) -> DiagnosisInput:
-    """Take the parts of a reduced run that are looked at, and measure their nominal bench.
+    """Select the parts of a reduced run to analyse, and measure their nominal bench.
 
-    ``learnt``: of the evidence fitted on and tried on, and how to run estimates; tells whose
-    estimates are statistics. Raises InputError: too few frames, or a part that cannot be fitted.
+    ``learnt``: given the evidence to fit and to test, and the runtime of estimates, returns the
+    estimates to use as statistics. Raises InputError: too few frames, or a part cannot be fitted.
     """
     ingested = Ingested(run_dir / "ingest")
     acquisition, reduction = _acquisition(run_dir, ingested), _reduction(run_dir)
@@ -87,14 +86,14 @@ def look_at(
             number = len(windows) + len(left_out) + 1
             halves = _evidence(run_dir, part, shape, raws, runtime, number)
         except InputError as error:
-            # In a corner there may be no light; effects are fitted in the middle.
+            # A corner may have no light; effects are fitted in the middle.
             if part == first or len(left_out) == len(parts) - 1:
                 raise
             left_out.append(LeftOut(part, str(error)))
             continue
         finally:
             del raws
-        # A bench whose flats are a little brighter is looked at in the same levels.
+        # A bench with slightly brighter flats is analysed at the same levels.
         full = halves[0].saturated | halves[1].saturated
         halves = [replace(half, full=full) for half in halves]
         if not windows:
@@ -124,7 +123,7 @@ def look_at(
 
 
 def _acquisition(run_dir: Path, ingested: Ingested) -> Acquisition:
-    """The acquisition; every window is looked at with the saturation of the whole detector."""
+    """The acquisition; every window uses the saturation level of the whole detector."""
     acquisition = read_acquisition(run_dir)
     saturation = acquisition.detector.saturation_adu or ingested.saturation_found
     used = read_json(run_dir / "reduce" / "reduce.json")["gain_e_per_adu"]["used"]
@@ -136,7 +135,7 @@ def _acquisition(run_dir: Path, ingested: Ingested) -> Acquisition:
 
 
 def _memory(half: Half, pixels: int, runtime: Runtime) -> tuple[Runtime, Runtime, bool]:
-    """Workers that fit the memory, of simulations, of estimates; if one of these fits beside."""
+    """Workers for simulations and for estimates; whether an estimate fits beside simulations."""
     largest, evidence = _samples(half, pixels)
     frames = sum(len(frames) for name, frames in half.items() if "/" not in name)
     held = EVIDENCE_BYTES * evidence + CALIBRATION_BYTES * pixels * frames
@@ -160,7 +159,7 @@ def _evidence(
     runtime: Runtime,
     number: int,
 ) -> list[Evidence]:
-    """Both halves of the frames of a window, reduced and fitted."""
+    """Evidence of both halves of the frames of a window, reduced and fitted."""
 
     def of_half(item: tuple[str, Raw]) -> Evidence:
         which, raw = item
@@ -174,7 +173,7 @@ def _evidence(
 
 
 def _samples(half: Half, pixels: int) -> tuple[int, int]:
-    """Samples of a window: of the largest fringe set, and of all; without fringes of all frames."""
+    """Samples of a window: in the largest fringe set and in all; without fringes in all frames."""
     counts = [len(frames) for name, frames in half.items() if "/" in name]
     counts = counts or [sum(map(len, half.values()))]
     return pixels * max(counts), pixels * sum(counts)

@@ -1,4 +1,4 @@
-"""The gain that the nominal bench has: as flats and its declaration tell together."""
+"""Gain of the nominal bench, from flats and the declared value together."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,32 +15,32 @@ from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import Recording
 
 DECLARED_ERROR = 0.01  # least relative error of a declared gain
-# Flats are simulated with and without effects, from the same random numbers, so many at a time,
-# until the relative change of their noise is known to this error or all flats are used.
+# Flats are simulated with and without effects, from the same random numbers, `FRAMES` at a time,
+# until the relative change of their noise has this error or all flats are used.
 FRAMES = 8
 CHANGE_ERROR = 0.003
-# shot noise over read noise, as variances, of a flat that tells what effects do to the former: with
-# the same random numbers the read noise cancels, and a response bends little down there
+# least ratio of shot to read variance in a flat that shows how effects change the shot noise: with
+# the same random numbers the read noise cancels, and nonlinearity is small at low levels
 LIT = 0.5
-# steps whose effects change the noise of flats otherwise than a gain does
+# steps whose effects change the noise of flats differently from a gain
 OF_NOISE = (Stage.CHARGE, Stage.SIGNAL, Stage.CONVERTER)
 
 
 @dataclass(frozen=True)
 class MeasuredGain:
-    """Gain of the amplifiers over the one that electrons were counted with."""
+    """Gain of the amplifiers over the gain used to count electrons."""
 
     amplifiers: F64  # (y, x) of each pixel's amplifier over the detector's mean
     # gain by photon transfer, and its 1-sigma error, of each part of the flats
     transfer: tuple[tuple[float, float], ...] = ()
-    # lags (rows, columns) whose covariances the photon transfer counts
+    # lags (rows, columns) whose covariances the photon transfer includes
     neighbours: tuple[tuple[int, int], ...] = ()
 
     def drawn(self, rng: np.random.Generator, change: float = 1.0) -> F32:
-        """Gain (y, x) over the one used, within its error; ``change``: of the variance of flats."""
+        """Gain (y, x) over the used gain, drawn within its error; ``change``: of flat variance."""
         measured = np.array([value * change for value, _ in self.transfer])
         errors = np.array([error for _, error in self.transfer])
-        # The declared gain is as wrong as the flats show it to be.
+        # The error of the declared gain is at least its difference from the flats.
         apart = abs(np.average(measured, weights=errors**-2.0) - 1) if self.transfer else 0.0
         values = np.array([1.0, *measured])
         weights = np.array([max(DECLARED_ERROR, apart), *errors]) ** -2.0
@@ -56,9 +56,10 @@ def photon_transfer_change(
     neighbours: Sequence[tuple[int, int]] = (),
     maps: DetectorMaps | None = None,
 ) -> float:
-    """What effects do to the variance of flats over their mean, neighbours at lags counted; or one.
+    """Factor on variance over mean of flats by effects, lags included; 1 without effects on it.
 
-    Photon transfer is off by the inverse, which a bench simulated with them must not have twice.
+    The photon-transfer gain is off by the inverse; a simulation with the effects must not apply it
+    twice.
     """
     flats = [r for r in recordings if r.kind == "flat" and r.electrons > 0 and r.count > 1]
     detector = bench.detector
@@ -69,7 +70,7 @@ def photon_transfer_change(
     if len(flats) < LADDER:
         flat = max(flats, key=lambda r: r.electrons)
     else:
-        # Of a ladder the gain is that at level zero: the dimmest flat with light enough.
+        # Of several levels, use the dimmest with enough light: the gain is that at level zero.
         lit = [r for r in flats if r.electrons > LIT * detector.read_noise_e**2] or flats
         flat = min(lit, key=lambda r: r.electrons)
     flat = replace(flat, bench=bench)

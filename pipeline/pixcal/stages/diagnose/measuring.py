@@ -1,4 +1,4 @@
-"""The nominal bench is measured: on a part of an acquisition, or several, of the same pixels."""
+"""Measure the nominal bench on one or more parts of an acquisition, of the same pixels."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -28,9 +28,9 @@ from pixcal.stages.diagnose.nominal import Measured, NominalBench, SetTruth, unc
 from pixcal.stages.diagnose.parts import Half, Table
 from pixcal.stages.reduce.calibration import FLAT_FLOOR
 
-NO_TEST = 10.0  # reduced chi-square of the photon transfer beyond which its gain is not believed
+NO_TEST = 10.0  # reduced chi-square of the photon transfer above which its gain is not used
 CORE = 5.0  # robust standard deviations within which the scatter of the dark signal may be noise
-_MOST_UNLIT = 0.5  # share of pixels without light up to which the others tell the light of flats
+_MOST_UNLIT = 0.5  # largest share of unlit pixels for which the lit ones set the light of flats
 
 
 def nominal_bench(
@@ -42,7 +42,7 @@ def nominal_bench(
     reduction: reduce.Config,
     dtypes: Mapping[str, np.dtype[Any]],
 ) -> NominalBench:
-    """The nominal bench that was measured by several parts of an acquisition.
+    """The nominal bench measured from one or more parts of an acquisition.
 
     ``evidence``: of the same pixels, of each of the ``halves``. ``whole``: detector's window (y,
     x).
@@ -97,10 +97,10 @@ def _pixel_noise(
     one = evidence[0]
     if not one.dithered:
         return None
-    # Where frames are too few to part, every part holds the same ones.
+    # If frames are too few to split, every part holds the same ones.
     parts = evidence if parted("bias", halves) else evidence[:1]
     bias = [s.adu for e in parts for s in e.of_kind("bias")]
-    # Noise that jumps between levels is an effect; white noise is the detector's own.
+    # Noise that jumps between levels is an effect; white noise belongs to the nominal detector.
     noisy = ~np.logical_or.reduce([jumping(frames) for frames in bias])
     return PixelNoise.of(bias, good, 1 - (one.amplifier_noise / one.read_noise) ** 2, noisy)
 
@@ -112,7 +112,7 @@ def parted(name: str, halves: Sequence[Half]) -> bool:
 
 
 def _unlit_stay_so(flat: F32, good: Mask) -> F32:
-    """Response less its minimum, unless most pixels are unlit: so simulations mask unlit ones."""
+    """Response, 0 in unlit pixels so that simulations mask them, unless most are unlit."""
     unlit = ~good & (flat <= FLAT_FLOOR)
     return np.where(unlit, np.float32(0), flat) if unlit.mean() < _MOST_UNLIT else flat
 
@@ -123,7 +123,7 @@ def _mean(maps: Sequence[F64]) -> F32:
 
 
 def _bias_before_rounding(evidence: Sequence[Evidence], dtypes: Mapping[str, np.dtype[Any]]) -> F32:
-    """Bias (ADU) of the amplifier, whose rounded samples have the measured mean."""
+    """Bias (ADU) of the amplifier such that rounded samples have the measured mean."""
     mean = _mean([e.bias for e in evidence])
     if any(dtype.kind == "f" for dtype in dtypes.values()):
         return mean
@@ -135,8 +135,8 @@ def _bias_before_rounding(evidence: Sequence[Evidence], dtypes: Mapping[str, np.
 
 
 def _response_of_fringes(evidence: Sequence[Evidence]) -> F32:
-    """Response as the light of the fringes shows it, where there are no flats."""
-    # Its scatter is lessened by what is noise, for the simulation adds its own.
+    """Response from the mean light of the fringes, if there are no flats."""
+    # Noise is removed from its scatter, because the simulation adds its own.
     parts = []
     for one in evidence:
         for found in one.fringes.values():
@@ -155,7 +155,7 @@ def _fitted(evidence: Sequence[Evidence], name: str, flat: F64 | None) -> Fitted
     one, read_noise_e = found[0], evidence[0].amplifier_noise
     good = np.all([f.good for f in found], axis=0)
     k = float(np.hypot(*one.k))
-    # The scan starts anywhere: turn the others to the first before the mean is taken.
+    # The scan starts at an arbitrary phase: rotate the others to the first before averaging.
     phasors = [f.theta[2] + 1j * f.theta[1] for f in found]
     turns = [np.angle(np.vdot(phasors[0][good], z[good])) for z in phasors]
     z = np.mean([z * np.exp(-1j * a) for z, a in zip(phasors, turns, strict=True)], axis=0)
@@ -179,7 +179,7 @@ def _fitted(evidence: Sequence[Evidence], name: str, flat: F64 | None) -> Fitted
 def _frames(
     found: Sequence[FringeEvidence], turns: Sequence[float], read_noise_e: float, first_row: int
 ) -> FittedFrames:
-    """All frames, with their phases turned along with the maps."""
+    """All frames, with their phases rotated like the maps."""
     wave = np.concatenate(
         [(f.g[:, 1] + 1j * f.g[:, 2]) * np.exp(1j * a) for f, a in zip(found, turns, strict=True)]
     )
@@ -193,10 +193,9 @@ def _frames(
 
 
 def excess_scatter(found: Sequence[FringeEvidence], good: Mask) -> float:
-    """Scatter of offsets of independent frames over their errors, at least 1.
+    """Scatter of offsets between independent frames over their errors, at least 1.
 
-    What differs from frame to frame must not be in a simulation twice: as offsets, and by the
-    effect.
+    A simulation must not contain frame-to-frame changes twice, as offsets and by the effect.
     """
     k = float(np.hypot(*found[0].k))
     most = 1.0
@@ -208,7 +207,7 @@ def excess_scatter(found: Sequence[FringeEvidence], good: Mask) -> float:
 
 
 def _dark_rate(evidence: Sequence[Evidence], halves: Sequence[Half]) -> F32:
-    """Dark signal, e-/s, its scatter lessened by noise, which the simulation adds itself."""
+    """Dark signal, e-/s, without the part of its scatter that is noise: simulations add it."""
     rate = _mean([uncoupled(e.dark_rate, np.random.default_rng(0)) for e in evidence])
     own = parted("bias", halves) and parted("dark", halves)
     noise = _rate_variance(evidence[0]) / (len(evidence) if own else 1)
@@ -221,7 +220,7 @@ def _dark_rate(evidence: Sequence[Evidence], halves: Sequence[Half]) -> F32:
 
 
 def _rate_variance(evidence: Evidence) -> float:
-    """Variance of a pixel's dark signal by noise, (e-/s)²."""
+    """Noise variance of a pixel's dark signal, (e-/s)²."""
     stacks = [*evidence.of_kind("bias"), *evidence.of_kind("dark")]
     times = np.array([np.nan_to_num(s.exptime_s) for s in stacks for _ in s.adu])
     if not len(times) or np.ptp(times) == 0:
@@ -231,7 +230,7 @@ def _rate_variance(evidence: Evidence) -> float:
 
 
 def _set_truth(found: Sequence[FringeEvidence], frames: Sequence[Indices], count: int) -> SetTruth:
-    """Straight, steady fringes with the offsets that can be true ones."""
+    """Straight, steady fringes of a set, as fitted."""
     one = found[0]
     good = np.all([f.good for f in found], axis=0)
     iota = np.mean([f.theta[0] * np.mean(f.g[:, 0]) for f in found], axis=0)
@@ -271,7 +270,7 @@ def _phases(found: Sequence[FringeEvidence], frames: Sequence[Indices], count: i
 
 
 def _gain(evidence: Sequence[Evidence], flat: F64, good: Mask, with_flats: bool) -> MeasuredGain:
-    """Gain as flats and declaration tell together, and of each amplifier where flats show steps."""
+    """Gain from flats and declared value, and of each amplifier if flats show steps."""
     amplifiers = np.ones(good.shape)
     noise = [n for e in evidence for n in _noise_ratios(e)]
     if with_flats and noise:
@@ -289,5 +288,5 @@ def _gain(evidence: Sequence[Evidence], flat: F64, good: Mask, with_flats: bool)
 
 
 def _noise_ratios(one: Evidence) -> list[F64]:
-    """Mean squares (y, x) of residuals over what shot and read noise give, of each fringe set."""
+    """Mean squared residual (y, x) over shot and read variance, of each fringe set."""
     return [Look(fringes, one).moments[0] for fringes in one.fringes.values()]

@@ -1,10 +1,10 @@
-"""The nominal bench of an acquisition: an ordinary, well-behaved bench as its own frames show it.
+"""The nominal bench of an acquisition: an ordinary bench with properties measured on its frames.
 
-Straight fringes with one fringe vector a set, two beams, constant intensity and visibility, the
-phases as they were; a linear detector without couplings; all else as measured
-(docs/explanation/diagnosis.md). What is known only within an error is drawn anew in every
-simulation. Fringes, repeating rows or columns, and curvature are taken out of the offsets, for no
-foundry makes these: they are what a simulation must bring about by some effect.
+It has straight fringes with one fringe vector per set, two beams, constant intensity and
+visibility, the measured phases, and a linear detector without coupling. All else is as measured
+(docs/explanation/diagnosis.md). Each simulation draws uncertain quantities anew within their
+errors. Fringes, repeating rows or columns, and curvature are removed from the offsets, because no
+foundry makes them: only an effect may produce them in a simulation.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,8 +34,8 @@ from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_c
 from pixcal.stages.diagnose.parts import Half, Raw, Table, select
 
 _GAIN, _NOISE, _DARK = 101, 102, 103  # keys of random numbers
-HOT = 40.0  # robust standard deviations of the dark current beyond which a pixel is hot
-# pixels around a hot one that may have got some of its charge: at most a share of `SHARED`
+HOT = 40.0  # robust standard deviations of the dark current above which a pixel is hot
+# pixels around a hot one that may have received some of its charge: at most a share of `SHARED`
 HOT_REACH = 2
 SHARED = 0.1
 
@@ -51,7 +51,7 @@ class SetTruth:
     psi: F64  # (y, x) phase of the pixels if they had no offsets, rad
     k: tuple[float, float]  # fringe vector, rad/px
     step: float  # of a ramp of the phase, rad; zero: no ramp
-    phi: F64  # (t,) phase of every frame as measured, rad; NaN for frames that were not looked at
+    phi: F64  # (t,) measured phase of every frame, rad; NaN for frames that were not fitted
 
     def phase(self, delta_x: F32, delta_y: F32) -> F64:
         """Phase (y, x) of the pixels at their offsets (px), rad."""
@@ -60,12 +60,12 @@ class SetTruth:
 
 @dataclass(frozen=True)
 class Measured(Effect):
-    """What was measured on a bench, in place of what a bench file describes."""
+    """Measured properties of a bench, in place of those of a bench file."""
 
     name = " measured"
     title = "as measured"
     acts_at = Stage.LIGHT
-    # Before all effects: what it sets would replace what they do.
+    # It acts before all effects, because it would overwrite their changes.
     order = -1
     domains = ()
     strengths = ()
@@ -106,29 +106,29 @@ class Measured(Effect):
 
 @dataclass(frozen=True)
 class NominalBench:
-    """An acquisition's nominal bench, ready to take the same frames again."""
+    """An acquisition's nominal bench, to simulate the same frames."""
 
     acquisition: Acquisition
     tables: Mapping[str, Table]  # of all frames, as in ``frames.json``
     reduction: reduce.Config
     dtypes: Mapping[str, np.dtype[Any]]  # of the samples of each array
-    bench: Bench  # geometry and what effects ask for
+    bench: Bench  # geometry and other properties that effects use
     measured: Measured  # without offsets
     noise: PixelNoise | None  # read noise of the pixels
     gain: MeasuredGain
-    fits: tuple[FittedSet, ...]  # what was fitted of each fringe set
-    # ADU that samples are higher by in the simulated converter, which has no negative codes
+    fits: tuple[FittedSet, ...]  # fitted quantities of each fringe set
+    # pedestal (ADU) of the samples in the simulated converter, which has no negative codes
     pedestal: int
-    # in the order of their arrays; one for each exposure time of calibration frames
+    # in the order of the arrays; one for each exposure time of calibration frames
     recordings: tuple[Recording, ...]
     # array of each recording and the numbers of its frames there
     places: tuple[tuple[str, Indices], ...]
 
     def simulate(self, half: Half, effects: Sequence[Effect], seed: int, *, window: int = 0) -> Raw:
-        """Frames of a half of the acquisition, from this bench with some effects.
+        """Simulate a half of the acquisition's frames with this bench and given effects.
 
-        The measured maps hold the effects, which are undone before they act anew. ``seed``: of
-        everything random. ``window``: of the detector's, for pixel noise of its own.
+        Effects are undone on the measured maps, which contain them, before they act. ``seed``: of
+        everything random. ``window``: number of the window, for independent pixel noise.
         """
         own_seed = seed + SEEDS_APART * window
         undone = IntensityBeforeEffects(effects, self.bench.detector)
@@ -173,9 +173,9 @@ class NominalBench:
     def _of_measured_k(
         self, measured: Measured, bench: Bench, effects: Sequence[Effect]
     ) -> Measured:
-        """The bench whose fringe vectors are those that were measured when effects have acted."""
-        # So is the phase that all pixels have in common: with fringes that lie elsewhere, the noise
-        # of the same seed would be another one.
+        """The bench whose fringe vectors equal the measured ones after effects have acted."""
+        # The phase common to all pixels is kept too: with shifted fringes, the same seed would give
+        # different noise.
         rows = (0, bench.detector.shape[0])
         before, after = (
             Camera(bench, rows, acting, maps=measured.maps)
@@ -193,12 +193,12 @@ class NominalBench:
                 found, (kx, ky) = sets[n], sets[n].k
                 tilt = dkx * x + dky * y
                 tilt = tilt + np.angle(np.sum(turn * np.exp(-1j * tilt)))
-                # Of offsets too, which the effects see as places.
+                # Offsets are included, because effects use them as positions.
                 sets[n] = replace(found, psi=found.psi - tilt, k=(kx - dkx, ky - dky))
         return replace(measured, sets=tuple(sets))
 
     def _electronics(self, measured: Measured, seed: int, own_seed: int, change: float) -> Measured:
-        """With gain and read noise drawn within what is known of them; samples keep their level."""
+        """With gain and read noise drawn within their errors; samples keep their level."""
         gain = self.gain.drawn(np.random.default_rng([seed, _GAIN]), change)
         m = measured.maps
         m = replace(m, bias=m.bias + np.float32(self.pedestal))
@@ -215,12 +215,12 @@ class NominalBench:
         return replace(measured, maps=maps)
 
     def _drawn(self, effects: Sequence[Effect], seed: int) -> Measured:
-        """As measured, with offsets that can be true where the effects are what they are."""
+        """As measured, with offsets drawn from those possible given the effects."""
         if not self.fits:
             return self.measured
         fits = [fit.without(effects) for fit in self.fits]
         directions = np.stack([np.array(fit.k) / np.hypot(*fit.k) for fit in fits])
-        # Sets along one axis see the same offsets.
+        # Sets along one axis measure the same offsets.
         along = [
             fit.offsets.drawn(np.random.default_rng([seed, int(abs(dy) > abs(dx))]))
             for fit, (dx, dy) in zip(fits, directions, strict=True)
@@ -229,7 +229,7 @@ class NominalBench:
         maps = replace(self.measured.maps, delta_x=delta[0], delta_y=delta[1])
         if fits[0].flat is not None:
             maps = replace(maps, response=np.maximum(fits[0].flat, 0).astype(np.float32))
-        # As the bench was without what the effects take from the fringes, and do anew.
+        # Light and contrast before the effects, which reduce them again in the simulation.
         sets = tuple(
             replace(
                 own,
@@ -242,7 +242,7 @@ class NominalBench:
 
 
 def uncoupled(dark: Dark, rng: np.random.Generator) -> Dark:
-    """Dark current (y, x) where pixels beside hot ones have that of others, not the median."""
+    """Dark current (y, x), with neighbours of hot pixels redrawn from other pixels' values."""
     rest = dark - np.median(dark)
     spread = robust_sigma(rest)
     brightest = maximum_filter(rest, size=2 * HOT_REACH + 1, mode="nearest")

@@ -1,7 +1,7 @@
-"""A part of an acquisition, as the camera wrote it, through the same stages as the whole.
+"""Reduce and fit a part of an acquisition by the same stages as the whole.
 
-The reality and every simulation of it are reduced and fitted by the same code: what differs between
-them is not in how they were looked at.
+The same code reduces and fits the data and every simulation, so the processing causes no
+difference between them.
 """
 
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ from pixcal.storage.memory import MemoryArray, MemoryBuild, MemoryPath
 
 Frames = NDArray[Any]
 Table = Mapping[str, list[Any]]
-# some frames of an acquisition: their numbers (t,), ascending, by the name of the array, such as
+# a subset of frames: their numbers (t,), ascending, by the name of the array, such as
 # ``bias`` or ``fringes/vertical``
 Half = Mapping[str, Indices]
 HERE = Runtime(cluster="sync", quiet=True)
@@ -45,12 +45,12 @@ class Raw:
 
     acquisition: Acquisition
     arrays: Mapping[str, Frames]  # (t, y, x) by name of the array
-    tables: Mapping[str, Table]  # what is known of each frame, in columns, as in ``frames.json``
+    tables: Mapping[str, Table]  # properties of each frame, in columns, as in ``frames.json``
     reduction: reduce.Config  # how to reduce them
 
     @property
     def checksum(self) -> int:
-        """Of all samples; however they are kept on the disk."""
+        """Checksum of all samples, independent of how they are stored."""
         found = 0
         for name in sorted(self.arrays):
             found = crc32(np.ascontiguousarray(self.arrays[name]).data, found)
@@ -86,7 +86,7 @@ def select(tables: Mapping[str, Table], half: Half) -> dict[str, Table]:
 
 
 def evidence_of(raw: Raw, part: Part, window: tuple[int, int]) -> Evidence:
-    """Reduce and fit a part of a window, with straight fringes: what it tells."""
+    """Reduce and fit a part of a window, with straight fringes."""
     run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction)
     return evidence.evidence_of(run, within=((part[0][0], part[1][0]), window))
 
@@ -100,7 +100,7 @@ def run_in_memory(
 ) -> MemoryPath:
     """A run of frames (t, y, x), ADU, by name of the array, as a run directory; straight fringes.
 
-    ``tables``: what is known of them, as in ``frames.json``. By default no batches are fitted.
+    ``tables``: properties of the frames, as in ``frames.json``. By default no batches are fitted.
     """
     run = MemoryPath()
     for name, samples in frames.items():

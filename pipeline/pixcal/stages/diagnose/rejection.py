@@ -1,8 +1,8 @@
-"""Why a candidate is rejected, and others in the place of an accepted cause.
+"""Why a candidate is rejected, and which candidates may replace an accepted cause.
 
-A candidate is rejected before it is accepted, or once each cause was left out in turn. A cause that
-was measured as a curve can take up what two effects do together; neither of them then adds to it.
-So the strongest of the other candidates are tried together in its place.
+A candidate is rejected before acceptance, or after each cause was left out in turn. A cause
+measured as a curve can absorb the joint effect of two others; neither then improves the fit. So
+pairs of the strongest other candidates are tried in its place.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.candidates import Candidate
 from pixcal.stages.diagnose.comparison import LAW_ERROR, MIN_LOGLIK_GAIN, Comparison, Trial
 
-# least rise of the log-likelihood of the held-out frames by a candidate of weak significance
+# least rise of the log-likelihood of the held-out frames by a candidate of low significance
 MIN_LOGLIK_GAIN_WEAK = 12.0
 OPEN = 0.15  # residual gap above which an unknown cause is assumed
 LITTLE = 0.1  # fraction of the gap that a doubtful cause must close,
@@ -23,21 +23,21 @@ BESIDE_OPEN = 0.25  # and every cause, as a fraction of the residual gap
 UNTRIED = ("not decided", "not tested", "cannot be simulated")  # how such reasons begin
 
 Rejection = tuple[str, str]  # name of a cause, and why it is rejected
-STRONGEST = 3  # candidates that are tried in the place of others
+STRONGEST = 3  # candidates that are tried as replacements
 
 
 def similar_to(name: str) -> str:
-    """Why a candidate is not tried any more beside an accepted cause."""
+    """Why a candidate is no longer tried together with an accepted cause."""
     return f"explained by {name}, which has a similar signature"
 
 
 def explained_by_other_law(name: str) -> str:
-    """Why a cause is taken back that an accepted one makes needless as it was measured."""
+    """Why a cause is rejected that another one, as measured, makes redundant."""
     return f"{name}, as measured frame by frame, explains the data as well without it"
 
 
 def needed_gain(candidate: Candidate) -> float:
-    """Gain in log-likelihood of the held-out frames that a candidate needs."""
+    """Required gain in log-likelihood of the held-out frames for a candidate."""
     return MIN_LOGLIK_GAIN if candidate.significance >= SIGNIFICANT else MIN_LOGLIK_GAIN_WEAK
 
 
@@ -56,7 +56,7 @@ def too_little(gain: float, candidate: Candidate) -> str:
 def redundant(
     comparison: Comparison, current: Trial, without: Mapping[str, Trial]
 ) -> Rejection | None:
-    """A cause without which the held-out frames are about as likely as with all causes."""
+    """A cause without which the held-out frames are about as likely."""
     gains = {name: comparison.gain_over(trial, current) for name, trial in without.items()}
     least = min(gains, key=lambda name: gains[name], default=None)
     if least is None or gains[least] >= MIN_LOGLIK_GAIN:
@@ -72,7 +72,7 @@ def doubtful(
 ) -> Rejection | None:
     """A cause that closes little of the gap and may stand in for another.
 
-    For an unknown cause: more of the gap remains than it closes, or what differs most stays. For
+    For an unknown cause: it closes little of a large gap, or the largest difference remains. For
     another law of other causes: these produce much of its significance, or it has none.
     """
     where = comparison.gap_of(current)
@@ -89,13 +89,13 @@ def doubtful(
     }
     among = [name for name in closed if closed[name] < needed[name]]
     alone = [candidates[name].alone for name in closed]
-    # Causes that each only make good for what another spoils.
+    # Causes that only compensate each other.
     if open_still > OPEN and all(
         one is not None and comparison.residual(one, where) > 1 - LITTLE for one in alone
     ):
         among = list(closed)
     least = min(among, key=lambda name: closed[name], default=None)
-    # What was not tried may be the cause of what differs most.
+    # A candidate that was not tried may cause the largest difference.
     strong = [one for one in candidates.values() if one.significance >= SIGNIFICANT]
     tried = not any(one.reason.startswith(UNTRIED) for one in strong)
     if closed and least is None and tried and comparison.strongest_stays(current):
@@ -121,7 +121,7 @@ def doubtful(
 
 @dataclass(frozen=True)
 class Exchange:
-    """Two candidates in the place of a cause."""
+    """Two candidates that replace a cause."""
 
     out: str  # name of the cause
     effects: Mapping[str, Effect]  # all causes with them, by name
@@ -129,14 +129,14 @@ class Exchange:
 
     @property
     def reason(self) -> str:
-        """Why the cause is taken back."""
+        """Why the cause is rejected."""
         return f"{' and '.join(self.new)} together explain the held-out frames better"
 
 
 def exchanges(
     causes: Mapping[str, Effect], candidates: Mapping[str, Candidate]
 ) -> tuple[Exchange, ...]:
-    """Every pair of the strongest other candidates, as measured, in the place of each cause."""
+    """Replace each cause by every pair of the strongest other candidates, as measured."""
     sizes = {
         name: one.significance
         for name, one in candidates.items()

@@ -1,4 +1,4 @@
-"""``diagnosis.json`` and the curves behind it, from what a search found."""
+"""``diagnosis.json`` and its curves, from the result of a search."""
 
 import inspect
 from collections.abc import Mapping, Sequence
@@ -30,14 +30,14 @@ from pixcal.stages.diagnose.frames_used import FRINGES, FramesUsed, recommend_fr
 Json = dict[str, Any]
 
 SCHEMA = "pixcal/diagnosis/1"
-EXPLAINED = 0.15  # share of the gap that may be left where it is called explained,
-LEFT = 0.25  # and share of any one statistic's that is off by more than
-STILL = 6.0  # standard deviations: less can be the simulation of the effects themselves
-# statistics told in units of the bench even where nothing differs
+EXPLAINED = 0.15  # largest residual gap that is called explained,
+LEFT = 0.25  # and largest residual share of any one statistic that deviates by more than
+STILL = 6.0  # standard deviations: less can come from the simulation of the effects
+# statistics reported in bench units even if they do not differ
 ALWAYS = ("allan_of_batches", "offset_by_place", "residual_noise")
-MIN_P_VALUE = 1e-12  # smallest that is told: of tails further out nobody knows the shape
-SHOWN = 3  # statistics named that gave a cause away
-# facts of a statistic that its curve has
+MIN_P_VALUE = 1e-12  # smallest reported: the shape of the tails beyond is unknown
+SHOWN = 3  # statistics listed that identified a cause
+# attributes of a curve that describe its statistic
 FACTS = ("title", "domain", "quantity", "unit", "x_label", "kind")
 
 
@@ -49,10 +49,10 @@ def describe(
     facts: FramesUsed,
     places: Sequence[Mapping[str, Any]] = (),
 ) -> tuple[Json, list[Json]]:
-    """The product, and every curve as measured, nominal and with the effects found.
+    """The product, and every curve: measured, nominal and with the effects found.
 
     ``data``: held-out curves on the reference's scales; ``measured``: in their own units;
-    ``places``: how far windows are off, `by_domain`.
+    ``places``: deviations of the windows, `by_domain`.
     """
     described = _Description(found, data, measured, reference, facts)
     return described.diagnosis(places), list(described.curves.values())
@@ -61,7 +61,7 @@ def describe(
 def by_domain(
     before: Mapping[Key, Difference], after: Mapping[Key, Difference]
 ) -> dict[str, list[float]]:
-    """Standard deviations, 0 or more, of what is furthest off in each domain, before and after."""
+    """Largest deviation (sigma, at least 0) in each domain, before and after."""
     found = {}
     for domain in DOMAINS:
         keys = [k for k in before if statistic_named(k[0]).domain == domain]
@@ -73,9 +73,9 @@ def by_domain(
 
 
 def not_compared(measured: Mapping[Key, Curve], data: Mapping[Key, F64]) -> list[str]:
-    """Titles of statistics that were measured and that the simulations lack, or have otherwise.
+    """Titles of measured statistics that simulations lack, or have in another form.
 
-    Estimates as statistics are left out: some are asked of the simulations only where it matters.
+    Estimates used as statistics are left out: simulations compute some of them only when needed.
     """
     known = known_statistics()
     return [
@@ -87,7 +87,7 @@ def not_compared(measured: Mapping[Key, Curve], data: Mapping[Key, F64]) -> list
 
 @dataclass(frozen=True)
 class _Description:
-    """Arguments of `describe`, and what follows from them."""
+    """Arguments of `describe`, and results from them."""
 
     found: SearchResult
     data: Mapping[Key, F64]
@@ -162,14 +162,14 @@ class _Description:
         by_law = self._with(found.by_law[name]) if name in found.by_law else alone
         alike = found.alike.get(name, ())
         kinds = [type(e.effect) for n in (name, *alike) if (e := found.candidates[n].estimate)]
-        # Two independent parts of the frames, joined by Fisher's rule. A likelihood ratio of e^gain
+        # Fisher's method combines two independent parts of the frames. A likelihood ratio of e^gain
         # has a chance of at most e^-gain (Markov's inequality).
         own = estimate.significance * candidate.share
         log_both = max(float(log_ndtr(-own)) - max(gain, 0.0), -600.0)
         chance = np.exp(log_both) * (1 - log_both)
         same_samples = self.facts.shared and not self.facts.sets and self.facts.on_the_same_pixels
         if same_samples or candidate.in_maps_alone:
-            # Both parts hold the same samples, or the same offsets: the second says nothing new.
+            # Both parts hold the same samples, or the same offsets: the second adds no information.
             chance = float(ndtr(-own))
         chance *= len(found.candidates) * candidate.ways
         return {
@@ -199,7 +199,7 @@ class _Description:
         }
 
     def _not_tested(self) -> Json:
-        """Effects that these frames cannot show, by the frames that would."""
+        """Effects that these frames cannot show, by the frames that could."""
         groups: Json = {}
         for candidate in self.found.candidates.values():
             if candidate.needs and candidate.needs != (FRINGES,):
@@ -207,7 +207,7 @@ class _Description:
         return groups
 
     def _telling(self, without: Trial) -> list[dict[str, str]]:
-        """Statistics that an effect makes most likely, best first."""
+        """Statistics whose likelihood an effect raises most, best first."""
         gains = likelier(self.data, without.expected, self.found.final.expected)
         best = sorted(gains, key=lambda k: -gains[k])[:SHOWN]
         return [{"statistic": k[0], "set": k[1]} for k in best if gains[k] > 1]
@@ -228,7 +228,7 @@ class _Description:
 
     @cached_property
     def curves(self) -> dict[Key, Json]:
-        """Every statistic: measured, nominal and with effects, with limits of one sigma."""
+        """Every statistic: measured, nominal and with effects, with 1-sigma limits."""
         curves, gap = {}, self.final.gap
         for key, before in self.final.before.items():
             one, after = statistic_named(key[0]), self.final.after[key]
@@ -258,7 +258,7 @@ class _Description:
         return {name: _natural(values, usual).tolist() for name, values in ends}
 
     def _where(self) -> list[Json]:
-        """Statistics that differ, most significant first; then those that only do with effects."""
+        """Statistics that differ, most significant first; then those only with effects."""
         before, after = self.final.before, self.final.after
         keys = sorted(self.where, key=lambda k: before[k].log_chance)
         keys += sorted(flagged(after) - self.where, key=lambda k: after[k].log_chance)
@@ -284,7 +284,7 @@ class _Description:
         }
 
     def _absolute(self) -> list[Json]:
-        """What differs in units of the bench, with all causes and each alone; 1 sigma intervals."""
+        """Differences in bench units, with all causes and with each alone; 1-sigma intervals."""
         candidates = self.found.candidates
         only = {n: t for n in self.found.accepted if (t := candidates[n].alone) is not None}
         rows = []
@@ -311,7 +311,7 @@ class _Description:
 
 
 def _natural(values: F64, usual: F64 | None) -> F64:
-    """From the scale of comparison to the statistic's own unit."""
+    """Convert from the scale of comparison to the unit of the statistic."""
     if usual is None:
         return values
     ratio = np.where(values > 0, np.exp(np.minimum(values, 600)), (1 + values / 3) ** 3)
@@ -319,7 +319,7 @@ def _natural(values: F64, usual: F64 | None) -> F64:
 
 
 def _closed(left: float) -> float:
-    """Share of the gap that is closed where so much is left; never less than none."""
+    """Closed share of the gap, given the residual share; at least 0."""
     return _rounded(max(1 - left, 0.0))
 
 

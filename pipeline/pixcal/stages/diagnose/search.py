@@ -1,8 +1,8 @@
-"""Search for the effects that close the gap: added one by one, then each left out in turn.
+"""Search for the effects that close the gap: add one by one, then leave each out in turn.
 
-A candidate is accepted if, with parameters fitted to other frames, it makes the held-out frames
-likelier by more than chance and complexity allow, and by more than any other. The same estimate, on
-a simulation with the accepted effects, tells how much of a candidate's significance these produce
+A candidate is accepted if, with parameters fitted to other frames, it raises the likelihood of the
+held-out frames by more than chance and complexity allow, and by more than any other. Its estimate
+on a simulation with the accepted effects shows how much of its significance these produce
 (docs/explanation/cause-search.md).
 """
 
@@ -36,19 +36,19 @@ from pixcal.stages.diagnose.rejection import (
 )
 from pixcal.stages.diagnose.trial import Curves, Effects
 
-# significance that an estimate needs where there is a gap, instead of `SIGNIFICANT`,
+# least significance of an estimate when there is a gap, instead of `SIGNIFICANT`,
 MIN_SIGMA_IN_GAP = 1.5
-MIN_SIGMA_WEAK = 1.0  # and where no candidate is significant: the weakest may be the true one
+MIN_SIGMA_WEAK = 1.0  # and when no candidate is significant: even a weak one may be true
 SCREEN = 3  # simulations of a candidate,
 CONFIRM = 8  # and of the accepted causes
-PROMISING = 0.25  # share of the best gain from which a candidate is simulated more than once,
-KNOWN_TO = 3.0  # with its effect known to one part in this: what one simulation leaves open
-MAX_CAUSES = 5  # causes that are accepted at most
-AS_GOOD = 0.1  # by which the gain of a candidate may be less than the best, to count as its equal
-# simulations that a search may use; two causes take some 80. Where they are slow, as many as this
-# much processor time (s) allows, and so many at least
+PROMISING = 0.25  # share of the best gain above which a candidate is simulated more than once,
+KNOWN_TO = 3.0  # largest significance credited after one simulation: its scatter is unknown
+MAX_CAUSES = 5  # most causes that are accepted
+AS_GOOD = 0.1  # relative difference from the best gain within which candidates are equal
+# most simulations of a search (two causes take about 80); processor time (s) that limits them if
+# they are slow; least number even then
 SIMULATIONS, SEARCH_S, LEAST_SIMULATIONS = 300, 400.0, 100
-SIMILAR = 0.7  # fraction of a candidate's significance that another effect may produce
+SIMILAR = 0.7  # largest fraction of a candidate's significance that other effects may produce
 
 
 def affordable(seconds: float) -> int:
@@ -64,9 +64,9 @@ class Search:
     """Greedy search over candidates.
 
     data : test statistics of the held-out frames, on the scales of the reference
-    simulate : of benches, seeds, label and the candidates asked of `estimates` next: statistics
-    estimates : of effects and names: significance of candidates on the fitted frames taken again
-    most : number of simulations that the search may use
+    simulate : benches, seeds, label, candidates for the next `estimates` -> statistics
+    estimates : effects, names -> significance of candidates on simulations of the fitted frames
+    most : largest number of simulations
     """
 
     def __init__(
@@ -81,12 +81,12 @@ class Search:
         self._made: dict[frozenset[Effect], int] = {}  # simulations of each bench
         self.comparison = Comparison(reference, data)
         self._causes = Accepted(self.comparison.nominal, {})
-        # all of them, and those that may yet be accepted
+        # all candidates, and those that may still be accepted
         self._candidates: Mapping[str, Candidate] = {}
         self._remaining: dict[str, Candidate] = {}
 
     def run(self, candidates: Mapping[str, Candidate]) -> SearchResult:
-        """Search; ``reason`` of the rejected candidates is filled in."""
+        """Search, and fill in ``reason`` of rejected candidates."""
         remaining = {n: c for n, c in candidates.items() if c.estimate and not c.reason}
         self._candidates, self._remaining = candidates, remaining
         self._causes = Accepted(self.comparison.nominal, dict.fromkeys(remaining, 1.0))
@@ -127,14 +127,14 @@ class Search:
         return True
 
     def _leave_explained(self, cause: str) -> None:
-        """Leave out the candidates most of whose significance the causes produce."""
+        """Leave out candidates whose significance comes mostly from the causes."""
         shares = self._causes.shares = self._unexplained()
         for name in [n for n, share in shares.items() if share < 1 - SIMILAR]:
             self._candidates[name].reason = similar_to(cause)
             del self._remaining[name], shares[name]
 
     def _exchange(self) -> bool:
-        """Where the data still differ, put two other candidates in the place of a cause."""
+        """If the data still differ, replace a cause by two other candidates."""
         causes, remaining, candidates = self._causes, self._remaining, self._candidates
         options = exchanges(causes.effects, candidates)
         count = len(causes.effects) + 1
@@ -142,7 +142,7 @@ class Search:
         if not options or len(options) + 1 > left or not self.comparison.differs(causes.current):
             return False
         benches = [tuple(one.effects.values()) for one in options]
-        # One simulation of each to choose by; some more, before all that confirm the choice.
+        # Choose by one simulation of each, then by a few, before the choice is confirmed.
         for seeds, needed in ((1, 0.0), (SCREEN, MIN_LOGLIK_GAIN_WEAK)):
             tried = self._simulate([causes.bench, *benches], seeds, "exchanged", ())
             likely = [
@@ -175,13 +175,13 @@ class Search:
     def _favoured(
         self, laws: Additions, replays: Additions
     ) -> tuple[dict[str, float], Effect | None, str]:
-        """Gain of every candidate, and effect and name of the best that gains enough."""
+        """Gain of every candidate, and effect and name of the best with sufficient gain."""
         candidates = self._candidates
-        # A replay takes the place of the law where it fits better.
+        # A replay replaces the law if it fits better.
         gains = {name: law.gain for name, law in laws.items()}
         enough = {n: g for n, g in gains.items() if g >= needed_gain(candidates[n])}
         if gains and not enough:
-            # No law of any effect does; one of them may yet have acted by another law.
+            # No law of any effect suffices, but an effect may have acted by another law.
             enough = {n: r.gain for n, r in replays.items() if r.gain >= MIN_LOGLIK_GAIN_WEAK}
             gains |= enough
             laws |= {name: replays[name] for name in enough}
@@ -198,7 +198,7 @@ class Search:
         return gains, effect, best
 
     def _best(self, gains: dict[str, float]) -> str:
-        """The candidate that gains most; among equals, the one that does so by its law."""
+        """The candidate with the largest gain; among equals, one that is described by its law."""
         # A curve measured at many levels can imitate another effect.
         most = max(gains.values())
         equals = {n: g for n, g in gains.items() if g >= (1 - AS_GOOD) * most}
@@ -209,7 +209,7 @@ class Search:
         return max(equals, key=lambda n: equals[n])
 
     def _reject_insignificant(self) -> None:
-        """Leave out candidates that the fitted frames show no more than the causes produce."""
+        """Leave out candidates whose significance does not exceed what the causes produce."""
         causes, remaining, sizes = self._causes, self._remaining, self._sizes()
         least = SIGNIFICANT
         if self.comparison.differs(causes.current):
@@ -224,12 +224,12 @@ class Search:
                 del remaining[name]
 
     def _sizes(self) -> dict[str, float]:
-        """Significance of the remaining candidates beyond what the causes produce."""
+        """Significance of the remaining candidates that the causes do not produce."""
         shares = self._causes.shares
         return {n: c.significance * shares.get(n, 1.0) for n, c in self._remaining.items()}
 
     def _reject_undecided(self) -> None:
-        """Leave out the weakest where all would take more simulations than are left at the end."""
+        """Leave out the weakest candidates if simulations do not suffice for all."""
         causes, remaining, sizes = self._causes, self._remaining, self._sizes()
         count = len(causes.effects) + 1
         weighed = count * (2 * CONFIRM + SCREEN) + count * (count - 1) // 2 * CONFIRM
@@ -252,10 +252,10 @@ class Search:
         return self._ask(benches, seeds, label, asked)
 
     def _tried(self) -> tuple[Additions, Additions]:
-        """Each candidate added to the causes: its likeliest variant by law, and its replay.
+        """Add each candidate to the causes: its likeliest variant by law, and its replay.
 
-        A replay may imitate what another effect does by its law, so it is kept apart. One
-        simulation each shows which variants are promising; others wait if one of these gains
+        A replay may imitate the law of another effect, so it is kept separate. One simulation of
+        each shows which variants are promising; the rest are simulated only if none of these gains
         enough.
         """
         causes, remaining = self._causes, self._remaining
@@ -270,7 +270,7 @@ class Search:
                 remaining[name].alone = addition.trial
         least = PROMISING * max((one.gain for one in once), default=0.0)
         hopeful = {one.name for one in once if one.gain >= least}
-        # A replay is held against the best of its laws, which may be without promise itself.
+        # A replay is compared with its best law, even if that law is not promising.
         laws = likeliest(o for o in once if o.effect != remaining[o.name].replay)
         promising = [
             one
@@ -279,7 +279,7 @@ class Search:
         ]
         tried = self._added([(o.name, o.effect) for o in promising], SCREEN, "candidates")
         if all(one.gain < needed_gain(remaining[one.name]) for one in tried):
-            # Some may be refused by now: of other seeds.
+            # Some may have been refused in the meantime, with other seeds.
             rest = [one for one in once if one not in promising and one.name in remaining]
             others = [(one.name, one.effect) for one in rest if one.gain > 0]
             tried += self._added(others, SCREEN, "candidates")
@@ -295,7 +295,7 @@ class Search:
         *,
         drop: bool = True,
     ) -> list[Addition]:
-        """Variants added to the causes, by log-likelihoods; ``drop`` those not simulated."""
+        """Variants added to the causes, with their gains; ``drop`` those that were refused."""
         causes, candidates = self._causes, self._candidates
         beside = self._start(causes.bench, simulations)
         start = self.comparison.allowing_for_laws(beside, causes.current)
@@ -315,8 +315,8 @@ class Search:
             trial = self.comparison.allowing_for_laws(trial, causes.current)
             gain = trial.log_likelihood - start.log_likelihood
             if candidates[name].in_maps_alone:
-                # Chance does the same to all statistics of a pattern, which are no more unlikely
-                # together than one of them.
+                # Chance acts alike on all statistics of a pattern: together they are no less likely
+                # than one of them.
                 own = signature_key(effect.name, effect.domains[0])
                 gain = min(gain, self.comparison.gain_where_differing(start, trial, own))
             made.append(Addition(name, effect, trial, gain))
@@ -329,13 +329,13 @@ class Search:
     def _confirmed(
         self, effects: Effects, simulations: int = CONFIRM, asked: Sequence[str] = ()
     ) -> Trial | str:
-        """A bench with some effects, or why it cannot be simulated."""
+        """A bench with the given effects, or why it cannot be simulated."""
         (curves,) = self._simulate([effects], simulations, "confirm", asked)
         return curves if isinstance(curves, str) else self.comparison.trial(effects, curves)
 
     def _start(self, effects: Effects, simulations: int = CONFIRM) -> Trial:
-        """A bench with some effects; the nominal one without any, or if they are refused."""
-        # What has been simulated with more effects is hardly ever refused with fewer.
+        """A bench with the given effects; the nominal one if there are none or they are refused."""
+        # A bench that was simulated with more effects is hardly ever refused with fewer.
         nominal = self.comparison.nominal
         trial = self._confirmed(effects, simulations) if effects else nominal
         return nominal if isinstance(trial, str) else trial
@@ -351,7 +351,7 @@ class Search:
         }
 
     def _each_weighed(self) -> SearchResult:
-        """Leave each cause out in turn, and reject those that add nothing to the others."""
+        """Leave each cause out in turn, and reject redundant and doubtful ones."""
         candidates, effects, current = self._candidates, self._causes.effects, self._causes.current
         while True:
             without = self._each_left_out(effects)
@@ -373,7 +373,7 @@ class Search:
             effects |= {one: e for one in effects for e in current.effects if e.name == one}
             without = self._each_left_out(effects)
         for name, effect in effects.items():
-            # Of as many simulations as all together: three tell little of what is random.
+            # As many simulations as for all causes: three show random effects poorly.
             alone = self._confirmed((effect,))
             if not isinstance(alone, str):
                 candidates[name].alone = alone
@@ -392,7 +392,7 @@ class Search:
     def _needless(
         self, effects: Mapping[str, Effect], current: Trial
     ) -> tuple[str, str, Trial] | None:
-        """A cause made needless by another of the same step and domains; the bench without it."""
+        """A cause made redundant by another of the same step and domains; the bench without it."""
         candidates = self._candidates
         for name in sorted(effects, key=lambda n: candidates[n].significance):
             own = effects[name]
@@ -414,7 +414,7 @@ class Search:
         return None
 
     def _by_laws(self, effects: Mapping[str, Effect]) -> dict[str, Trial]:
-        """Each effect alone, as the best of its laws describes it."""
+        """The bench with each effect alone, by its best-fitting law."""
         trials = {}
         for name, effect in effects.items():
             law = self._candidates[name].by_law(effect)
@@ -429,7 +429,7 @@ class Search:
             name: tuple(e for n, e in effects.items() if n != name)
             for name in (effects if len(effects) > 1 else ())
         }
-        # All at once, side by side; below they are at hand.
+        # Simulate all in parallel; the next line finds the results.
         self._simulate(list(benches.values()), CONFIRM, "each cause left out", ())
         return {name: self._start(benches.get(name, ())) for name in effects}
 
@@ -437,7 +437,7 @@ class Search:
 def _reject(
     name: str, reason: str, effects: dict[str, Effect], candidates: Mapping[str, Candidate]
 ) -> None:
-    """Take a cause back, and what was rejected for its sake."""
+    """Reject a cause, and the candidates that were rejected as similar to it."""
     candidates[name].reason = reason
     for candidate in candidates.values():
         if candidate.reason == similar_to(name):

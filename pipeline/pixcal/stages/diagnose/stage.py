@@ -1,7 +1,7 @@
-"""``pixcal diagnose``: where data and simulation differ, which effect causes it, what remains.
+"""``pixcal diagnose``: differences of data and simulation, their causes, and the residual gap.
 
-The frames are parted in blocks: on half of them effects are fitted, on the others they are tried.
-Both the data and every simulation of them are reduced and fitted by the same stages.
+The frames are split in blocks: effects are fitted to half of them and tested on the other half.
+The same stages reduce and fit the data and every simulation.
 """
 
 import hashlib
@@ -94,19 +94,19 @@ def _kinds(config: Config, known: Mapping[str, type[Effect]]) -> dict[str, type[
 
 
 def _base(nominal: Path | None, known: Mapping[str, type[Effect]]) -> Effects:
-    """Effects that the nominal bench has from the start."""
+    """Effects that the nominal bench includes."""
     if nominal is None:
         return ()
     return parse_effects(load_bench(nominal).effects, str(nominal), known)
 
 
-# What a cause does to the map of offsets
+# Change of the offset map by a cause
 
 
 def on_map(effect: Effect, fits: Iterable[FittedSet], run_dir: Path) -> dict[str, Any]:
-    """Rms and maximum (px) of the offsets' change by undoing an effect, and what is to be done.
+    """Rms and maximum (px) change of the offsets by undoing an effect, and the treatment.
 
-    On maps of every set and window, modes removed; zero where free parameters take it up.
+    On maps of every set and window, modes removed; zero if free parameters absorb it.
     """
     action = treatment_of(effect, *fitted_shapes(run_dir)).action
     square, count, most = 0.0, 0, 0.0
@@ -120,7 +120,7 @@ def on_map(effect: Effect, fits: Iterable[FittedSet], run_dir: Path) -> dict[str
 
 
 def _change(effect: Effect, fit: FittedSet) -> F64:
-    """Change (pixel,) of the offsets of good pixels by an effect, px; modes taken off."""
+    """Change (pixel,) of the offsets of good pixels by an effect, px; modes removed."""
     good = np.isfinite(fit.theta).all(axis=0) & np.isfinite(fit.delta)
     maps = fit.maps
     after = fit.undone(effect, maps) or effect.predict(maps)

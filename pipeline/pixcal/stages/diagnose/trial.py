@@ -1,4 +1,4 @@
-"""The bench taken again: simulations of the windows that are looked at, through the same stages."""
+"""Simulations of the analysed windows, processed by the same stages as the data."""
 
 import threading
 import time
@@ -24,34 +24,34 @@ from pixcal.stages.diagnose.parts import Half, evidence_of
 from pixcal.stages.evidence import Part
 from pixcal.storage.manifest import digest, read_json, write_json
 
-# the slowest seen took 16 s: telegraph noise of 40,000 pixels whose read noise differs
+# the slowest so far took 16 s: telegraph noise of 40,000 pixels with different read noise
 OF_ESTIMATE = Bound(seconds=45.0)
 
 _SLOW = threading.Lock()
 
 T = TypeVar("T")
 Curves = dict[Key, Curve]
-# an effect whose estimate is a statistic; or, by its forward model, the score test of just it
+# an effect whose estimate is a statistic; or the score test of one effect by its forward model
 Signature = type[Effect] | Again
 Effects = tuple[Effect, ...]
 
 
 @dataclass(frozen=True)
 class Window:
-    """A part of the detector that is looked at."""
+    """A part of the detector to analyse."""
 
     part: Part  # rows and columns
-    bench: NominalBench  # as measured there
-    learn: Half  # learn, test: frames that effects are fitted on, and frames that they are tried on
+    bench: NominalBench  # measured in this window
+    learn: Half  # learn, test: frames to which effects are fitted, and held-out frames
     test: Half
     whole: tuple[int, int]  # rows and columns of the detector's window
-    # to which those of simulations are added: every acquisition is held against other random
-    # numbers, so that what chance does to one is not done to all of them
+    # added to the seeds of simulations: each acquisition is compared with different random numbers,
+    # so that chance does not act alike on all of them
     seed: int = 0
     full: frozenset[Level] = frozenset()  # flats that saturate
 
     def evidence(self, half: Half, effects: Effects, seed: int, *, number: int = 0) -> Evidence:
-        """A half of the frames, taken again with some effects (`NominalBench.simulate`)."""
+        """Evidence of a simulated half of the frames with effects (`NominalBench.simulate`)."""
         own = self.seed + seed
         raw = self.bench.simulate(half, effects, own, window=number)
         return replace(evidence_of(raw, self.part, self.whole), full=self.full)
@@ -59,15 +59,15 @@ class Window:
 
 @dataclass(frozen=True)
 class Trials:
-    """Simulations of the test frames of some windows; none is made twice."""
+    """Simulations of the test frames of all windows; none is made twice."""
 
     windows: tuple[Window, ...]
-    # folder for what is written in between; a run that goes on finds its simulations there
+    # folder for intermediate files; a resumed run finds its simulations there
     scratch: Path
     runtime: Runtime
-    signatures: tuple[Signature, ...] = ()  # effects whose estimates are statistics too
-    # by name, of effects whose parameters are known within errors: from the seed ``exact`` on they
-    # are moved by these, so that the scatter of the simulations holds what they leave open
+    signatures: tuple[Signature, ...] = ()  # effects whose estimates are also statistics
+    # estimates by name of the effect: from the seed ``exact`` on, parameters are drawn within their
+    # errors, so that the scatter of the simulations includes these errors
     estimates: Mapping[str, Estimate] = field(default_factory=dict)
     exact: int = 0
     _made: dict[tuple[frozenset[Effect], int], list[Curves] | str] = field(default_factory=dict)
@@ -75,8 +75,8 @@ class Trials:
 
     @property
     def seconds(self) -> float:
-        """Processor time (s) of a simulation, all windows together: half of them took less."""
-        # A median: the first ones compile kernels.
+        """Median processor time (s) of a simulation, all windows together."""
+        # Median, because the first simulations compile kernels.
         return float(np.median(self._seconds or [0.0])) * len(self.windows)
 
     def curves(
@@ -86,9 +86,9 @@ class Trials:
         label: str,
         beside: Callable[[], None] | None = None,
     ) -> list[list[Curves] | str]:
-        """Of each bench its simulations (means over the windows), or why it has none.
+        """Simulations of each bench (means over the windows), or why it has none.
 
-        ``seeds``: simulations of each. ``beside``: done meanwhile in this process, if any is made.
+        ``seeds``: simulations of each. ``beside``: run in this process meanwhile, if any is made.
         """
         wanted = [(frozenset(bench), seed) for bench in benches for seed in range(seeds)]
         missing = [one for one in dict.fromkeys(wanted) if one not in self._made]
@@ -122,7 +122,7 @@ class Trials:
         else:
             others: list[Callable[[], Any]] = [partial(work, item) for item in moved]
             _, *results = run_tasks(_call, [beside, *others], self.runtime.here, label=label)
-        # What is refused as moved may do as it was.
+        # A bench refused with drawn parameters may work with the estimated ones.
         again = [
             n
             for n, (one, other) in enumerate(zip(moved, items, strict=True))
@@ -140,7 +140,7 @@ class Trials:
         return tuple(known[e.name].scattered(e, seed) if e.name in known else e for e in effects)
 
     def of_window(self, number: int, bench: Effects, seeds: int) -> list[Curves]:
-        """Statistics of a window by itself, of a bench that `curves` has simulated."""
+        """Statistics of one window, of a bench that `curves` has simulated."""
         made = [self._made[frozenset(bench), seed] for seed in range(seeds)]
         return [r[number] for r in made if not isinstance(r, str)]
 
@@ -155,7 +155,7 @@ def _kept_or_made(
     signatures: tuple[Signature, ...],
     item: tuple[Effects, int, int],
 ) -> tuple[Curves | str, float]:
-    """A simulation that an interrupted run left, or a new one; and its processor time, s."""
+    """A simulation from an interrupted run, or a new one; and its processor time, s."""
     effects, seed, number = item
     on = sorted((e.name, to_plain(e)) for e in effects)
     name = digest(on, seed, number, windows[number].part, sorted(k.name for k in signatures))
@@ -181,7 +181,7 @@ def _kept_or_made(
 
 
 def _kept(file: Path) -> dict[str, Any] | None:
-    """What an interrupted run has left, if it is as it was written."""
+    """Contents of a file of an interrupted run, if it is undamaged."""
     try:
         plain: dict[str, Any] = read_json(file)
         return plain if plain.pop("seal") == digest(plain) else None
@@ -202,7 +202,7 @@ def _made(
 
 
 def measured_curves(evidence: Evidence, signatures: Sequence[Signature]) -> Curves:
-    """The test statistics, and the detection significance of some effects."""
+    """The test statistics, and the detection significance of given effects."""
     curves = measure(evidence)
     for kind in signatures:
         found = detect(evidence, kind)
@@ -212,7 +212,7 @@ def measured_curves(evidence: Evidence, signatures: Sequence[Signature]) -> Curv
 
 
 def averaged(curves: Sequence[Curves]) -> Curves:
-    """Mean over windows of the curves that all have."""
+    """Mean over windows of the curves that all windows have."""
     first, *others = curves
     if not others:
         return first
@@ -235,15 +235,15 @@ def estimate(
 
 
 def detect(evidence: Evidence, kind: Signature, bound: Bound = OF_ESTIMATE) -> float | None:
-    """Significance of an effect; None where it cannot be told."""
-    # Slow detections run one at a time: the memory plan of simulations has no room for two.
+    """Significance of an effect; None if it cannot be determined."""
+    # Slow detections run one at a time: the memory plan of simulations allows for one only.
     with nullcontext() if kind.quick else _SLOW:
         found = _kept_within(bound, kind.detect, evidence)
     return found if isinstance(found, float) and np.isfinite(found) else None
 
 
 def _kept_within(bound: Bound, ask: Callable[[Evidence], T], evidence: Evidence) -> T | str:
-    """An answer within a bound, or why there is none."""
+    """Result of ``ask`` within a bound, or why there is none."""
     try:
         with bound.kept():
             return ask(evidence)

@@ -1,4 +1,4 @@
-"""Which pixels and frames are looked at: all of a small window, some windows of a large one."""
+"""Choose pixels and frames to analyse: all of a small detector, windows of a large one."""
 
 import itertools
 import math
@@ -11,25 +11,26 @@ from pixcal.model.arrays import Indices
 from pixcal.stages.diagnose.parts import Half, Table, groups
 from pixcal.stages.evidence import Part
 
-SIDE = 128  # pixels along the side of a window on a large detector: those of a chunk of the cube
-LARGEST = 288  # rows or columns of a detector that are taken whole; of more, windows do not overlap
-APART = 4  # sides of a window that a detector has at least where windows lie on chunks
-# samples of a fringe set that are looked at in each half of the frames and each window
+SIDE = 128  # side (pixels) of a window on a large detector: the width of a chunk of the cube
+LARGEST = 288  # most rows or columns of a detector used whole; beyond, windows do not overlap
+APART = 4  # least size of a detector, in window sides, for windows aligned to chunks
+# samples of a fringe set to analyse, in each half of the frames and each window
 SAMPLES = 6_000_000
-FEWEST = 4  # calibration frames of an exposure time that can be parted; fewer serve both halves
-# fringe frames in a half: the time that series of them take grows with the square
+FEWEST = 4  # least calibration frames of an exposure time to split; fewer serve both halves
+# most fringe frames in a half: the computing time of their series grows with the square
 MOST_FRAMES = 1500
-# blocks that frames are parted into, and the frames that this takes at least: long blocks leave few
-# frames without the one before, short ones show both halves the same drifts
+# number of blocks, and least number of frames for it: with long blocks, few frames lack the
+# preceding one; with short ones, both halves have the same drifts
 BLOCKS = ((16, 384), (8, 192), (4, 32), (2, FEWEST))
 TURN = (False, True, True, False)  # which blocks are held out: a steady drift is alike in both
 
 
 def chosen_windows(shape: tuple[int, int], frames: int = 0) -> tuple[Part, tuple[Part, ...]]:
-    """The window that effects are fitted on, and those that they are tried on.
+    """The window to which effects are fitted, and those on which they are tested.
 
-    A small detector is one; on a large one, the middle, and four other places (two, if one side is
-    short). Without fringes but few ``frames`` in each half, more pixels make up for them.
+    A small detector is one window. On a large one, the former is in the middle, the latter at four
+    other places (two if one side is short). Without fringes, ``frames``, the number in each half,
+    sets the size: the fewer frames, the more pixels.
     """
     if max(shape) <= LARGEST or 0 < frames * math.prod(shape) <= SAMPLES:
         return whole_of(shape), (whole_of(shape),)
@@ -44,7 +45,7 @@ def chosen_windows(shape: tuple[int, int], frames: int = 0) -> tuple[Part, tuple
             side = min(max(SIDE, min(wanted, size // 3)), size)
             first = (size - side) * share
             if on_chunks:
-                # Of the cube, where there are enough to lie apart on.
+                # Align to the chunks of the cube if there are enough of them.
                 grid = SIDE if size >= APART * SIDE else 1
                 first = min(round(first / grid) * grid, size - side)
             elif share != 0.5:
@@ -55,26 +56,26 @@ def chosen_windows(shape: tuple[int, int], frames: int = 0) -> tuple[Part, tuple
         return spans[0], spans[1]
 
     corners = ((0.1, 0.1), (0.1, 0.9), (0.9, 0.1), (0.9, 0.9))
-    # All of them have as many samples as the one in the middle.
+    # Together they have as many samples as the middle window.
     tried = tuple(sorted({place(y, x, widest // 2) for y, x in corners}))
     return _widened(place(0.5, 0.5), widest**2, shape, tried), tried
 
 
 def _widened(middle: Part, pixels: int, shape: tuple[int, int], tried: tuple[Part, ...]) -> Part:
-    """The window in the middle, with so many pixels if there is room between the others."""
+    """The middle window, enlarged to a number of pixels if there is room between the others."""
     rows, columns = (
         (a[1], b[0]) if a != b else (0, size)
         for a, b, size in zip(tried[0], tried[-1], shape, strict=True)
     )
     high = _grown(middle[0], math.isqrt(pixels), rows)
-    # Between windows above and below, rows are free from end to end.
+    # Between windows above and below, whole rows are free.
     free = tried[0][0][1] <= high[0] and high[1] <= tried[-1][0][0]
     beside = (0, shape[1]) if free else columns
     return high, _grown(middle[1], pixels // (high[1] - high[0]), beside)
 
 
 def _grown(span: tuple[int, int], size: int, room: tuple[int, int]) -> tuple[int, int]:
-    """Rows or columns in the middle of some room, of a size, if they are more than these."""
+    """Rows or columns of a size in the middle of the room, if larger than the span."""
     size = min(size, room[1] - room[0])
     if size <= span[1] - span[0]:
         return span
@@ -89,17 +90,17 @@ def whole_of(shape: tuple[int, int]) -> Part:
 
 @dataclass(frozen=True)
 class Split:
-    """Frames that effects are fitted on (``learn``), and frames they are tried on (``test``)."""
+    """Frames to which effects are fitted (``learn``), and held-out frames (``test``)."""
 
     learn: Half
     test: Half
 
 
 def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = ()) -> Split:
-    """Blocks in turn (`TURN`) of every array and exposure time.
+    """Assign blocks of every array and exposure time to the halves (`TURN`).
 
-    Of long fringe sets the blocks are parts, `SAMPLES` in each half; without fringes as many of all
-    frames together. Flats whose pixels are full are left out unless all are.
+    A long fringe set contributes `SAMPLES` to each half; without fringes, all frames together do.
+    Flats with full pixels are left out unless all have them.
     """
     learn, test = {}, {}
     every = {name: _groups(name, table, full_flats) for name, table in tables.items()}
@@ -120,7 +121,7 @@ def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = 
 
 
 def _groups(name: str, table: Table, full_flats: Sequence[int]) -> list[Indices]:
-    """Frames of an array that are halved together."""
+    """Groups of frames of an array that are split together."""
     if "/" in name:
         return [np.arange(len(table["exptime_s"]))]
     every = groups(table)
@@ -129,7 +130,7 @@ def _groups(name: str, table: Table, full_flats: Sequence[int]) -> list[Indices]
 
 
 def _of_half(count: int) -> int:
-    """Frames of a half of so many."""
+    """Number of frames in a half of ``count``."""
     return count if count < FEWEST else count // 2
 
 
@@ -144,7 +145,7 @@ def frames_of_half(tables: Mapping[str, Table]) -> int:
 
 
 def _equal_share(counts: Sequence[int], total: int) -> int:
-    """Most frames of each group in a half, so that all together are no more than a total."""
+    """Largest number of frames per group in a half that keeps the sum within a total."""
     left, share = total, total
     ordered = sorted(map(_of_half, counts))
     for n, count in enumerate(ordered):

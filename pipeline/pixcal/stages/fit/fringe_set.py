@@ -1,4 +1,4 @@
-"""One fringe set: the shape of its fringes, from the sums that the sweep left of every tile."""
+"""One fringe set: the shape of its fringes, from the sums of the sweep over each tile."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,18 +17,18 @@ from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.place import Local
 
-MAX_STEPS = 8  # gauss-Newton steps of a shape; it is nearly linear (physics note, section 4)
-STEP_RAD = 1e-7  # a step that moves phases by less, rms, is the last
-# fall in chi-square for which ``auto`` takes hyperbolic fringes: one chance in a hundred for three
-# terms. Taken in vain they cost three modes of the map; curvature missed stays in it whole.
+MAX_STEPS = 8  # Gauss-Newton steps of a shape; it is nearly linear (physics note, section 4)
+STEP_RAD = 1e-7  # iteration stops once a step changes phases by less, rms
+# fall in chi-square above which ``auto`` chooses hyperbolic fringes: one chance in a hundred for
+# three terms. A false choice costs three modes of the map; missed curvature stays in it entirely.
 EVIDENCE = 12.0
-QUADRATIC = 3  # terms of second order, which is what hyperbolic fringes show first
-# power at large scales over that at small ones beyond which the map has structure of its own
+QUADRATIC = 3  # second-order terms, the leading ones of hyperbolic fringes
+# ratio of power at large to small scales above which the map has large-scale structure
 RED = 2.5
-# fall then asked of each term over that of terms of no cause: the power of steps falls with the
+# fall then required of each term over that of spurious terms: the power of steps falls with the
 # order of the term, and two stitches reach 15
 EXCESS = 50.0
-# relative departure of the fringe period from the nominal one that is worth a note
+# relative difference of the fringe period from nominal above which a note is added
 FAR_PERIOD = 0.15
 
 
@@ -37,17 +37,17 @@ class SetFit:
     """A shape fitted to a set."""
 
     basis: ModeBasis  # the shape and the modes about it
-    # (mode, 1 + batch) what is left to take off the phases of the run and of each batch
+    # (mode, 1 + batch) coefficients to subtract from the phases of the run and of each batch
     coefficients: F64
     covariance: F64  # (mode, mode) of the shape's coefficients and the gauge's
-    square: float  # weighted square of what remains of the map
-    spread: float  # the same for each pixel: variance of the map over that of its noise
-    steps: int  # gauss-Newton steps taken
+    square: float  # weighted square of the residual map
+    spread: float  # same per pixel: variance of the map over that of its noise
+    steps: int  # Gauss-Newton steps taken
 
 
 @dataclass(frozen=True)
 class FittedSet:
-    """A set with its shape, ready for its maps to be written."""
+    """A set with its fitted shape, before its maps are written."""
 
     name: str
     source: ReducedSet
@@ -58,12 +58,12 @@ class FittedSet:
     shape: FringeShape  # with the fitted parameters
     model: str  # model, evidence: name of the shape, and why it was chosen
     evidence: str
-    # usual reduced chi-square: the variance of the samples over that of the noise model
+    # typical reduced chi-square: the variance of the samples over that of the noise model
     noise: float
 
     @property
     def carrier(self) -> Carrier:
-        """That the sweep's phases are relative to."""
+        """Carrier of the sweep's phases."""
         return self.fit.basis.carrier
 
     @property
@@ -140,10 +140,10 @@ def _start(
 
 
 def _choose(model: str, tiles: TileSums, start: Start) -> tuple[SetFit, str]:
-    """Fit the shape asked for; ``auto``: hyperbolic fringes where the map asks for them.
+    """Fit the requested shape; ``auto``: hyperbolic fringes if the map requires them.
 
-    True structure at large scales passes for curvature: as much as a polynomial finds beyond the
-    hyperbolic shape is of no cause.
+    True large-scale structure imitates curvature: polynomial terms beyond the hyperbolic shape
+    measure how much of it is spurious.
     """
     shapes = fringe_models()
     if model != "auto":
@@ -171,7 +171,7 @@ def _choose(model: str, tiles: TileSums, start: Start) -> tuple[SetFit, str]:
 def _fit_shape(
     tiles: TileSums, cls: type[FringeShape], start: Start, background: float = 1.0
 ) -> SetFit:
-    """Gauss-Newton steps of a shape on all pixels, and the gauge's modes with it."""
+    """Fit a shape and the gauge modes to all pixels by Gauss-Newton steps."""
     shape = cls.start(start)
     size = len(shape.names)
     pixels = max(float(tiles.pixels.sum()), 1.0)
@@ -194,7 +194,7 @@ def _fit_shape(
 
 
 def describe(fitted: FittedSet, masked: int, sigma_px: float) -> dict[str, Any]:
-    """What ``fit.json`` says of a set; ``sigma_px`` is the median error of pixels not masked."""
+    """Entry of a set in ``fit.json``; ``sigma_px``: median error of unmasked pixels."""
     source, facts, shape, fit = fitted.source, fitted.facts, fitted.shape, fitted.fit
     ny, nx = source.shape
     kx, ky = fitted.vector
@@ -235,7 +235,7 @@ def describe(fitted: FittedSet, masked: int, sigma_px: float) -> dict[str, Any]:
 
 
 def _period_note(k: float, nominal: float) -> str:
-    """What to say of a fringe vector (rad/px) far from the nominal length; "" if it is not."""
+    """Note on a fringe vector (rad/px) far from the nominal length; "" if close."""
     if abs(nominal / k - 1) <= FAR_PERIOD:
         return ""
     return (

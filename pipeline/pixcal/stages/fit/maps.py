@@ -1,4 +1,4 @@
-"""The maps of all sets and what they give together: one pass over the sweep's maps."""
+"""The maps of all sets and their combination, in one pass over the sweep's maps."""
 
 import shutil
 from collections.abc import Mapping, Sequence
@@ -31,16 +31,16 @@ from pixcal.storage.cube import (
 from pixcal.storage.folder import link_files
 from pixcal.storage.place import Local
 
-SAME_AS_SWEPT = ("iota", "alpha", "chi2", "mask")  # maps of a set that are those of its sweep
-# by name of the set, "" for maps of all of them, and of the array
+SAME_AS_SWEPT = ("iota", "alpha", "chi2", "mask")  # maps identical to those of the sweep
+# by names of the set ("" for combined maps) and of the array
 Writers = dict[tuple[str, str], ArrayWriter]
-# errors that a tile tells at most for the median of all, and about how many all of them tell
+# most errors that a tile contributes to the median, and about how many all tiles contribute
 TOLD, TOLD_IN_ALL = 4000, 4_000_000
 
 
 @dataclass(frozen=True)
 class SetTotals:
-    """What is known of a set once its maps are written."""
+    """Totals of a set over its written maps."""
 
     masked: int
     sigma_px: float
@@ -48,16 +48,16 @@ class SetTotals:
 
 @dataclass(frozen=True)
 class Totals:
-    """What is known once all maps are written."""
+    """Totals over all written maps."""
 
     sets: dict[str, SetTotals]  # by name
-    outputs: tuple[str, ...]  # maps that the sets give together
-    # reduced chi-square of the sets' disagreement; None where they determine no more than that
+    outputs: tuple[str, ...]  # combined maps of the sets
+    # reduced chi-square of the sets' disagreement; None without redundant sets
     consistency: float | None
 
 
 def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals:
-    """Write ``fit.zarr``: the maps of each set, and those that all sets give together."""
+    """Write ``fit.zarr``: the maps of each set, and the combined maps."""
     source = fitted[0].source
     ny, nx = source.shape
     both = axes_span_plane([f.shape.axis(ny / 2, nx / 2) for f in fitted])
@@ -68,11 +68,11 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
         writers |= _create_set(group / f.name, f)
     pixels = int(np.prod(source.signal.chunks[1:]))
     most = max(f.n_batches for f in fitted)
-    # Of a tile; of all maps of a strip, read, made and written.
+    # For a tile, and for all maps of a strip, read, computed and written.
     per_pixel = 500 + 60 * len(fitted) + 40 * most + STRIP * len(fitted) * (60 + 20 * most)
     runtime = within_memory("the maps of the fit", pixels * per_pixel, 0, runtime)
     removed = {f.name: f.fit.basis.removed(f.planes, f.fit.coefficients) for f in fitted}
-    # Each tile gets its own part of them: on a cluster they travel with it.
+    # Each tile gets its own part, which is sent with its task on a cluster.
     jobs = {
         at: (at, {name: local[n] for name, local in removed.items()})
         for n, at in enumerate(source.tiles())
@@ -97,7 +97,7 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
 
 
 def write_offsets(group: Local, fitted: list[FittedSet]) -> None:
-    """Write the offsets of each set alone, as `write_maps` has them."""
+    """Write only the offsets of each set, as `write_maps` does."""
     for f in fitted:
         swept = {name: ArrayReader(f.swept / name) for name in ("mask", "phase", "sigma")}
         writer = _map_writer(group / f.name / "delta", f)
@@ -118,7 +118,7 @@ def _map_writer(place: Local, fitted: FittedSet, batches: int = 0) -> ArrayWrite
 
 @dataclass(frozen=True)
 class _Told:
-    """Of one tile: good pixels and some errors (px) of each set, and how the sets disagree."""
+    """Good pixels and sampled errors (px) of each set in a tile, and disagreement of the sets."""
 
     good: list[int]
     sigma: list[F32]
@@ -133,14 +133,14 @@ Swept = Mapping[str, ArrayReader]  # readers of the maps of a set's sweep
 def _write_strip(
     fitted: list[FittedSet], writers: Writers, both: bool, strip: Sequence[Job]
 ) -> list[_Told]:
-    """Write the maps of tiles side by side."""
+    """Write the maps of neighbouring tiles."""
     (y0, y1), (x0, x1) = span(fitted[0].source.shape, [at for at, _ in strip])
     swept: list[Swept] = []
     for f in fitted:
         names = ("phase", "sigma", *SAME_AS_SWEPT, *(BATCH_MAPS if f.n_batches else ()))
         held = {name: CachedReader(f.swept / name) for name in names}
         for reader in held.values():
-            # Those that are linked too: damage would be there for good.
+            # Also for linked maps: damage to them would be permanent.
             reader.keep_block((y0, y1), (x0, x1))
         swept.append(held)
     shape = (y1 - y0, x1 - x0)
@@ -162,7 +162,7 @@ def _maps_of_tile(
     job: Job,
     made: dict[tuple[str, str], NDArray[Any]],
 ) -> _Told:
-    """Fill the maps of a tile, by the keys of their writers; what there is to tell of it."""
+    """Fill the maps of a tile, by the keys of their writers; return its share of the totals."""
     at, removed = job
     y, x = fitted[0].source.ranges(at)
     found = [
@@ -173,12 +173,12 @@ def _maps_of_tile(
         np.stack([getattr(m, name) for m in found]).astype(float) for name in ("delta", "sigma")
     )
     masks = np.stack([m.flags for m in found])
-    # Hyperbolic fringes turn over the window: each tile has its own axes.
+    # The direction of hyperbolic fringes varies over the window: each tile has its own axes.
     axes = [f.shape.axis((y[0] + y[1] - 1) / 2, (x[0] + x[1] - 1) / 2) for f in fitted]
     value, error, chi2 = (combine_sets if both else combine_parallel)(axes, delta, sigma)
     values, errors = (v.reshape(-1, *chi2.shape).astype(np.float32) for v in (value, error))
     missing = ~np.isfinite(values).all(axis=0)
-    # A flag counts where it costs the pixel its value; a set that others replace does not.
+    # A flag counts only if the pixel has no value; other sets can replace a flagged one.
     flags = np.where(missing, np.bitwise_or.reduce(masks, axis=0), 0).astype(np.uint8)
     for name, own_value, own_error in zip(outputs_of(both), values, errors, strict=True):
         made["", name][...], made["", f"{name}_sigma"][...] = own_value, own_error
@@ -197,18 +197,18 @@ def _maps_of_tile(
 
 @dataclass(frozen=True)
 class SetOffsets:
-    """Of one set in one tile."""
+    """Offsets of one set in one tile."""
 
     delta: F32  # delta, sigma: (y, x) offset and its error, px; NaN where masked
     sigma: F32
     flags: U8  # (y, x)
     modes: F64  # (mode, y * x) of the shape and the gauge
     k: float  # length of the fringe vector, rad/px
-    scale: np.float32  # errors (px) over those of the sweep (rad)
+    scale: np.float32  # ratio of errors (px) to those of the sweep (rad)
 
 
 def offsets(fitted: FittedSet, swept: Swept, at: tuple[int, int], removed: F64) -> SetOffsets:
-    """Offsets of a set in a tile, the modes that were removed from its phases."""
+    """Offsets of a set in a tile, given the modes ``removed`` from its phases."""
     source = fitted.source
     y, x = source.ranges(at)
     plane = fitted.planes[at[0] * source.grid[1] + at[1]]
@@ -252,10 +252,10 @@ def _maps_of_set(
 
 
 def _create_set(folder: Path, fitted: FittedSet) -> Writers:
-    """The set's folder: what is the sweep's is linked; writers of the rest."""
+    """Create the set's folder: link maps of the sweep, and return writers of the others."""
     create_group(folder)
     for name in SAME_AS_SWEPT:
-        # Those that a killed fit has linked may be of a sweep that was damaged.
+        # Links left by a killed fit may point to a damaged sweep.
         shutil.rmtree(folder / name, ignore_errors=True)
         swept = fitted.swept / name
         assert isinstance(swept, Path)
@@ -277,7 +277,7 @@ def _create_joint(group: Path, fitted: FittedSet, outputs: tuple[str, ...]) -> W
 
 
 def _write_frames(folder: Path, maps: Local) -> None:
-    """Parameters of every frame and the times of the batches, for those who read the fit."""
+    """Write the parameters of every frame and the times of the batches, for users of the fit."""
     frames = read_frames(maps)
     for array, data in (
         ("B", frames.B), ("A", frames.A), ("phi", frames.phi), ("dkx", frames.dk[:, 0]),
@@ -289,10 +289,10 @@ def _write_frames(folder: Path, maps: Local) -> None:
 
 
 def outputs_of(both: bool) -> tuple[str, ...]:
-    """Maps that sets give together, whose axes differ or not."""
+    """Names of the combined maps of sets along one axis, or along two (``both``)."""
     return ("delta_x", "delta_y") if both else ("delta_fringe",)
 
 
 def _some(values: F32, number: int) -> F32:
-    """About a number of many values, evenly; a copy, lest they all stay in memory."""
+    """About ``number`` of the values, evenly spaced; a copy, so that the rest can be freed."""
     return values[:: max(1, len(values) // number)].copy()

@@ -1,4 +1,4 @@
-"""Offsets from the sweep's phases: a shape for each set, modes removed, sets joined, products."""
+"""Offsets from the phases of the sweep: fit shapes, remove modes, combine sets, write products."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -65,11 +65,11 @@ def _fit_all(run_dir: Path, swept: Manifest, config: Config, runtime: Runtime, m
     made.summary = result
 
 
-# What other programs read
+# Products
 
 
 def published(run_dir: Path, stage: str = "fit", facts: str = "fit.json", suffix: str = "") -> bool:
-    """Whether a stage's products are there, unaltered, and are those of its present artefact."""
+    """Whether a stage's products exist, are unaltered, and belong to its present artefact."""
     products = run_dir / "products"
     try:
         product = read_json(products / facts)
@@ -119,7 +119,7 @@ def header_of(run_dir: Path, result: dict[str, Any], key: str) -> tuple[list[Car
 
 
 def _detector_cards(run_dir: Path) -> list[Card]:
-    """Which detector it is, and when its fringes were recorded (where the frames say)."""
+    """Cards on the detector, and on when its fringes were recorded (if the frames state it)."""
     detector = load_run(run_dir).detector
     cards: list[Card] = [
         ("DETECTOR", detector.name, "name of the detector"),
@@ -150,7 +150,7 @@ def publish_maps(
     history: list[str],
     suffix: str = "",
 ) -> None:
-    """Write the maps of ``fit.zarr`` or the like as FITS, and remove those of another fit."""
+    """Write the maps of ``fit.zarr`` or the like as FITS, and remove maps of an earlier fit."""
     for name in outputs:
         delta, sigma, mask = (
             ArrayReader(group / array) for array in (name, f"{name}_sigma", "mask")

@@ -1,7 +1,7 @@
 """Scout and sweep: the only part of the fit that reads the cube.
 
-What it leaves, ``RUN/sweep``, holds for every model of the fringes' geometry, which is fitted to
-the phases afterwards: trying another model does not read the cube again.
+Its result, ``RUN/sweep``, is valid for every model of the fringes' geometry, which is fitted to the
+phases afterwards: a fit with another model does not read the cube again.
 """
 
 import math
@@ -53,24 +53,24 @@ from pixcal.storage.manifest import Manifest, file_digest, read_json, write_json
 from pixcal.storage.place import Local
 from pixcal.storage.stage import make, read_acquisition, require
 
-# chi-squares kept in all to tell the usual one from (at least `MIN_SAMPLES` of a tile)
+# total of chi-squares kept to estimate the typical one (at least `MIN_SAMPLES` per tile)
 CHI2_SAMPLES = 4096
 MIN_SAMPLES = 16
 MAPS = ("iota", "alpha", "phase", "sigma", "chi2")
 BATCH_MAPS = ("batch_phase", "batch_sigma")
-# binary digits kept of the batches' maps: the others, far below their noise, would take as much
-# disk again
+# binary digits kept of the batches' maps: the rest, far below their noise, would double the disk
+# space
 DIGITS = {"batch_phase": 10, "batch_sigma": 8, "batch_delta": 12}
-TABLES = ("tiles", "sums")  # of a row of numbers for each tile
+TABLES = ("tiles", "sums")  # with a row of numbers for each tile
 SCOUT_SHARE = 0.01  # share of the tiles that the scout reads (of large windows)
-SCOUT_TILES = 5  # tiles that the scout reads where they can be kept in memory
+SCOUT_TILES = 5  # tiles that the scout reads if they can be kept in memory
 # memory for the scout's tiles; fixed, so that results do not depend on ``--memory``
 CACHE_BYTES = 384 << 20
 PRIME_BYTES = 48 << 20  # memory for the codes of the scout's first look
-# chunks along time that the first look takes frames from: one may hold little of a slow scan
+# chunks along time from which the first look takes frames: one may hold little of a slow scan
 LOOKS = 16
-# frames that the first look takes at most: pixels of three unknowns each add three parts in so many
-# to the variance of the frames' parameters; the time of the rank-three search grows with the square
+# most frames of the first look: the three unknowns per pixel add a fraction 3 / `LOOK_FRAMES` to
+# the variance of the frames' parameters; the time of the rank-three search grows with the square
 LOOK_FRAMES = 128
 
 
@@ -112,7 +112,7 @@ def sweep_sets(
 
 @dataclass(frozen=True)
 class _Job:
-    """What all tiles of a set have in common."""
+    """Input common to all tiles of a set."""
 
     source: ReducedSet
     writers: dict[str, ArrayWriter]
@@ -150,8 +150,8 @@ def sweep_set(
     n_batches = len(batches.ranges)
     writers = _create_maps(folder, source, n_batches)
     cy, cx = source.signal.chunks[1:]
-    # Codes held until the start model stands and those of the chunk at hand; sums, maps and modes;
-    # what is kept of each batch.
+    # Codes held until the start model is fitted, and codes of the current chunk; sums, maps and
+    # modes; arrays of each batch.
     held = 2 * min(prime, source.n_frames) + 4 * source.block
     kept = STRIP * (40 + 16 * n_batches)
     per_task = cy * cx * (held + 900 + 24 * n_batches + kept + source.more_bytes)
@@ -180,7 +180,7 @@ def sweep_set(
 
 
 def _create_maps(folder: Local, source: ReducedSet, n_batches: int) -> dict[str, ArrayWriter]:
-    """Arrays that the tasks write, one chunk a strip."""
+    """Arrays that the tasks write, one chunk per strip."""
     (ny, nx), (cy, cx) = source.shape, source.map_chunks
     units = {"iota": "electron", "alpha": "electron", "phase": "radian", "sigma": "radian"}
     writers = {
@@ -202,7 +202,7 @@ def _create_maps(folder: Local, source: ReducedSet, n_batches: int) -> dict[str,
 
 
 def _bound_pixels(source: ReducedSet) -> int:
-    """Pixels of each tile for the bound: some hundreds in all, whatever the number of tiles."""
+    """Pixels of each tile for the bound: several hundred in total, for any number of tiles."""
     return max(4, min(BOUND_PIXELS, 512 // math.prod(source.grid)))
 
 
@@ -211,7 +211,7 @@ def _chi2_pixels(source: ReducedSet) -> int:
 
 
 def _sweep_strip(job: _Job, strip: Sequence[tuple[int, int]]) -> None:
-    """Sweep tiles side by side and write their maps."""
+    """Sweep neighbouring tiles and write their maps."""
     parts = [_sweep_tile(job, at) for at in strip]
     (y, _), (x, _) = job.source.ranges(strip[0])
     for name, writer in job.writers.items():
@@ -249,7 +249,7 @@ def _sweep_tile(job: _Job, at: tuple[int, int]) -> dict[str, NDArray[Any]]:
 
 
 def rounded(values: F32, digits: int) -> F32:
-    """Rounded to some binary digits, in place; what is no number stays none."""
+    """Round to a number of binary digits, in place; NaN stay NaN."""
     bits, dropped = values.view(np.uint32), 23 - digits
     bits += np.uint32(1 << (dropped - 1))
     bits &= np.uint32(0xFFFFFFFF ^ ((1 << dropped) - 1))
@@ -271,7 +271,7 @@ def _sums(job: _Job, tile: Tile, maps: TileMaps, good: Mask) -> F64:
 
 @dataclass(frozen=True)
 class Lookout:
-    """Where the scout looks, and whether what it reads is kept for the sweep."""
+    """Tiles that the scout reads, and whether their codes are kept for the sweep."""
 
     source: ReducedSet
     places: list[tuple[int, int]]
@@ -283,7 +283,7 @@ class Lookout:
 
 
 def scout_tiles(grid: tuple[int, int], number: int) -> list[tuple[int, int]]:
-    """Tiles spread over the window: the central one, then each time the one farthest from all."""
+    """Tiles spread over the window: the central one, then repeatedly the one farthest from all."""
     tiles = np.array(list(product(range(grid[0]), range(grid[1]))), dtype=float)
     middle = (np.array(grid) - 1) / 2
     chosen = [int(np.argmin(((tiles - middle) ** 2).sum(axis=1)))]
@@ -305,16 +305,16 @@ def scout_set(
     places = scout_tiles(source.grid, number)
     keep = len(places) * tile_bytes <= CACHE_BYTES
     tiles = [source.tile(at) for at in places]
-    # The first tile must show fringes: one with few good pixels is a bad place to look.
+    # The first tile must show fringes, so it needs enough good pixels.
     order = sorted(range(len(tiles)), key=lambda n: -int(tiles[n].good.sum() > 100))
     places, tiles = [places[n] for n in order], [tiles[n] for n in order]
     ny, nx = source.shape
-    # Here, whatever does the rest: in other processes nothing would be kept for the sweep.
+    # In this process, wherever the sweep runs: other processes could not keep codes for the sweep.
     here = replace(runtime.here, quiet=True)
     if runtime.remote:
         here = here.with_workers(0)
-    # The chunks kept; the first look's codes, copies of a tile's share, and its Gram matrix; for
-    # each task the sums of a tile, or chunks that are not kept.
+    # Kept chunks; codes of the first look, copies of a tile's share, and its Gram matrix; for each
+    # task the sums of a tile, or chunks that are not kept.
     kept = len(places) * tile_bytes if keep else 0
     what = f"the scout of {name}"
     per_task = (4 if keep else max(4, len(places))) * chunk_bytes
@@ -330,7 +330,7 @@ def scout_set(
     del looks
     scout.each = in_turn
     if len(parts[0].g) < source.n_frames:
-        # A chunk of each place and what its solution takes.
+        # A chunk of each place and the memory of its solution.
         runtime = within_memory(what, 3 * len(places) * chunk_bytes, kept, runtime)
         parts = run_tasks(
             partial(_solve_block, lookout, scout),
@@ -368,11 +368,11 @@ def _solve_block(lookout: Lookout, scout: Scout, block: int) -> FrameParameters:
 
 
 def _first_look(source: ReducedSet, blocks: int) -> list[tuple[int, Indices]]:
-    """Blocks spread over the run and frames of each, as many in all as in ``blocks`` whole ones."""
+    """Blocks spread over the run and frames of each, as many in total as in ``blocks`` blocks."""
     wanted = min(source.n_blocks, max(blocks, LOOKS))
     each = max(1, source.block * max(1, min(blocks, wanted)) // wanted)
     each = min(each, -(-LOOK_FRAMES // wanted))
-    # At random: frames at even steps may have the same phase again and again.
+    # At random: evenly spaced frames may all have the same phase.
     rng = np.random.default_rng(0)
     looks = []
     for n in np.linspace(0, source.n_blocks - 1, wanted).astype(int):
@@ -382,7 +382,7 @@ def _first_look(source: ReducedSet, blocks: int) -> list[tuple[int, Indices]]:
 
 
 def read_frames(folder: Local) -> FrameParameters:
-    """Frame parameters that the scout left in ``sweep.zarr/<set name>``."""
+    """Frame parameters that the scout wrote to ``sweep.zarr/<set name>``."""
     y, x = read_json(folder / "scout.json")["reference"]
     return FrameParameters(
         ArrayReader(folder / "g").read(), ArrayReader(folder / "dk").read(), (float(y), float(x))

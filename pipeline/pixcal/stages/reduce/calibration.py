@@ -1,7 +1,7 @@
 """The calibration maps of ``RUN/reduce``, made from the statistics of the frames.
 
-First what is usual on the whole detector, then, column of chunks by column, the maps in electrons
-and the flags of the pixels that are not usual.
+First the medians over the whole detector, then, by columns of chunks, the maps in electrons and the
+flags of outlying pixels.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,13 +33,13 @@ from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_g
 from pixcal.storage.place import Place
 
 _SAMPLES = 1 << 20
-FLAT_FLOOR = 0.05  # least relative response in the map: pixels that see no light have it
-# weight of the detector's read variance beside a pixel's own, in degrees of freedom: that of pixels
-# whose read noise differs by 13 % rms. Few frames alone would give good pixels false weights, and
-# at low light a chi-square that flags them.
+FLAT_FLOOR = 0.05  # least relative response in the map, which pixels without light have
+# weight of the detector's read variance relative to a pixel's own, in degrees of freedom, for read
+# noise that differs by 13 % rms among pixels. A few frames alone would give good pixels wrong
+# weights, and at low light a chi-square that flags them.
 _PRIOR_DOF = 30
 
-# attributes of a mask, as CF has them
+# attributes of a mask by the CF conventions
 FLAG_ATTRS = {
     "long_name": "why a pixel is not to be used",
     "flag_masks": [int(flag) for flag in PixelFlag],
@@ -57,10 +57,10 @@ _MAPS: dict[str, tuple[Any, dict[str, Any]]] = {
 
 @dataclass(frozen=True)
 class Usual:
-    """What is usual on the detector."""
+    """Typical values over the detector."""
 
-    # response, response_error: median response of the flats, and its error in a pixel, over the
-    # mean light of the detector; NaN without flats
+    # response, response_error: median response of the flats and its error for one pixel, relative
+    # to the mean light of the detector; NaN without flats
     response: float
     response_error: float
     # dark_rate, dark_rate_sigma: median and robust spread of the dark signal (ADU/s)
@@ -68,7 +68,7 @@ class Usual:
     dark_rate_sigma: float
     dark_variance: float  # variance of a sample without light and without dark signal (ADU²)
     bias: float  # median (ADU)
-    noisy: float  # factor of the usual noise from which a pixel is noisy
+    noisy: float  # factor of the typical noise above which a pixel is noisy
 
 
 def on_grid(
@@ -81,7 +81,7 @@ def on_grid(
     folder : where the maps are
     shape : of the detector's window (y, x)
     names : of `STATISTICS`
-    light : of each tile, which its response is multiplied by
+    light : of each tile, a factor on its response
     """
     reader = ArrayReader(folder / "maps")
     stride = int(np.ceil(np.sqrt(shape[0] * shape[1] / _SAMPLES)))
@@ -100,7 +100,7 @@ def on_grid(
 
 
 def usual(job: Measuring, folder: Place, light: F64) -> Usual:
-    """Medians of the maps that `measure` wrote; ``light`` is of each tile over the detector's."""
+    """Medians of the maps that `measure` wrote; ``light``: of each tile over the detector's."""
     names = ("response", "response_error", "dark_rate", "dark_variance", "dark_dof", "bias")
     response, error, rate, variance, dof, bias = on_grid(folder, job.shape, names, light)
     freedom = int(np.median(dof))
@@ -116,15 +116,15 @@ def usual(job: Measuring, folder: Place, light: F64) -> Usual:
 
 @dataclass(frozen=True)
 class Finishing:
-    """What the second task of a column needs."""
+    """Input of the second task of a column."""
 
     statistics: Place  # what `measure` wrote
     shape: tuple[int, int]  # of the detector's window (y, x)
-    usual: Usual  # what is usual on the detector
-    light: F64  # of each tile over that of the detector
+    usual: Usual  # typical values over the detector
+    light: F64  # light of each tile over that of the detector
     gain: float  # to use (e-/ADU)
     read_noise: float  # of the detector (e-)
-    read_dof: int  # degrees of freedom of each pixel's own; zero to use the detector's for all
+    read_dof: int  # degrees of freedom of a pixel's own read noise; 0: use the detector's for all
     floor: float  # least read noise of a pixel (e-): the rounding of the converter
     has_rate: bool  # has_rate, has_flat: whether dark signal and response were measured
     has_flat: bool
@@ -147,7 +147,7 @@ def finish(job: Finishing, strip: Strip) -> F64:
     """Write the calibration maps of `STRIP` columns.
 
     Returns (column, 4) over the good pixels: least and largest flat, largest bias (ADU) and dark
-    signal (e-/s); infinite of the other sign when there is none.
+    signal (e-/s); infinity of the opposite sign without good pixels.
     """
     rows, columns = span(job.shape, strip)
     block = ArrayReader(job.statistics / "maps").read((0, len(STATISTICS)), rows, columns)
@@ -183,7 +183,7 @@ def _maps(job: Finishing, index: Index, block: F32) -> dict[str, NDArray[Any]]:
 
 
 def _ends(maps: Mapping[str, NDArray[Any]]) -> tuple[float, float, float, float]:
-    """What `finish` returns of a column."""
+    """The four numbers that `finish` returns for a column."""
     good = maps["mask"] == 0
     if not good.any():
         return np.inf, -np.inf, -np.inf, -np.inf
@@ -194,7 +194,7 @@ def _ends(maps: Mapping[str, NDArray[Any]]) -> tuple[float, float, float, float]
 def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> U8:
     mask = found["flags"].astype(np.uint8)
     limits, medians = job.options, job.usual
-    # A sample that lies on a change of code is one of two, however little noise it has.
+    # A level at the boundary of two codes gives either one, however low the noise.
     least = 3 * (job.floor / job.gain) ** 2
     if job.has_flat:
         mask[~np.isfinite(flat)] |= np.uint8(PixelFlag.NO_DATA)

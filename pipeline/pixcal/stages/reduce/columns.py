@@ -1,7 +1,7 @@
 """Columns of chunks, 128 by 128 pixels of all frames, and strips of neighbours, the unit of work.
 
-FITS files hold rows: a strip as wide as memory allows is read in one go. Maps lie in chunks of
-`STRIP` columns, so a task has so many at least, whatever it reads at a time.
+FITS files hold rows: a strip as wide as memory allows is read at once. Maps are stored in chunks of
+`STRIP` columns, so a task has at least `STRIP` columns, however many it reads at a time.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,8 +18,8 @@ from pixcal.storage.cube import ArrayReader
 from pixcal.storage.frame_reader import Reader
 from pixcal.storage.place import UrlPath
 
-SHARE = 0.8  # of the memory allowed, that strips may be made wide for
-CAUTIOUS = 4  # tasks that share as much memory as this process may use, on a cluster
+SHARE = 0.8  # share of the allowed memory that strips may fill
+CAUTIOUS = 4  # tasks assumed to share the memory of this process, on a cluster
 
 
 def strip_width(readers: Iterable[Reader], need: Callable[[int], int], runtime: Runtime) -> int:
@@ -33,7 +33,7 @@ def strip_width(readers: Iterable[Reader], need: Callable[[int], int], runtime: 
         if isinstance(reader, ArrayReader) and isinstance(reader.path, UrlPath):
             return 1
         width = grid(reader.shape[1:])[1]
-    # Nobody knows here what the workers of a cluster may use.
+    # The memory of the workers of a cluster is unknown here.
     at_once = CAUTIOUS if runtime.remote else runtime.n_workers
     while width > 1 and Plan(need(width), 0, at_once).total > SHARE * runtime.memory:
         width = -(-width // 2)
@@ -59,19 +59,18 @@ def run_noted(
     runtime: Runtime,
     label: str,
 ) -> None:
-    """Run a task that writes whole chunks on columns side by side, but for those noted as done.
+    """Run a task that writes whole chunks, on neighbouring columns not yet noted as done.
 
     Parameters
     ----------
     made : whose journal to use
-    task : given the strips to read one after the other. All that it leaves is written when it
-        returns.
+    task : given the strips to read in turn. All its results are written when it returns.
     todo : columns
     width : columns to read at a time, from `strip_width`
-    label : name of the task in the journal, and for the progress
+    label : name of the task in the journal and the progress display
     """
     journal = made.journal()
-    # Those whose maps share a chunk are noted together.
+    # Columns whose maps share a chunk are noted together.
     steps = {strip[0]: f"{label} {strip[0][0]} {strip[0][1]}" for strip in strips(todo, STRIP)}
     undone = [s for s in strips(todo, STRIP) if steps[s[0]] not in journal]
     left = strips([index for strip in undone for index in strip], max(width, STRIP))

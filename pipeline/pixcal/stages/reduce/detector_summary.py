@@ -36,32 +36,32 @@ _LINEAR_SHARE = 0.7
 _SATURATED_RUNG = 1e-2
 _GAIN_ERROR = 0.2
 _GUESS_ERROR = 0.1
-# variance of a sample, in square codes, from which rounding adds the same at every level
+# variance of a sample, in square codes, above which rounding adds the same at every level
 _SMOOTH = 0.25 + SHEPPARD
-_LAMP = 0.3  # relative change of light a second between flats that are not of one lamp
-_LIT = 5.0  # least response of the usual pixel over its error: below it the flat would be noise
+_LAMP = 0.3  # relative change of light per second that shows that flats are not of one lamp
+_LIT = 5.0  # least response of the median pixel over its error: below it the flat would be noise
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What the calibration frames say of the detector as a whole; None where they do not."""
+    """Results of the calibration frames for the whole detector; None if not measurable."""
 
-    declared: Detector  # what its owner says
+    declared: Detector  # as in ``acquisition.yaml``
     step: float  # of the converter (ADU)
     usual: Usual  # medians of the maps
-    light: F64  # of each tile in the flats, over that of the detector
-    # of a sample, rounding included, from differences of successive frames; its error (ADU)
+    light: F64  # light of each tile in the flats, over that of the detector
+    # of a sample, rounding included, from differences of successive frames; and its error (ADU)
     read_noise: tuple[float, float] | None
-    before_rounding: tuple[float, float] | None  # the same without the rounding of the converter
+    before_rounding: tuple[float, float] | None  # same, without the rounding of the converter
     gain: GainFit | None  # by photon transfer
-    levels: F64  # (rung,) of the ladder of flats (ADU above bias and dark)
-    # usable, full: (rung,) rungs without saturation; those with full pixels though the
+    levels: F64  # (step,) levels of the exposure-time steps of flats (ADU above bias and dark)
+    # usable, full: (step,) steps without saturation; steps with full pixels although the
     # converter does not saturate
     usable: Mask
     full: Mask
     transfer: F64  # (point, 3) photon-transfer curve: see `emva.transfer_points`
     well: Measure | None  # level of its maximum (ADU above bias), if the flats go beyond
-    linearity: Linearity | None  # of the usable rungs
+    linearity: Linearity | None  # of the usable steps
 
     def gain_to_use(self, choice: str) -> float:
         """Gain (e-/ADU), ``declared`` or ``measured``; InputError if there is no measured one."""
@@ -86,7 +86,7 @@ class Summary:
         return max(noise, gain * ROUNDING_ADU * self.step)
 
     def noise_measured_e(self, noise: Measure | None, gain: float) -> Measure | None:
-        """A noise (ADU) and its error in e-, by the measured gain, else by the one that is used."""
+        """A noise (ADU) and its error in e-, by the measured gain, else by the used gain."""
         if noise is None:
             return None
         own, error = (gain, 0.0) if self.gain is None else (self.gain.gain, self.gain.error)
@@ -94,7 +94,7 @@ class Summary:
 
     def noise_before_rounding_e(self, gain: float) -> float:
         """Read noise (e-) of the amplifier: measured, else declared."""
-        # Where samples of one code alone say that it is far below a step, no more than that.
+        # If samples of a single code only bound it far below a step, use that bound.
         if self.before_rounding is not None:
             return gain * self.before_rounding[0]
         if self.read_noise is None:
@@ -103,11 +103,11 @@ class Summary:
 
 
 def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
-    """Put the statistics of all columns together; InputError if the flats hold no light."""
+    """Combine the statistics of all columns; InputError if the flats hold no light."""
     tables = ArrayReader(folder / "levels").read()
     levels, usable, nearly = _rungs(tables, job)
     sums = pair_sums(folder, job)
-    # Pixels that are full saturate the flats though no sample of the converter does.
+    # Full pixels saturate the flats even if the converter does not saturate.
     points = transfer_points(add_neighbours(sums[1], sums[0]).sums)
     well = saturation(points)
     full = usable & (nearly | (levels > sum(well))) if well else np.zeros_like(usable)
@@ -132,7 +132,7 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
         straight = linearity(times, levels, usable)
     charge = dark_charge(folder, job)
     gain, wander, lost = None, bias_wander(job), lost_in_blocks(job)
-    # The shot noise of the dark signal is no read noise; how large it is the gain tells.
+    # Shot noise of the dark signal is not read noise; its size depends on the gain.
     for _ in range(2 if charge else 1):
         shot = charge / (job.gain if gain is None else gain.gain)
         noise, own = read_noise(sums[0], lost, shot, folder, job)
@@ -146,10 +146,10 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
 
 
 def pair_sums(folder: Place, job: Measuring) -> F64:
-    """Sums (2, N_BINS, COLUMNS) over the pairs of frames without and with light."""
+    """Sums (2, N_BINS, COLUMNS) over pairs of frames: without and with light."""
     tables = ArrayReader(folder / "pairs")
     sums = np.zeros(tables.shape[2:])
-    # Added up in the order of the columns: the same sums whoever measured them.
+    # Added in the order of the columns, so that the sums do not depend on the workers.
     for i, j in np.ndindex(grid(job.shape)):
         sums += tables.read((i, i + 1), (j, j + 1))[0, 0]
     return sums
@@ -165,19 +165,19 @@ def _gain(
 ) -> GainFit | None:
     """Photon transfer below the level ``top`` (ADU above bias) of saturation, neighbours added.
 
-    Blocks lose so much of the variance without light (ADU²), the bias wanders by so much (ADU).
-    None where the level above bias is unknown, or the error is too large.
+    ``lost``: variance without light that blocks remove (ADU²). ``wander``: of the bias (ADU).
+    None if the level above bias is unknown, or the error is too large.
     """
     if not (job.dark and job.flat):
         return None
     noise, error = read_noise or (job.read_noise, _GUESS_ERROR * job.read_noise)
-    # With light there is noise enough that rounding adds no more and no less than this.
+    # With light, noise is high enough for rounding to add exactly this.
     dark, lit = sums
     steps, uneven = _steps(job)
     variance = noise**2 + steps - lost
     highest = _LINEAR_SHARE * top
     lit = np.where(lit[:, 1:2] <= highest * lit[:, :1], lit, 0.0)
-    # Noise of less than half a code is rounded up or down by where its level lies.
+    # Noise below half a code is rounded up or down depending on its level.
     smooth = lit[:, 2:3] > _SMOOTH * job.quantum**2 * lit[:, :1]
     lit = np.where(smooth, lit, 0.0) if smooth.any() else lit
     shared = add_neighbours(lit, dark)
@@ -203,11 +203,11 @@ def _gain(
 
 
 def _steps(job: Measuring) -> tuple[float, float]:
-    """What the converter's steps add to the variance (ADU²), and `fit_gain`'s ``uneven`` (ADU³)."""
+    """Variance that the converter's steps add (ADU²), and ``uneven`` of `fit_gain` (ADU³)."""
     rounding = SHEPPARD * job.quantum**2
     if not job.quantum:
         return rounding, 0.0
-    # Within one level: codes between those of two need not come.
+    # Within one level, because codes between two levels need not occur.
     if not any(len(missing_codes(code_counts([group], job))) for group in job.flat):
         return rounding, 0.0
     variance, density = step_noise(code_counts(job.flat, job))
@@ -215,9 +215,9 @@ def _steps(job: Measuring) -> tuple[float, float]:
 
 
 def _rungs(tables: F64, job: Measuring) -> tuple[F64, Mask, Mask]:
-    """Level of each rung (ADU) over the columns that have one on all rungs, and which to use.
+    """Level of each step (ADU) over the columns that have one at all steps, and which to use.
 
-    Also those of which some pixels are full, or nearly.
+    Also the steps at which some pixels are full, or nearly so.
     """
     if not job.flat:
         return np.zeros(0), np.zeros(0, np.bool_), np.zeros(0, np.bool_)
@@ -233,7 +233,7 @@ def _rungs(tables: F64, job: Measuring) -> tuple[F64, Mask, Mask]:
 
 
 def _light(tables: F64, levels: F64, usable: Mask, job: Measuring) -> F64:
-    """Light of each tile over that of the detector, from the steps that most pixels have."""
+    """Light of each tile over the detector's, from usable steps or those losing fewest samples."""
     if not job.flat:
         return np.ones(grid(job.shape))
     lost = tables[..., 2].sum(axis=(0, 1))
@@ -248,13 +248,13 @@ def _light(tables: F64, levels: F64, usable: Mask, job: Measuring) -> F64:
 
 
 def _one_lamp(times: F64, levels: F64) -> bool:
-    """Whether flats (s, ADU) can be of one lamp: of several at one exposure time they are not."""
+    """Whether flats (s, ADU) can be of one lamp; not if one exposure time has several levels."""
     rates = levels / times
     return len(np.unique(times)) == len(times) > 0 and bool(rates.max() < (1 + _LAMP) * rates.min())
 
 
 def linearity_report(summary: Summary, job: Measuring, gain: float) -> dict[str, Any] | None:
-    """What ``reduce.json`` says of the ladder of flats; None when there is none."""
+    """Entry of ``reduce.json`` on the exposure-time steps of flats; None without them."""
     if summary.linearity is None:
         return None
     rows = zip(job.flat, summary.levels, summary.linearity.deviation, strict=True)

@@ -1,19 +1,19 @@
-"""Sentences on a detector that is not as it should be, or was declared otherwise than measured."""
+"""Warnings on a detector that behaves badly, or differs from its declaration."""
 
 from pixcal.kernels.gain_fit import GainFit
 from pixcal.kernels.photon_transfer import SHARED
 from pixcal.stages.reduce.detector_summary import Summary
 
-_ROUGH = 10.0  # reduced chi-square of a photon-transfer curve that is not smooth
+_ROUGH = 10.0  # reduced chi-square above which a photon-transfer curve is not smooth
 _LINEARITY = 0.02
-_OF_STEP = 0.1  # relative distance of a gain declared for a step of the converter
+_OF_STEP = 0.1  # relative tolerance to recognise a gain declared per step of the converter
 
 
 def detector_warnings(summary: Summary, gain: float, saturation: float | None) -> list[str]:
-    """What to say of the detector as a whole.
+    """Warnings on the detector as a whole.
 
-    ``gain``: that is used (e-/ADU). ``saturation``: where flats were found to saturate (ADU), if it
-    was not declared.
+    ``gain``: the used gain (e-/ADU). ``saturation``: level at which flats saturate (ADU), if not
+    declared.
     """
     found = []
     if saturation is not None:

@@ -36,7 +36,7 @@ from pixcal.storage.place import Place
 
 
 def convert_bytes(itemsize: int, width: int, frames: int = CHUNK[0]) -> int:
-    """Peak of `convert`: two chunks, compressed too; of each column, frames, codes and maps."""
+    """Peak of `convert`: two chunks, also compressed; frames, codes and maps of each column."""
     tile = CHUNK[1] * CHUNK[2]
     column = frames * itemsize + CHUNK[0] * np.dtype(np.uint16).itemsize
     return tile * (4 * 4 * CHUNK[0] + width * column + max(width, STRIP) * 16 * 4)
@@ -44,7 +44,7 @@ def convert_bytes(itemsize: int, width: int, frames: int = CHUNK[0]) -> int:
 
 @dataclass(frozen=True)
 class FringeSet:
-    """A fringe set, raw."""
+    """A raw fringe set."""
 
     name: str  # as in ``acquisition.yaml``
     raw: Reader  # of the frames
@@ -67,7 +67,7 @@ class FringeSet:
 
 
 def signal_range(fringes: FringeSet, strip: Strip) -> tuple[float, float]:
-    """Least and largest electrons of the samples of good pixels in columns of chunks."""
+    """Least and largest sample (e-) of good pixels in columns of chunks."""
     every = fringes.maps(strip)
     lowest = [np.full(maps["bias"].shape, np.inf, np.float32) for maps in every]
     highest = [-low for low in lowest]
@@ -92,7 +92,7 @@ def _range_e(
 
 @dataclass(frozen=True)
 class Converting:
-    """What the task of a column needs."""
+    """Input of the task of a column."""
 
     fringes: FringeSet
     scale: Scale  # codes of the electrons
@@ -147,15 +147,15 @@ def write_coordinates(folder: Place, time_s: Any, shape: tuple[int, int]) -> Non
         write_array(folder / name, values, dims=(name,), attrs=attrs)
 
 
-# share of saturated samples up to which a pixel is good: particles hit it now and then, and those
-# samples have no weight. Light that saturates does so in every bright fringe, and biases the rest.
+# largest share of saturated samples of a good pixel: occasional particle hits have no weight. Light
+# that saturates does so in every bright fringe, and biases the other samples.
 STRAY_SHARE = 1e-3
 
-STRAY_SAMPLES = 2  # saturated samples that a pixel may have in a short run
+STRAY_SAMPLES = 2  # saturated samples allowed per pixel in a short run
 
 
 class _Column:
-    """A column of chunks as it is converted."""
+    """A column of chunks during conversion."""
 
     def __init__(self, job: Converting, index: Index, maps: dict[str, NDArray[Any]]) -> None:
         self.job, self.index, self.maps = job, index, maps
@@ -170,7 +170,7 @@ class _Column:
         self.total = self.largest = 0
 
     def add(self, first: int, samples: NDArray[Any], begin: int) -> None:
-        """Convert frames from the columns of a strip from ``begin`` on; write full chunks."""
+        """Convert frames of a strip's columns from ``begin`` on; write full chunks."""
         fringes, last = self.job.fringes, first + len(samples)
         at = first % CHUNK[0]
         held = at + len(samples)
@@ -183,7 +183,7 @@ class _Column:
             self.job.writers["signal"].write((last - held, y0, x0), self.codes[:held])
 
     def result(self) -> dict[str, NDArray[Any]]:
-        """Maps and counts, by names of their arrays."""
+        """Maps and counts, by the names of their arrays."""
         fringes, maps = self.job.fringes, self.maps
         flat, rate, seconds = maps["flat"], maps["dark_rate"], float(fringes.exptime.mean())
         read = (maps["read_noise"] ** 2 + np.maximum(rate, 0) * seconds) / flat**2
@@ -199,8 +199,8 @@ class _Column:
 def convert(job: Converting, parts: Sequence[Strip]) -> None:
     """Write columns of chunks in electrons, their maps, and their counts.
 
-    The counts are: samples that are saturated; others without weight; samples with weight; the sum
-    of their codes; the largest sample of the strip (ADU; zero for real numbers).
+    The counts are: saturated samples; other samples without weight; samples with weight; the sum of
+    their codes; the largest sample of the strip (ADU; zero for real numbers).
     """
     found: dict[Index, dict[str, NDArray[Any]]] = {}
     for strip in parts:

@@ -1,4 +1,4 @@
-"""Which frames were exposed how long, and what to do where the headers do not say."""
+"""Exposure times of the frames, with defaults where headers lack them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ import numpy as np
 from pixcal.estimators.detector.calibration import MIN_RUNGS
 from pixcal.model.arrays import F32
 
-# exposure times are the same within this relative distance: cameras write what they measured
+# relative tolerance of equal exposure times: cameras may write measured times
 _SAME = 1e-3
 
 
@@ -28,20 +28,20 @@ class Exposures:
 
     dark: list[Group] = field(default_factory=list)  # frames without light, bias among them
     flat: list[Group] = field(default_factory=list)  # sorted by exposure time
-    # whether the exposure times of the flats are known; else there is one group, at one second
+    # whether exposure times of the flats are known; if not, there is one group, at one second
     known: bool = True
-    # exposure times (s) of the frames of each set, float32, zero where dark is not to be scaled
+    # exposure times (s) of the frames of each set, float32; zero: do not scale the dark signal
     fringes: dict[str, F32] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)  # sentences
 
     @property
     def has_rate(self) -> bool:
-        """Whether the dark signal per second can be told from the bias."""
+        """Whether the dark signal per second can be separated from the bias."""
         return len({group.exptime for group in self.dark}) > 1
 
     @property
     def read_series(self) -> Group | None:
-        """Frames whose noise is the read noise: bias, else the longest darks; None if single."""
+        """Series that gives the read noise: bias, else the longest darks; None if single frames."""
         series = [group for group in self.dark if group.array == "bias"] or self.dark
         longest = max(series, key=lambda group: len(group.frames), default=None)
         return longest if longest is not None and len(longest.frames) > 1 else None
@@ -54,7 +54,7 @@ def group_exposures(tables: Mapping[str, Mapping[str, Sequence[Any]]]) -> Exposu
     exposed = [t for name in ["dark", *lit] for t in times.get(name, [])]
     found = Exposures()
     if "dark" in times and all(t is None for t in exposed):
-        # The exposure is the unit of time, the same for all but the bias frames.
+        # The exposure is the unit of time, and equal for all but the bias frames.
         times |= {name: [1.0] * len(times[name]) for name in ["dark", *lit]}
         unit = ", and dark_rate is in electrons per exposure" if "bias" in times else ""
         found.warnings.append(
@@ -116,7 +116,7 @@ def _group_flats(found: Exposures, times: list[float | None], steps: Sequence[in
     if not times:
         found.warnings.append("no flat frames: the flat is 1, the gain is not measured")
         return
-    # Without exposure nothing tells the rate of the light.
+    # Zero exposure gives no rate of the light.
     usable = [t if t else None for t in times]
     found.flat = _groups("flat", usable, steps)
     unknown, unexposed = sum(t is None for t in times), sum(t == 0 for t in times)

@@ -1,7 +1,7 @@
-"""Figures of merit after EMVA 1288: what a data sheet of the detector would say, with errors.
+"""Figures of merit after EMVA 1288, as on a data sheet of the detector, with errors.
 
-Spatial nonuniformity comes from averages of the even and of the odd frames of a series, read once
-more in the middle of the detector (`SIDE` pixels at most); the rest from what was measured before.
+Spatial nonuniformity comes from averages of the even and of the odd frames of a series, read again
+in the middle of the detector (at most `SIDE` pixels); the rest comes from earlier measurements.
 """
 
 import math
@@ -35,23 +35,23 @@ from pixcal.storage.manifest import write_json
 
 Json = dict[str, Any]
 
-_NO_ERROR = 1e-9  # ADU/s: below it all samples are of one code
-_WELL = 0.97  # share of the converter's range below which it is the wells that are full
+_NO_ERROR = 1e-9  # ADU/s: below it all samples have one code
+_WELL = 0.97  # share of the converter's range below which saturation is due to full wells
 
 
 def characterise(
     made: Build, source: Ingested, job: Measuring, summary: Summary, facts: Json, runtime: Runtime
 ) -> Json:
-    """Figures of merit, by name; their curves go to ``figures_of_merit.json``.
+    """Figures of merit, by name; writes their curves to ``figures_of_merit.json``.
 
-    Each has ``title``, ``unit``, ``value``, ``error`` (null where unknown) and ``note``. ``facts``:
-    what ``reduce.json`` says so far.
+    Each has ``title``, ``unit``, ``value``, ``error`` (null if unknown) and ``note``. ``facts``:
+    present contents of ``reduce.json``.
     """
     gain = _gain(facts)
     dark, _ = pair_sums(made.scratch / "statistics", job)
     clipped = (source.detector.saturation_adu or source.saturation_found) is not None
     top, reached = _top(summary, job, clipped)
-    top = top if job.dark else None  # levels above an unknown bias say nothing
+    top = top if job.dark else None  # levels above an unknown bias are meaningless
     middle = middle_of(source.shape)
     halves = read_halves(made, source, summary, top, middle, runtime)
     note = "" if facts["gain_e_per_adu"]["measured"] is not None else "declared, not measured"
@@ -99,7 +99,7 @@ def _gain(facts: Json) -> tuple[float, float | None]:
 
 
 def _read_noise(found: Json, summary: Summary, gain: float, step: float) -> Measure | None:
-    """Read noise with and without rounding to steps (ADU), in e-; returned with it, in ADU."""
+    """Add read noise with and without rounding to steps, in e-; return it with rounding, in ADU."""
     whole, own = summary.read_noise, summary.before_rounding
     if whole is None:
         return None
@@ -118,11 +118,11 @@ def _read_noise(found: Json, summary: Summary, gain: float, step: float) -> Meas
 
 
 def _line_noise(found: Json, dark: F64, gain: float, shape: tuple[int, int]) -> None:
-    """Noise in time that the pixels of a row, or of a column, have in common."""
+    """Temporal noise common to the pixels of a row, or of a column."""
     lengths = {"row": shape[1], "column": shape[0]}
     for name, (shared, error) in shared_by_lines(dark).items():
         if shared:
-            # Each line of each pair of frames is one draw of it.
+            # Each line of each pair of frames is one sample of it.
             error = math.hypot(error, shared * math.sqrt(2 * lengths[name] / dark[:, 0].sum()))
             noise = math.sqrt(shared)
             title, note = f"noise of whole {name}s", "part of the read noise"
@@ -132,7 +132,7 @@ def _line_noise(found: Json, dark: F64, gain: float, shape: tuple[int, int]) -> 
 
 
 def _lamp_error(source: Ingested) -> float | None:
-    """Error of the level of a flat (%), by how those of one exposure differ."""
+    """Error of the level of a flat (%), from the scatter at one exposure time."""
     levels = None if source.survey is None else source.survey.levels
     groups = [] if levels is None else [levels[list(g.frames)] for g in source.exposures.flat]
     ratios = [own.var(ddof=1) / own.mean() ** 2 / len(own) for own in groups if len(own) > 1]
@@ -140,9 +140,9 @@ def _lamp_error(source: Ingested) -> float | None:
 
 
 def _top(summary: Summary, job: Measuring, clipped: bool) -> tuple[Measure | None, bool]:
-    """Saturation above bias (ADU) with its error, or the highest level, and whether it is one.
+    """Saturation above bias (ADU, error) and True, or else the highest level and False.
 
-    ``clipped`` tells whether samples end at a code, and not the wells.
+    ``clipped``: whether the converter limits samples, not the wells.
     """
     peak, end = summary.well, job.saturation - summary.usual.bias
     if peak is not None and (not clipped or peak[0] + 2 * peak[1] < _WELL * end):
@@ -184,12 +184,12 @@ def _full_well(
 
 
 _TITLES = {"dsnu": "DSNU", "prnu": "PRNU"}
-_ALTERNATES = 6.0  # errors of a difference between every second line that is worth a word
-_ALTERNATING_SHARE = 0.04  # of the variance of the map that its square is at least
+_ALTERNATES = 6.0  # least difference of even and odd lines to report, in its errors
+_ALTERNATING_SHARE = 0.04  # least share of its square in the variance of the map
 
 
 def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: Mask) -> list[str]:
-    """Standard deviations, spectra and profiles of a pair of maps; what to say of a pattern."""
+    """Add standard deviations, spectra and profiles of a pair of maps; return pattern warnings."""
     pair = without_gaps(halves[0], good), without_gaps(halves[1], good)
     spread: Nonuniformity = nonuniformity(*pair, int((~good).sum()))
     patterns = []
@@ -225,7 +225,7 @@ def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: 
 
 
 def _listed(columns: Any, names: tuple[str, ...]) -> Json:
-    """Columns of numbers of five digits."""
+    """Columns of numbers rounded to five digits."""
     return {
         name: [float(f"{v:.5g}") for v in column]
         for name, column in zip(names, columns, strict=True)
@@ -236,7 +236,7 @@ def _listed(columns: Any, names: tuple[str, ...]) -> Json:
 
 
 def _dark_current(found: Json, made: Build, source: Ingested, scale: float, middle: Window) -> None:
-    """Mean dark signal of the good pixels; its error is that of frames, drift of bias included."""
+    """Mean dark signal of good pixels; its error is from frames, bias drift included."""
     if not source.exposures.has_rate:
         return
     folder = made.folder / "calibration.zarr"
@@ -254,7 +254,7 @@ def _dark_current(found: Json, made: Build, source: Ingested, scale: float, midd
 
 
 def _dark_means(source: Ingested, middle: Window, good: Mask) -> tuple[F64, F64]:
-    """Exposure time (s) and mean (ADU) of each frame without light, over some rows."""
+    """Exposure time (s) and mean (ADU) of each frame without light, over a window."""
     (y0, y1), columns = middle
     rows = y0 + (y1 - y0) // CHUNK[1] // 2 * CHUNK[1]
     window = (rows, min(rows + CHUNK[1], y1)), columns
@@ -268,7 +268,7 @@ def _dark_means(source: Ingested, middle: Window, good: Mask) -> tuple[F64, F64]
 
 
 def _temperature(tables: Mapping[str, Mapping[str, Any]]) -> str:
-    """At what temperature the frames without light were taken, if their headers say."""
+    """Temperature of the frames without light, if in their headers."""
     told = [
         t
         for kind in ("dark", "bias")

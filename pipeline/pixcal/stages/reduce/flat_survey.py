@@ -1,7 +1,7 @@
-"""What frames show at first sight: how bright each one is, and where samples saturate.
+"""A first survey of the frames: the level of each, and where samples saturate.
 
-Frames of one exposure time may be of several levels, where the lamp was changed. Where a converter
-or a well ends, samples pile up at their highest code.
+Frames of one exposure time have several levels if the lamp was changed. At saturation of the
+converter or the well, samples pile up at their highest code.
 """
 
 import math
@@ -17,34 +17,34 @@ from pixcal.model.arrays import F64, I64
 from pixcal.model.errors import InputError
 from pixcal.storage.frame_reader import Reader
 
-ROWS = 64  # rows that are looked at, in the middle of the frames
-TOGETHER = 64  # frames that are read at once: those of a chunk of a cube
-APART = 0.05  # relative distance of two levels that are not one lamp's flicker
-# The same where the lamp is steady: least distance, and that over the usual one of two frames that
-# follow one another.
+ROWS = 64  # rows that are surveyed, in the middle of the frames
+TOGETHER = 64  # frames read at once: those of a chunk of a cube
+APART = 0.05  # relative distance of two levels that exceeds the flicker of a lamp
+# The same for a steady lamp: least relative distance, and its ratio to the typical difference of
+# successive frames.
 FINE, STEADY = 0.005, 6.0
-MIN_SHARE = 1e-3  # of the samples of a frame that lie at the highest code at least
+MIN_SHARE = 1e-3  # least share of the samples of a frame at the highest code
 MIN_SAMPLES = 50
-MIN_CHANGES = 3  # fewest, from frame to frame, that tell a lamp's flicker
-NEIGHBOURS = 16  # codes below the highest that are held against it
-MIN_DARKS = 5  # fewest steps between levels of darks that tell groups apart
-# least step between two groups: over the median step, and over the noise of a sample
+MIN_CHANGES = 3  # fewest frame-to-frame changes to measure a lamp's flicker
+NEIGHBOURS = 16  # codes below the highest that are compared with it
+MIN_DARKS = 5  # fewest steps between levels of darks to separate groups
+# least step between two groups, over the median step and over the noise of a sample
 JUMP, NOTABLE = 20.0, 0.1
-OUTLIER = 9.0  # median deviations beyond which a difference of two frames is no noise
-PILED = 4  # how many times as many samples as at any of these are a pile
+OUTLIER = 9.0  # median deviations above which a difference of two frames is not noise
+PILED = 4  # least ratio of samples at a pile to those at any of these codes
 
 
 @dataclass(frozen=True)
 class FlatSurvey:
-    """Flats at first sight."""
+    """Levels and saturation of the flats, from a survey."""
 
     levels: F64  # (t,) mean of each frame above the bias (ADU)
-    # code (ADU) at which samples pile up; None where none do, or samples are real numbers
+    # code (ADU) at which samples pile up; None if none do, or samples are real numbers
     saturation: float | None
 
     @classmethod
     def of(cls, arrays: Mapping[str, Reader]) -> "FlatSurvey":
-        """Look at the middle rows of all flats, and of a frame without light."""
+        """Survey the middle rows of all flats, and of a frame without light."""
         dark = next((arrays[name] for name in ("bias", "dark") if name in arrays), None)
         pedestal = 0.0 if dark is None else float(np.nanmean(middle_rows(dark, 0, 1)))
         flats = arrays["flat"]
@@ -63,7 +63,7 @@ class FlatSurvey:
         return cls(np.array(levels), _pile(tops))
 
     def steps(self, exposures: Sequence[float | None]) -> list[int]:
-        """Number of the level of each frame among those of the same exposure time, from 0."""
+        """Index from 0 of each frame's level among those of its exposure time."""
         found = np.zeros(len(exposures), int)
         times = np.array([np.nan if t is None else t for t in exposures], float)
         for time in np.unique(times):
@@ -77,10 +77,9 @@ class FlatSurvey:
         return [int(step) for step in found]
 
     def _parted(self, frames: I64) -> list[I64]:
-        """Frames of similar levels, parted where a steady lamp was changed a little between them.
+        """Split frames of similar levels where a steady lamp was changed slightly.
 
-        Frames of a level follow one another, two at least: how much those differ tells the lamp's
-        flicker.
+        A level has two or more successive frames, whose differences measure the lamp's flicker.
         """
         frames = np.sort(frames)
         change = np.abs(np.diff(self.levels[frames])) / max(float(self.levels[frames].max()), 1.0)
@@ -103,10 +102,10 @@ class FlatSurvey:
 
 
 def rough_gain(arrays: Mapping[str, Reader], levels: F64, groups: Sequence[Sequence[int]]) -> float:
-    """Gain (e-/ADU) to some tens of per cent, by two frames of the level with most photon noise.
+    """Gain (e-/ADU) to a few tens of per cent, from two frames at the level with most shot noise.
 
     ``levels``: (t,) of the flats (ADU above bias); ``groups``: numbers of the flats of each level.
-    InputError if no two flats are of one level, or they show no photon noise.
+    InputError if no two flats have one level, or they show no shot noise.
     """
     dark = next((arrays[name] for name in ("bias", "dark") if name in arrays), None)
     read = 0.0 if dark is None or dark.shape[0] < 2 else _noise_of_pair(dark, 0, 1)
@@ -125,7 +124,7 @@ def rough_gain(arrays: Mapping[str, Reader], levels: F64, groups: Sequence[Seque
 
 
 def _noise_of_pair(frames: Reader, one: int, other: int) -> float:
-    """Variance (ADU²) of a sample by the difference of two frames, without outliers."""
+    """Variance (ADU²) of a sample from the difference of two frames, without outliers."""
     first, second = (middle_rows(frames, n, n + 1)[0].astype(float) for n in (one, other))
     change = second - first
     change -= np.nanmedian(change)
@@ -134,7 +133,7 @@ def _noise_of_pair(frames: Reader, one: int, other: int) -> float:
 
 
 def of_several_levels(frames: Reader) -> bool:
-    """Whether frames without light fall into groups of levels far apart: of exposure times."""
+    """Whether levels of frames without light form separate groups, as different exposures do."""
     some = [middle_rows(frames, n, n + 1)[0].astype(float) for n in range(frames.shape[0])]
     steps = np.diff(np.sort([np.nanmean(one) for one in some]))
     if len(steps) < MIN_DARKS:
@@ -144,19 +143,19 @@ def of_several_levels(frames: Reader) -> bool:
 
 
 def share_at_zero(frames: Reader) -> float:
-    """Share of the samples of the first frame that are zero, where no sample is below."""
+    """Share of zero samples in the first frame, if no sample is negative."""
     samples = middle_rows(frames, 0, 1)
     return 0.0 if samples.min() < 0 else float((samples == 0).mean())
 
 
 def noise_above(frames: Reader) -> float:
-    """Noise of the first frame (ADU) by its upper half alone: the lower may be cut off."""
+    """Noise of the first frame (ADU) from its upper half: the lower may be cut off."""
     lower, upper = np.quantile(middle_rows(frames, 0, 1), ndtr([1.0, 2.0]))
     return float(upper - lower)
 
 
 def of_whole_numbers(frames: Reader) -> bool:
-    """Whether samples are whole numbers; files of real numbers may hold such."""
+    """Whether samples are whole numbers, which files of real numbers may also hold."""
     if frames.dtype.kind in "iu":
         return True
     ends = (middle_rows(frames, n, n + 1) for n in {0, frames.shape[0] - 1})
@@ -164,14 +163,14 @@ def of_whole_numbers(frames: Reader) -> bool:
 
 
 def code_step(arrays: Sequence[Reader]) -> int:
-    """Largest step of which all samples of some frames are multiples; 1 if they are few."""
+    """Largest step of which all surveyed samples are multiples; 1 if they are few."""
     ends = ((array, n) for array in arrays for n in {0, array.shape[0] - 1})
     codes = {int(code) for array, n in ends for code in np.unique(middle_rows(array, n, n + 1))}
     return math.gcd(*codes) if len(codes) >= NEIGHBOURS else 1
 
 
 def middle_rows(frames: Reader, begin: int, end: int) -> NDArray[Any]:
-    """Samples (t, y, x) of the middle `ROWS` rows of some frames."""
+    """Samples (t, y, x) of the middle `ROWS` rows of a range of frames."""
     count, ny, nx = frames.shape
     first = max((ny - ROWS) // 2, 0)
     read: NDArray[Any] = frames.read(
@@ -181,7 +180,7 @@ def middle_rows(frames: Reader, begin: int, end: int) -> NDArray[Any]:
 
 
 def _pile(tops: Sequence[tuple[int, I64, float]]) -> float | None:
-    """Highest code, if there are far more samples than just below it."""
+    """Highest code, if it has far more samples than the codes just below."""
     if not tops:
         return None
     highest = max(top for top, _, _ in tops)

@@ -1,9 +1,9 @@
-"""What the calibration frames say, column of chunks by column; each frame is read once.
+"""Statistics of the calibration frames by columns of chunks; each frame is read once.
 
 Strips of neighbouring columns are read together. A column's bias, dark and flat frames are combined
-into maps; its share of the photon transfer and
-of the ladder of flats goes into small tables. All of it is left in a scratch store, so that a run
-that was cut short goes on with the columns that are missing.
+into maps; its share of the photon transfer and of the exposure-time steps of flats goes into small
+tables. All results are kept in a scratch store, so that an interrupted run resumes with the missing
+columns.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -54,23 +54,23 @@ STATISTICS = (
     "bias",  # ADU
     "dark_rate",  # ADU/s
     "dark_rate_error",  # ADU/s
-    "response",  # over that of the tile
+    "response",  # relative to the tile
     "response_error",
-    "read_variance",  # ADU², of the read noise series
-    "dark_variance",  # ADU², of all frames without light, as it would be without dark signal
+    "read_variance",  # ADU², of the read-noise series
+    "dark_variance",  # ADU², of all frames without light, less the shot noise of dark signal
     "dark_dof",
     "kurtosis",
     "outliers",
     "flags",
 )
 
-# noise, in steps of the samples, below which the median of few frames' variances jumps
+# noise, in steps of the samples, below which the median of variances of few frames jumps
 _COARSE = 3.0
 
 
 @dataclass(frozen=True)
 class Measuring:
-    """What the first task of a column needs."""
+    """Input of the first task of a column."""
 
     frames: Mapping[str, Reader]  # a reader of each array
     shape: tuple[int, int]  # of the detector's window (y, x)
@@ -78,12 +78,12 @@ class Measuring:
     flat: Sequence[Group]
     read_series: Group | None  # the one of ``dark`` whose noise is the read noise
     flats_timed: bool  # whether the exposure times of the flats are known
-    # saturation, full: level (ADU) from which on samples of flats are saturated; of any frames
+    # saturation, full: level (ADU) from which samples are saturated: in flats, and in any frames
     saturation: float
     full: float
     quantum: float  # step of the samples (ADU), 0 for real numbers
-    cut_off: Mapping[str, float]  # arrays whose noise is cut off at code zero; it, roughly (ADU)
-    gain: float  # gain, read_noise: rough guess: e-/ADU, ADU
+    cut_off: Mapping[str, float]  # rough noise (ADU) of arrays whose noise is cut off at code zero
+    gain: float  # gain, read_noise: rough values (e-/ADU, ADU)
     read_noise: float
     options: Reduce  # limits of outliers and flags
     writers: Mapping[str, ArrayWriter]  # arrays for the results
@@ -106,7 +106,7 @@ def statistics_writers(folder: Place, shape: tuple[int, int], flats: int) -> dic
 
 
 def measure_bytes(dark: Sequence[Group], flat: Sequence[Group], width: int) -> int:
-    """Peak of `measure`: a column's batch in copies; of each column, one chunk and maps."""
+    """Peak of `measure`: copies of a column's batch; one chunk and the maps of each column."""
     chunk, tile = 4 * CHUNK[0] * CHUNK[1] * CHUNK[2], 8 * CHUNK[1] * CHUNK[2]
     maps = max(width, STRIP) * tile * (60 + 8 * len(dark) + 16 * len(flat))
     return (6 + width) * chunk + maps
@@ -114,14 +114,14 @@ def measure_bytes(dark: Sequence[Group], flat: Sequence[Group], width: int) -> i
 
 @dataclass
 class _Column:
-    """What becomes known of a column of chunks."""
+    """Statistics of a column of chunks."""
 
     index: Index
     maps: dict[str, F64]
     pairs: F64
     levels: F64
-    noise: F64  # variance of a sample that is usual here (ADU²)
-    loud: NDArray[np.bool_]  # pixels that are noisy without light: left out of the photon transfer
+    noise: F64  # typical variance of a sample in this column (ADU²)
+    loud: NDArray[np.bool_]  # pixels noisy without light, which photon transfer leaves out
     line_noise: LineNoise = field(default_factory=LineNoise)
     line: DarkLine | None = None
     rungs: list[Rung] = field(default_factory=list)
@@ -149,7 +149,7 @@ def measure(job: Measuring, parts: Sequence[Strip]) -> None:
 
 
 def _measured(job: Measuring, strip: Strip) -> list[_Column]:
-    """Columns that are read together."""
+    """Statistics of columns that are read together."""
     columns = [_Column.begin(job, index) for index in strip]
     combined = [_combine_dark(job, group, columns) for group in job.dark]
     for column, *found in zip(columns, *combined, strict=True) if combined else []:
@@ -165,7 +165,7 @@ def _measured(job: Measuring, strip: Strip) -> list[_Column]:
 
 
 def _combine_dark(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[Combined]:
-    """Frames without light in each column, as they would be if no noise were cut off."""
+    """Combine frames without light in each column, corrected for noise cut off at zero."""
     every = _combine(job, group, columns)
     if group.array not in job.cut_off:
         return every
@@ -177,7 +177,7 @@ def _combine_dark(job: Measuring, group: Group, columns: Sequence[_Column]) -> l
 
 
 def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined]) -> None:
-    """Bias and dark signal; also the variance of a sample that is usual in this column."""
+    """Measure bias and dark signal, and the typical variance of a sample in this column."""
     maps = column.maps
     times = [group.exptime for group in job.dark]
     line = dark_line([c.mean for c in combined], [c.kept for c in combined], times)
@@ -190,7 +190,7 @@ def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined])
     read = max(read if read > 0 else job.read_noise**2, SHEPPARD * job.quantum**2)
     dofs = [np.where(np.isfinite(c.variance), c.kept - 1, 0.0) for c in combined]
     dof = np.sum(dofs, axis=0)
-    # Of a variance less the shot noise of the dark signal, which adds to its error.
+    # Subtract the shot noise of the dark signal from the variance; it adds to the error.
     shots = [charge / job.gain for charge in charges]
     weights = [n * (read / (read + shot)) ** 2 for n, shot in zip(dofs, shots, strict=True)]
     weight = np.sum(weights, axis=0)
@@ -214,13 +214,13 @@ def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined])
 
 
 def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined) -> None:
-    """A level of the flats, and how many of its samples have no weight."""
+    """Measure a level of the flats, and count its samples without weight."""
     group, line = job.flat[number], column.line
     exptime = group.exptime if job.flats_timed else 0.0
     frames = len(group.frames)
     signal = np.where(found.seen == frames, found.mean, np.nan)
     column.levels[number, 1:3] = signal.size, (frames - found.seen).sum()
-    # Few frames say little of one pixel's noise, and most pixels are like the others.
+    # Few frames give a poor estimate of one pixel's noise, and most pixels are alike.
     seen = lit(signal)
     level = finite_median(signal[seen])
     usual = usual_variance(found.variance[seen], frames - 1)
@@ -237,7 +237,7 @@ def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined)
 
 
 def _measure_response(job: Measuring, column: _Column) -> None:
-    """Response and levels of the tile, and pixels that do not follow the others."""
+    """Measure the response, the levels of the tile, and pixels with deviating levels."""
     maps, levels = column.maps, step_levels(column.rungs)
     column.levels[:, 0] = levels
     rungs, levels = unsaturated(column.rungs, levels, float(np.median(column.noise)))
@@ -252,7 +252,7 @@ def _measure_response(job: Measuring, column: _Column) -> None:
 def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[Combined]:
     """Robust combination of a group in each column; statistics of its pairs are added there."""
     lamp = group.array == "flat"
-    # Of noise that is cut off the median deviation may be nothing.
+    # The median deviation of noise that is cut off may be zero.
     step = max(job.quantum, job.cut_off.get(group.array, 0.0))
     every = [Combination(clip=job.options.clip_sigma, lamp=lamp, quantum=step) for _ in columns]
     pedestals: list[F32 | None] = [None] * len(columns)
@@ -280,7 +280,7 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
 
 
 def _add_pairs(job: Measuring, column: _Column, frames: F32, levels: F32, full: F32 | None) -> None:
-    """Add the photon transfer of frames 0 and 1, 2 and 3, and so on; of flats, ``full`` (ADU)."""
+    """Add photon transfer of frames 0 and 1, 2 and 3, and so on; ``full`` (ADU) for flats."""
     of_samples = job.read_noise, job.quantum
     if full is not None:
         column.pairs[1] += flat_pair_sums(
@@ -294,12 +294,12 @@ def _add_pairs(job: Measuring, column: _Column, frames: F32, levels: F32, full: 
 
 
 def _loud(job: Measuring, frames: F32) -> NDArray[np.bool_]:
-    """Pixels whose noise without light is far above that of the others."""
+    """Pixels whose noise without light is far above typical."""
     if len(frames) < 2:
         return np.zeros(frames.shape[1:], np.bool_)
     variance = frames.var(axis=0, ddof=1, dtype=float)
     dof = np.full(variance.shape, len(frames) - 1.0)
-    # A sample that lies on a change of code is one of two.
+    # A level at the boundary of two codes gives either one.
     usual = max(usual_variance(variance, len(frames) - 1), job.quantum**2 / 4)
     unknown = np.full(variance.shape, np.nan)
     factor = noisy_factor(job.options.noisy_factor, variance, len(frames) - 1, job.quantum)
@@ -308,11 +308,11 @@ def _loud(job: Measuring, frames: F32) -> NDArray[np.bool_]:
 
 
 def _usable(job: Measuring, samples: NDArray[Any], lamp: bool) -> F32:
-    """Samples as real numbers, NaN where one cannot be used."""
+    """Samples as real numbers; NaN if unusable."""
     frames = samples.astype(np.float32)
     frames[~(np.abs(frames) <= MOST_ADU)] = np.nan
     if lamp:
-        # Only there: a pixel that is saturated without light shall be seen as hot.
+        # Only in flats: a pixel that saturates without light is to be flagged hot.
         frames[frames >= job.saturation] = np.nan
     return frames
 
@@ -325,7 +325,7 @@ def _batches(job: Measuring, group: Group, strip: Strip) -> Iterator[list[NDArra
         numbers = group.frames[first : first + BATCH]
         batch = np.empty((len(numbers), rows[1] - rows[0], x1 - x0), reader.dtype)
         for _, run in groupby(enumerate(numbers), key=lambda at: at[1] - at[0]):
-            # Frames that follow one another are read at once.
+            # Successive frames are read at once.
             (n, frame), *more = run
             last = n + 1 + len(more)
             reader.read((frame, frame + last - n), rows, (x0, x1), out=batch[n:last])

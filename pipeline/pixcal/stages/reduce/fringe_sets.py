@@ -1,4 +1,4 @@
-"""Write the datasets of the fringe sets: range, precision, conversion, and what there is to say."""
+"""Write the datasets of the fringe sets: range, precision, conversion and warnings."""
 
 import math
 from dataclasses import dataclass
@@ -33,11 +33,11 @@ class Bounds:
     flat: tuple[float, float]  # least and largest relative response
     bias: float  # bias, dark_rate: largest (ADU; e-/s)
     dark_rate: float
-    read_noise: float  # usual (e-)
+    read_noise: float  # typical (e-)
 
     @property
     def smallest_variance(self) -> float:
-        """Of a sample of the detector (e-²): its read noise where the response is largest."""
+        """Least variance of a sample (e-²): read noise at the largest response."""
         return (self.read_noise / self.flat[1]) ** 2
 
 
@@ -51,10 +51,10 @@ def write_set(
     share: float,
     runtime: Runtime,
 ) -> dict[str, Any]:
-    """Write the dataset of a fringe set; returns what ``reduce.json`` says of it.
+    """Write the dataset of a fringe set; return its entry in ``reduce.json``.
 
-    ``name``: of the array, ``fringes/<set>``; ``gain``: e-/ADU; ``share``: of the variance that the
-    stored precision may cost.
+    ``name``: of the array, ``fringes/<set>``; ``gain``: e-/ADU; ``share``: largest share of the
+    variance that rounding of stored samples may add.
     """
     fringes = FringeSet(
         name=name.partition("/")[2],
@@ -73,12 +73,12 @@ def write_set(
     if math.isfinite(high - low):
         scale = choose_scale(low, high, bounds.smallest_variance, share)
     if scale is None or scale.variance > share * bounds.smallest_variance:
-        # Worth a look at the frames: they need not fill the range that the converter has.
+        # Read the range from the frames: they may not fill the converter's range.
         origin = "frames"
         ends = run_tasks(
             partial(signal_range, fringes), strips(todo, width), runtime, label=f"{name} range"
         )
-        # Samples far below the bias are no samples: they have no weight.
+        # Samples far below the bias are invalid and have no weight.
         low, high = max(low, min(e[0] for e in ends)), max(e[1] for e in ends)
         low, high = (low, high) if low <= high else (0.0, 1.0)
         scale = choose_scale(low, high, bounds.smallest_variance, share)
@@ -101,8 +101,8 @@ def write_set(
 def _possible_range(
     source: Ingested, name: str, gain: float, bounds: Bounds
 ) -> tuple[float, float]:
-    """Electrons that a good pixel can have, from nothing on the converter to its end."""
-    # Types with a sign are not filled below zero by a converter, only by noise about a bias.
+    """Range of electrons of a good pixel over the range of the converter."""
+    # In signed types, only noise about a bias gives negative samples, not the converter's range.
     lowest = max(source.lowest(name), -32 * max(bounds.read_noise / gain, 1.0))
     flat = bounds.flat[0]
     dark = bounds.dark_rate * float(source.exposures.fringes[name].max())
@@ -142,10 +142,10 @@ def share_at_mean(found: dict[str, Any], bounds: Bounds) -> float | None:
 
 
 def set_warnings(name: str, found: dict[str, Any], declared: bool, share: float) -> list[str]:
-    """What to say of a fringe set, as `write_set` returns it.
+    """Warnings on a fringe set, given the result of `write_set`.
 
-    ``declared``: whether the saturation level is; ``share``: of the variance that the stored
-    precision may cost.
+    ``declared``: whether the saturation level is declared; ``share``: largest share of the
+    variance that rounding of stored samples may add.
     """
     warnings = []
     cost = found["quantisation"]["share_of_variance_dark"]

@@ -1,4 +1,4 @@
-"""Averages of the even and of the odd frames of a series: what they share is the detector's."""
+"""Averages of the even and of the odd frames of a series: their common part is fixed pattern."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import CHUNK, ArrayReader
 
-# first row and the one after the last; the same of columns
+# first row and the one after the last; same for columns
 Window = tuple[tuple[int, int], tuple[int, int]]
 
 SIDE = 1024  # longest side of the middle of the detector whose nonuniformity is measured
 _MIN_PIXELS = 16
-_FRAMES = 64  # most frames of a series that are read for it
+_FRAMES = 64  # most frames of a series that are read
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,12 @@ class Halves:
     """Averages of the even and of the odd frames over the middle of the detector (ADU)."""
 
     dark: F64 | None  # (2, y, x) without light, shortest exposure
-    flat: F64 | None  # (2, y, x) near half of the saturation, the former subtracted
+    flat: F64 | None  # (2, y, x) near half of saturation, ``dark`` subtracted
     good: Mask  # (y, x)
 
 
 def middle_of(shape: tuple[int, int]) -> Window:
-    """Rows and columns of the middle of the detector, from a border of chunks on."""
+    """Rows and columns of the middle of the detector, starting at chunk borders."""
     ends = []
     for n, chunk in zip(shape, CHUNK[1:], strict=True):
         first = max(0, (n - SIDE) // 2 // chunk * chunk)
@@ -56,7 +56,7 @@ def read_halves(
     """Read the bias frames and the flats near half of the saturation ``top`` (ADU above bias)."""
     dark, flat = source.exposures.read_series, _half_full(source, summary, top)
     mask = ArrayReader(made.folder / "calibration.zarr" / "mask").read(*middle)
-    # Which pixels are bent depends on their response: without them it would look more uniform.
+    # Nonlinearity depends on response: without these pixels, it would look more uniform.
     good = mask & ~np.uint8(PixelFlag.NONLINEAR) == 0
     series = [group for group in (dark, flat) if group is not None]
     if not series or good.sum() < _MIN_PIXELS or min(good.shape) < 2:
@@ -67,7 +67,7 @@ def read_halves(
         partial(_averages, source, tuple(series)), bands, runtime, label="nonuniformity"
     )
     whole = np.concatenate(parts, axis=1)
-    # A pixel that a frame lacks is not used.
+    # A pixel that is missing in any frame is not used.
     good &= np.isfinite(whole).all(axis=0)
     if good.sum() < _MIN_PIXELS:
         return Halves(None, None, good)
@@ -104,7 +104,7 @@ def _averages(source: Ingested, series: tuple[Group, ...], window: Window) -> F6
 def frames_of(
     source: Ingested, array: str, numbers: Sequence[int], window: Window
 ) -> Iterator[NDArray[Any]]:
-    """Samples (y, x) of some frames, read in the blocks that they are stored in."""
+    """Samples (y, x) of given frames, read in the blocks in which they are stored."""
     for block, held in groupby(numbers, key=lambda number: number // CHUNK[0]):
         first = block * CHUNK[0]
         samples = source.arrays[array].read((first, first + CHUNK[0]), *window)

@@ -1,4 +1,4 @@
-"""What ``RUN/ingest`` holds, as the reduction wants it."""
+"""Contents of ``RUN/ingest`` for the reduction."""
 
 import math
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ from pixcal.storage.manifest import read_json, read_manifest
 from pixcal.storage.place import Local, Place
 from pixcal.storage.stage import read_acquisition
 
-MOST_ADU = 2.0**32  # no converter gives more: real numbers beyond are no samples
+MOST_ADU = 2.0**32  # above any converter's range: larger real numbers are not samples
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,9 @@ class Ingested:
 
     @cached_property
     def tables(self) -> dict[str, dict[str, list[Any]]]:
-        """Columns of facts on the frames of each array; of flats also the ``step`` of the lamp.
+        """Properties of the frames of each array, in columns; for flats also the lamp's ``step``.
 
-        Without darks that are of several exposure times which nobody knows.
+        Darks of several unknown exposure times are left out.
         """
         listed = {k: v for k, v in self._listed.items() if k != "dark" or not self._mixed_darks}
         flat = listed.get("flat")
@@ -82,7 +82,7 @@ class Ingested:
 
     @cached_property
     def _mixed_darks(self) -> bool:
-        """Whether darks of unknown exposure times are of several, beside bias frames."""
+        """Whether there are bias frames, and darks of several unknown exposure times."""
         dark = self._listed.get("dark")
         return (
             dark is not None
@@ -93,12 +93,12 @@ class Ingested:
 
     @cached_property
     def survey(self) -> FlatSurvey | None:
-        """What flats show at first sight; None without flats."""
+        """Survey of the flats; None without flats."""
         return FlatSurvey.of(self.arrays) if "flat" in self._listed else None
 
     @cached_property
     def exposures(self) -> Exposures:
-        """Groups of the calibration frames, exposure times of the others."""
+        """Groups of the calibration frames, and exposure times of the fringe frames."""
         found = group_exposures(self.tables)
         if self._mixed_darks:
             found.warnings.append(
@@ -118,7 +118,7 @@ class Ingested:
         }
 
     def _readers(self) -> Mapping[str, ArrayReader | FrameReader]:
-        """A reader of all frames of each array: of its cube, or of the FITS files."""
+        """A reader of all frames of each array, from its cube or FITS files."""
         manifest = read_manifest(self.folder)
         if manifest is None or manifest.format == 1:
             return {name: ArrayReader(self.raw / name) for name in self._catalogue}
@@ -137,7 +137,7 @@ class Ingested:
         return readers
 
     def _files_folder(self, noted: Mapping[str, str], file: str) -> Path:
-        """The folder that holds the files: where it was, or as far from the run as it was."""
+        """The folder of the files: at its noted path, or at the same path relative to the run."""
         folder, run = Path(noted["folder"]), self.folder.parent
         assert isinstance(run, Path)
         for found in (folder, run.absolute() / noted["from_run"]):
@@ -163,17 +163,17 @@ class Ingested:
 
     @cached_property
     def quantum(self) -> float:
-        """Step of the calibration frames (ADU), 0 where any are real numbers."""
-        # Cameras of 12 bits that write 16 count in steps of 16.
+        """Step of the calibration frames (ADU); 0 if any hold real numbers."""
+        # 12-bit cameras that write 16 bits count in steps of 16.
         names = {group.array for group in (*self.exposures.dark, *self.exposures.flat)}
         if not all(of_whole_numbers(self.arrays[name]) for name in names):
             return 0.0
         return float(code_step([self.arrays[name] for name in sorted(names)]))
 
     def saturation(self, name: str) -> float:
-        """Level (ADU) from which on samples of an array are saturated.
+        """Level (ADU) from which samples of an array are saturated.
 
-        As declared, else where flats pile up, else the end of its type.
+        The declared level, else that at which flats pile up, else the largest value of the type.
         """
         end = MOST_ADU
         if self._is_integer(name):
@@ -182,7 +182,7 @@ class Ingested:
 
     @property
     def saturation_found(self) -> float | None:
-        """Level (ADU) at which flats pile up; None where they do not."""
+        """Level (ADU) at which flats pile up; None if they do not."""
         return None if self.survey is None else self.survey.saturation
 
     def lowest(self, name: str) -> float:

@@ -1,4 +1,4 @@
-"""Noise of frames without light: of samples, of what lines share, of their mean level."""
+"""Noise of frames without light: of samples, of common lines, and of the mean level."""
 
 import math
 from collections.abc import Sequence
@@ -19,11 +19,11 @@ from pixcal.stages.reduce.flat_survey import middle_rows
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.storage.place import Place
 
-# Error of noise that is cut off at code zero, relative: itself, and times the cube of the step over
-# the noise. So far off it is at most where pixels differ by 10 % rms and are taken for alike.
+# Relative error of noise that is cut off at code zero: a constant, and a factor on the cube of step
+# over noise. It is the largest error if pixels that differ by 10 % rms are treated as alike.
 _CUT_OFF, _COARSE_CUT_OFF = 0.006, 0.004
-_LEAST = 0.05  # steps of noise that are told from none
-_PAIRS, _SAMPLES = 16, 1 << 20  # of frames, and of each, that tell noise of whole blocks
+_LEAST = 0.05  # smallest measurable noise, in steps
+_PAIRS, _SAMPLES = 16, 1 << 20  # pairs, and samples of each frame, that measure block noise
 
 
 def _read_variance(dark: F64, lost: Measure) -> Measure | None:
@@ -35,7 +35,7 @@ def _read_variance(dark: F64, lost: Measure) -> Measure | None:
 
 
 def lost_in_blocks(job: Measuring) -> Measure:
-    """Variance (ADU²) that `pair_statistics` loses with the means of its blocks; its error."""
+    """Variance (ADU²) that `pair_statistics` removes with the means of its blocks; its error."""
     series = job.read_series
     ny, nx = (n // BLOCK * BLOCK for n in job.shape)
     if series is None or min(ny, nx) < 2 * BLOCK:
@@ -56,7 +56,7 @@ def lost_in_blocks(job: Measuring) -> Measure:
 
 
 def dark_charge(folder: Place, job: Measuring) -> float:
-    """Mean dark signal (ADU) of usual pixels in the frames that tell the read noise."""
+    """Mean dark signal (ADU) of pixels that are not hot, in the read-noise series."""
     series = job.read_series
     if series is None or not series.exptime > 0:
         return 0.0
@@ -87,12 +87,12 @@ def read_noise(
 
 
 def is_cut_off(job: Measuring) -> bool:
-    """Whether frames that tell the read noise are cut off at code zero."""
+    """Whether the noise of the read-noise series is cut off at code zero."""
     return job.read_series is not None and job.read_series.array in job.cut_off
 
 
 def of_variance(variance: Measure, step: float) -> tuple[Measure, Measure]:
-    """Noise (ADU) with and without rounding of some variance (ADU²), whatever the levels are."""
+    """Noise (ADU) with and without rounding from a variance (ADU²), at any level."""
     least = _LEAST * step
     whole, own = (
         max(math.sqrt(max(v, 0.0)), least) for v in (variance[0], variance[0] - SHEPPARD * step**2)
@@ -103,7 +103,7 @@ def of_variance(variance: Measure, step: float) -> tuple[Measure, Measure]:
 def _before_rounding(
     variance: tuple[float, float], folder: Place, job: Measuring
 ) -> tuple[float, float] | None:
-    """Noise of the amplifier and its error (ADU), by where the levels lie between codes."""
+    """Noise of the amplifier and its error (ADU), from positions of the levels between codes."""
     assert job.read_series is not None
     bias, rate = on_grid(folder, job.shape, ("bias", "dark_rate"))
     means = bias + rate * job.read_series.exptime
@@ -114,9 +114,9 @@ def _before_rounding(
     if not len(missing_codes(counts)):
         found = noise_before_rounding(*in_steps, levels, frames)
     else:
-        # Few frames without light do not tell whether there is a pattern in what is missing.
+        # A few frames without light cannot show a pattern of missing codes.
         multiple = step_of(code_counts([job.read_series, *job.flat], job))[0]
-        # Where codes are missing, means of darks lie on no line over exposure time.
+        # With missing codes, means of darks are not linear in exposure time.
         own = np.mean([middle_rows(reader, n, n + 1) for n in job.read_series.frames], axis=0)
         levels = own.ravel() / step
         found = noise_before_missing_codes(*in_steps, levels, frames, counts, multiple)
@@ -124,7 +124,7 @@ def _before_rounding(
 
 
 def code_counts(groups: Sequence[Group], job: Measuring) -> F64:
-    """How often each code, in steps, came up in the middle rows of some series."""
+    """Counts of each code, in steps, in the middle rows of given series."""
     found = np.zeros(0)
     for group in groups:
         reader = job.frames[group.array]
@@ -137,7 +137,7 @@ def code_counts(groups: Sequence[Group], job: Measuring) -> F64:
 
 
 def bias_wander(job: Measuring) -> float:
-    """By how much the level without light changes from frame to frame, rms (ADU)."""
+    """Frame-to-frame change of the level without light, rms (ADU)."""
     series = job.read_series
     if series is None or len(series.frames) < 2:
         return 0.0

@@ -1,7 +1,7 @@
-"""Reduce: from raw frames to electrons, with what is needed to weight every sample.
+"""Reduce: from raw frames to electrons, with maps to weight every sample.
 
-Reads the frames that ``RUN/ingest`` lists in strips of rows, from the FITS files where they were
-not copied, and holds them against their checksums.
+Reads the frames that ``RUN/ingest`` lists in strips, from the FITS files if they were not copied,
+and verifies their checksums.
 """
 
 import math
@@ -47,10 +47,10 @@ from pixcal.storage.stage import make, working
 
 SCHEMA = "pixcal/reduce/1"
 
-_MIN_READ_FRAMES = 8  # fewer do not tell the noise of each pixel
+_MIN_READ_FRAMES = 8  # fewest to measure the noise of each pixel
 _SHARED_BYTES = 64 << 20
-_LINES = 4  # rows or columns beside one another without light that are worth a word
-_CUT_OFF = 1e-3  # share of samples at code zero from which noise is cut off
+_LINES = 4  # fewest neighbouring rows or columns without light to report
+_CUT_OFF = 1e-3  # share of samples at code zero above which noise is cut off
 
 
 Config = Reduce
@@ -60,7 +60,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Make ``RUN/reduce`` from ``RUN/ingest``, unless it is up to date.
 
     The ``summary`` of its manifest holds gain, counts of flags and ``warnings``. Raises InputError
-    if the gain is to be measured and cannot be.
+    if the gain is to be measured but cannot be.
     """
     with working(run_dir, "ingest") as inputs:
         base = chosen_base(config.cubes, run_dir, run_dir / "ingest")
@@ -79,16 +79,16 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
 @dataclass(frozen=True)
 class Reduction:
-    """What is known of frames that were reduced, beside their cubes and maps."""
+    """Results of a reduction other than cubes and maps."""
 
     job: Measuring  # how the calibration frames were measured
-    summary: Summary  # what they say of the detector
-    gain: float  # that is used, e-/ADU
+    summary: Summary  # their results for the whole detector
+    gain: float  # used gain, e-/ADU
     bounds: Bounds  # extremes over the good pixels
-    sets: dict[str, dict[str, Any]]  # what ``reduce.json`` says of each fringe set
+    sets: dict[str, dict[str, Any]]  # entry of each fringe set in ``reduce.json``
 
     def noise(self, config: Config) -> dict[str, dict[str, Any]]:
-        """What ``reduce.json`` says of gain and read noise."""
+        """Entries of ``reduce.json`` on gain and read noise."""
         summary, gain, fitted = self.summary, self.gain, self.summary.gain
         noise = summary.noise_measured_e(summary.before_rounding, gain)
         total = summary.noise_measured_e(summary.read_noise, gain)
@@ -115,7 +115,7 @@ class Reduction:
 
 
 def reduce_frames(made: Workspace, source: Ingested, config: Config, runtime: Runtime) -> Reduction:
-    """Write ``calibration.zarr`` and ``reduced.zarr``; InputError if the gain cannot be told."""
+    """Write ``calibration.zarr`` and ``reduced.zarr``; InputError if the gain is unknown."""
     undeclared = source.detector.gain_e_per_adu is None
     if (
         config.gain == "measured"
@@ -261,7 +261,7 @@ def _report(
 
 
 def _cut_off(source: Ingested) -> dict[str, float]:
-    """Arrays whose black level is so low that noise is cut off at code zero; their share of it."""
+    """Share of samples at code zero, of arrays whose low black level cuts off the noise."""
     shares = {
         name: share_at_zero(source.arrays[name])
         for name in ("bias", "dark")
@@ -280,7 +280,7 @@ def _of_cut_off(shares: Mapping[str, float]) -> list[str]:
 
 
 def _dark_lines(mask: ArrayReader, shape: tuple[int, int]) -> list[str]:
-    """What to say of neighbouring rows or columns that see no light at all."""
+    """Warnings on neighbouring rows or columns without any light."""
     dark = {"rows": np.ones(shape[0], np.bool_), "columns": np.ones(shape[1], np.bool_)}
     for strip in strips(indices(shape), STRIP):
         (y0, y1), (x0, x1) = span(shape, strip)
