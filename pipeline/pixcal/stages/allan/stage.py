@@ -1,6 +1,6 @@
 """Stability: Allan deviation of the offset maps over batches of frames (paper, section 4.3).
 
-``docs/reference/products.md`` describes ``allan.json``, what the stage leaves for each set.
+``docs/reference/products.md`` describes ``allan.json``, the result of the stage for each set.
 """
 
 from collections.abc import Iterator, Sequence
@@ -46,8 +46,8 @@ from pixcal.storage.manifest import Manifest, read_json, write_json
 from pixcal.storage.stage import make, working
 
 SCHEMA = "pixcal/allan/1"
-COUNT_BYTES = 64 << 20  # of the digits of all values of a map (`quantiles_of_parts`)
-# a task takes so many of the fit's chunks, one above the other: one file of each length
+COUNT_BYTES = 64 << 20  # counts of the digits of all values of a map (`quantiles_of_parts`)
+# chunks of the fit per task, stacked vertically: one file for each length
 TILES_HIGH = 4
 # levels of the quantiles that describe the noise over a region
 NOISE_LEVELS = (np.arange(64) + 0.5) / 64
@@ -58,7 +58,7 @@ Tile = tuple[Range, Range]
 
 @dataclass(frozen=True)
 class Batches:
-    """The batch maps of one fringe set, as the fit left them."""
+    """The batch maps of one fringe set, as written by the fit."""
 
     folder: Path
     n: int  # batches, gaps included
@@ -66,11 +66,11 @@ class Batches:
     chunks: tuple[int, int]  # of the fit's maps, (rows, columns)
     frames: int  # frames of a batch
     step_s: float  # from one batch to the next, seconds
-    note: str  # what the fit says of them, or ""
+    note: str  # note of the fit on them, or ""
 
     @classmethod
     def open(cls, folder: Path, facts: dict[str, Any]) -> "Batches":
-        """Look at ``fit.zarr/<set name>``; ``facts`` are the set's part of ``fit.json``."""
+        """Open ``fit.zarr/<set name>``; ``facts``: the set's part of ``fit.json``."""
         delta, time = ArrayReader(folder / "delta"), ArrayReader(folder / "batch_time").read()
         ny, nx = delta.shape
         cy, cx = delta.chunks
@@ -79,7 +79,7 @@ class Batches:
         return cls(folder, len(time), (ny, nx), (cy, cx), facts["batch_frames"], step, note)
 
     def tiles(self, area: Region, times: int = 1) -> list[Tile]:
-        """So many chunks one above the other, cut to an area."""
+        """Tiles of ``times`` vertically stacked chunks, cut to an area."""
         (y0, y1, x0, x1), (cy, cx) = area, self.chunks
         return list(product(_spans(y0, y1, times * cy), _spans(x0, x1, cx)))
 
@@ -131,7 +131,7 @@ def _measure_set(
     lengths = averaging_lengths(batches.n)
     cy, cx = batches.chunks
     tile_bytes = 4 * cy * cx * (2 * batches.n + len(lengths) * (TILES_HIGH + 2))
-    # Some rows of a map in copies, and counts of its values.
+    # Copies of rows of a map, and counts of its values.
     values = 16 * TILES_HIGH * cy * batches.window[1] + COUNT_BYTES
     per_task, held = max(tile_bytes, values), values + 40 * MAX_DRAWS * len(lengths)
     runtime = within_memory(f"the Allan deviation of {name}", per_task, held, runtime)
@@ -161,7 +161,7 @@ def _write_maps(
     lengths: tuple[int, ...],
     runtime: Runtime,
 ) -> None:
-    """Deviation of every pixel, and what its error of the fit lets expect for one batch."""
+    """Write the deviation of every pixel, and that expected for one batch from fit errors."""
     create_group(folder)
     (cy, cx), shape = batches.chunks, batches.window
     chunks = (TILES_HIGH * cy, cx)
@@ -203,7 +203,7 @@ def _maps_task(
 
 
 def _root_mean_square(sigma: F32) -> F64:
-    """Over the batches that there are; NaN where there are none."""
+    """Over the batches present; NaN without any."""
     total, count = np.zeros(sigma.shape[1:]), np.zeros(sigma.shape[1:])
     for plane in sigma:
         there = np.isfinite(plane)
@@ -215,9 +215,9 @@ def _root_mean_square(sigma: F32) -> F64:
 def _measure_region(
     folder: Path, batches: Batches, lengths: tuple[int, ...], region: Region, runtime: Runtime
 ) -> dict[str, Any]:
-    """Curve of the median pixel of a region, as it goes into ``allan.json``."""
+    """Curve of the median pixel of a region, in the format of ``allan.json``."""
     counts, grams = sums_of_region(folder, batches, lengths, region, runtime)
-    # A batch is there when most pixels have it: a few may lack one for reasons of their own.
+    # A batch is present if most pixels have it: a few may lack one individually.
     present = counts > counts.max(initial=0) / 2
     filled = int(present.sum())
     common = {"n_batches": batches.n, "gaps": batches.n - filled}
@@ -266,7 +266,7 @@ def _as_json(
     }
 
 
-# The batch maps of a fringe set, as the fit left them, and what their pixels share
+# The batch maps of a fringe set, and the changes common to their pixels
 
 
 def _spans(start: int, stop: int, size: int) -> Iterator[Range]:
@@ -275,7 +275,7 @@ def _spans(start: int, stop: int, size: int) -> Iterator[Range]:
 
 
 def region_name(region: Region) -> str:
-    """As the option writes it: y0:y1,x0:x1."""
+    """Name in the format of the option: y0:y1,x0:x1."""
     y0, y1, x0, x1 = region
     return f"{y0}:{y1},{x0}:{x1}"
 
@@ -283,7 +283,7 @@ def region_name(region: Region) -> str:
 def sums_of_region(
     folder: Path, batches: Batches, lengths: tuple[int, ...], region: Region, runtime: Runtime
 ) -> tuple[I64, list[F64]]:
-    """Pixels of a region that have each batch, and for each length their products."""
+    """Number of pixels of a region with each batch, and products for each length."""
     if not lengths:
         return ArrayReader(batches.folder / "batch_count").read().astype(np.int64), []
     sums = run_tasks(
@@ -299,7 +299,7 @@ def sums_of_region(
 def _sums_task(
     batches: Batches, lengths: tuple[int, ...], expected: Path, square: Tile
 ) -> tuple[I64, list[F64]]:
-    """Pixels that have each batch, and the products of differences that pixels may share."""
+    """Number of pixels with each batch, and products of differences that pixels may share."""
     counts = np.zeros(batches.n, np.int64)
     grams: list[Any] = [0.0] * len(lengths)
     for tile in batches.tiles((*square[0], *square[1])):
@@ -310,7 +310,7 @@ def _sums_task(
         for number, m in enumerate(lengths):
             steps = disjoint_differences(series, m, 32)
             steps /= noise
-            # Missing batches and pixels without errors are NaN both, and add nothing.
+            # Missing batches and pixels without errors are both NaN, and add zero.
             steps[np.isnan(steps)] = 0.0
             grams[number] = grams[number] + steps @ steps.T
     return counts, grams
@@ -319,7 +319,7 @@ def _sums_task(
 def quantiles_of_region(
     path: Path, region: Region, usable: Sequence[int], runtime: Runtime
 ) -> tuple[dict[int, tuple[float, float, float]], int]:
-    """Central 68 % and median over a region for each length's number, and how many pixels."""
+    """Central 68 % and median over a region by number of the length, and count of pixels."""
     quiet = replace(runtime, quiet=True)
     found = run_tasks(partial(_quantiles, path, region), usable, quiet, label="quantiles")
     quantiles = {
@@ -336,12 +336,12 @@ def _quantiles(path: Path, region: Region, n: int) -> tuple[F64, int]:
 
 
 def _positive(path: Path, lengths: Range | None, region: Region) -> Iterator[F32]:
-    """Finite values of a map over a region that are above zero, some rows at a time."""
+    """Finite positive values of a map over a region, a few rows at a time."""
     reader = ArrayReader(path)
     y0, y1, x0, x1 = region
     for rows in _spans(y0, y1, reader.chunks[-2]):
         values = reader.read(*([lengths] if lengths else []), rows, (x0, x1))
-        # No noise gives zero.
+        # Zero means no noise.
         yield values[(values > 0) & (values < np.inf)]
 
 

@@ -1,9 +1,9 @@
 """The detector of the simulated stars: true and measured positions of its pixels.
 
-What the true offsets may be, the maps say: the measured offset and a draw of its error. A centroid
-that takes pixels where the maps say errs by the draw alone; against a perfect grid such a detector
-holds the maps' errors twice, which `summary` subtracts. Where a truth is given, it is the detector,
-without the modes that no fringes can tell from the bench (docs/explanation/gauge.md).
+True offsets are the measured ones plus a draw of their errors. The error of a centroid with pixels
+at their measured places comes from the draw alone. Relative to a perfect grid, such a detector
+contains the maps' errors twice, which `summary` subtracts. A given truth is used as the detector,
+less the modes that are degenerate with the bench (docs/explanation/gauge.md).
 """
 
 from collections.abc import Sequence
@@ -26,9 +26,9 @@ from pixcal.storage.products import FitsMap
 Range = tuple[int, int]
 
 DRAW_TILE = 64  # side of the tiles of pixels that share a generator of errors, px
-LARGEST = 1.0  # an offset beyond is no offset; such a pixel is left out, px
+LARGEST = 1.0  # largest valid offset, px; pixels beyond are left out
 AXES = {"delta_x": ("x", (1.0, 0.0)), "delta_y": ("y", (0.0, 1.0))}
-ENOUGH = 4_000_000  # pixels that determine the modes; of larger detectors some bands are left out
+ENOUGH = 4_000_000  # pixels that determine the modes; on larger detectors, bands are left out
 BAND = 16  # rows of a task of the fit of the modes
 
 
@@ -39,7 +39,7 @@ def generator(seed: int, *key: int) -> np.random.Generator:
 
 @dataclass(frozen=True)
 class DegenerateModes:
-    """The modes of all sets' maps that are degenerate with the bench; the smooth ones first."""
+    """Modes of all sets' maps that are degenerate with the bench; smooth ones first."""
 
     shape: tuple[int, int]  # of the detector, (y, x)
     sets: tuple[FringeShape, ...]  # as fitted
@@ -73,9 +73,9 @@ class Component:
     delta: FitsMap  # delta, sigma, mask: product of the fit
     sigma: FitsMap
     mask: FitsMap
-    # the true offset is the sum of the maps times the numbers; empty where it is not known
+    # the true offset is the sum of the maps times the numbers; empty if unknown
     truth: tuple[tuple[float, FitsMap], ...] = ()
-    # what the truth is freed from: modes, and the coefficient of each, px
+    # modes to remove from the truth, and the coefficient of each, px
     removed: tuple[DegenerateModes, tuple[float, ...]] | None = None
 
     def true(self, y: Range, x: Range) -> F64:
@@ -91,7 +91,7 @@ class Component:
 class Patch:
     """A part of the detector."""
 
-    # true, known: (component, y, x) where pixels lie and where the maps say, px; zero where not
+    # true, known: (component, y, x) true offsets and offsets of the maps, px; zero where not
     # `good`
     true: F64
     known: F64
@@ -161,7 +161,7 @@ class PixelPositions:
 
 
 def open_components(run_dir: Path, fit: dict[str, Any], truth: Path | None) -> list[Component]:
-    """The products of a run as components, with their truth where one is given."""
+    """The products of a run as components, with their truth if given."""
     true = {}
     files = {} if truth is None else {name: truth / f"{name}.fits" for name in AXES}
     for name, file in files.items():
@@ -195,7 +195,7 @@ def free_from_modes(
 ) -> tuple[list[Component], dict[str, dict[str, float]]]:
     """Fit the modes to truth minus maps, and remove them; rms (px) of ``smooth``, ``fringe``."""
     ny, nx = modes.shape
-    # An odd step: bands must not keep pace with fringes.
+    # Odd step, so that bands are not in phase with fringes.
     step = (ny * nx // ENOUGH) | 1
     bands = [(y, min(y + BAND, ny)) for y in range(0, ny, BAND * step)]
     task = partial(_mode_sums, tuple(components), modes)
@@ -204,7 +204,7 @@ def free_from_modes(
     freed, removed = [], {}
     for component, sums in zip(components, zip(*parts, strict=True), strict=True):
         normal, right, count = (np.sum(part, axis=0) for part in zip(*sums, strict=True))
-        # Modes of two sets overlap: of all combinations that do, the least.
+        # Modes of two sets overlap: take the minimum-norm solution.
         c = inverse_normal(normal, 1e-10) @ right
         freed.append(replace(component, removed=(modes, tuple(c.tolist()))))
         removed[component.name] = {

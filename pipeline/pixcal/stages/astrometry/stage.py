@@ -53,8 +53,8 @@ SCHEMA = "pixcal/astrometry/1"
 CURVE = np.geomspace(1e4, 1e12, 49)  # electrons of the curve of errors
 DETAIL = 128  # side of the part of the error maps that is shown place by place, px
 FIGURE_BYTES = 160 << 20  # Matplotlib and one figure
-_BYTES_PER_PIXEL = 180  # peak of a task for each pixel that it looks at (measured)
-_BYTES_PER_PIXEL_AND_MODE = 13  # what each mode adds where there is a truth (measured)
+_BYTES_PER_PIXEL = 180  # peak of a task per pixel (measured)
+_BYTES_PER_PIXEL_AND_MODE = 13  # additional per mode if there is a truth (measured)
 # peak of a task of the fit of the modes, for each pixel and mode (measured)
 _BYTES_PER_FITTED_MODE = 28
 # peak of a task of the stars, for each pixel of a star's windows (measured)
@@ -104,7 +104,7 @@ def _measure(
     config: Config,
     runtime: Runtime,
 ) -> None:
-    """Everything; writes the artefact's files."""
+    """Run all measurements and write the artefact's files."""
     shape = components[0].delta.shape
     observed = _star(telescope, config, acquisition, shape)
     psf, half = observed.psf, observed.half
@@ -238,7 +238,7 @@ def _warnings(result: Mapping[str, Any]) -> list[str]:
 def _view(
     result: dict[str, Any], detector: PixelPositions, observed: Star, maps: ErrorMaps, photons: F64
 ) -> AstrometryView:
-    """What the picture shows."""
+    """Contents of the figure."""
     ny, nx = detector.shape
     y, x = ((max(0, (n - DETAIL) // 2), min(n, (n + DETAIL) // 2)) for n in (ny, nx))
     return AstrometryView(

@@ -18,18 +18,18 @@ from pixcal.model.errors import InputError
 from pixcal.stages.astrometry.detector import PixelPositions, generator
 from pixcal.storage.cube import ArrayWriter, create_group, create_map
 
-FULL_WELL_E = 50_000.0  # where the acquisition declares none (paper, table 1)
+FULL_WELL_E = 50_000.0  # if the acquisition declares none (paper, table 1)
 WINDOW = 4.0  # half of the default window, in lambda / D: three dark rings
-SAMPLINGS = (0.4, 40.0)  # pixels in lambda / D that the table of the pattern is made for
+SAMPLINGS = (0.4, 40.0)  # range of pixels per lambda / D of the table of the pattern
 BATCH = 16  # stars of a task
-# a place is not used where masked pixels would tell more than so much of the position
+# largest share of the position information in masked pixels at a usable place
 MAX_LOST = 0.1
-# errors of a star at a place: pixels taken for a perfect grid, or where the maps say; without and
-# with photon noise; and the first two as `centroids.Star.weights` predicts them
+# errors of a star at a place: with pixels on a perfect grid or at the places of the maps; without
+# and with photon noise; and the first two as predicted by `centroids.Star.weights`
 KINDS = ("perfect", "measured", "perfect_photons", "measured_photons", "linear", "linear_measured")
 TILE = 512  # side of a task's part of the map, about, px
 SHOWN = 96  # most blocks along the longer side of the pictures of the whole detector
-# least side of such a block, px: a few independent places, for its rms to mean something
+# least side of such a block, px: its rms needs a few independent places
 MIN_BLOCK = 8
 GRIDS = ("perfect", "measured")
 
@@ -86,12 +86,12 @@ def star(psf: Psf, half: int, electrons: float, background: float, detector: Dec
 
 @dataclass(frozen=True)
 class Observation:
-    """What is observed."""
+    """Plan of an observation."""
 
     star: Star
     stars: int
     positions: int  # places of each star
-    dither: float  # they lie within so many px of the first, along x and y
+    dither: float  # largest distance (px) from the first place, along x and y
 
 
 def observe(detector: PixelPositions, plan: Observation, runtime: Runtime) -> F64:
@@ -131,7 +131,7 @@ def observe_star(detector: PixelPositions, plan: Observation, core: F64, number:
     patch = detector.patch((corner[1], end[1]), (corner[0], end[0]))
     cuts = [np.s_[..., y : y + star.side, x : x + star.side] for x, y in (pixel - half - corner)]
     good = np.stack([patch.good[cut] for cut in cuts])
-    # Displacements (position, (x, y), y, x): the true ones, and what the maps say.
+    # Displacements (position, (x, y), y, x): true ones, and those of the maps.
     true, known = (
         np.einsum("nkyx,ka->nayx", np.stack([offsets[cut] for cut in cuts]), axes)
         for offsets in (patch.true, patch.known)

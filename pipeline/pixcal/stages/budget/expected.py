@@ -1,7 +1,7 @@
 """Expected precision of a bench: frames for a given precision, and what limits it.
 
 The Cramér-Rao bound (`phase_information`) on a grid of pixels spread over the window, for each
-fringe set and for the sets joined. What is systematic is not in it.
+fringe set and for the combined sets. Systematic errors are not included.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,21 +24,21 @@ from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import states_of
 from pixcal.simulation.recording import Recording
 
-NODES = 9  # places of the quadrature over the changes from frame to frame
-TURN = 720  # steps of a turn where a mean over the phase has no closed form
+NODES = 9  # nodes of the quadrature over frame-to-frame changes
+TURN = 720  # steps per cycle for means over the phase without a closed form
 Shares = Sequence[float] | F64
 
-SAMPLES = 96  # pixels along each side of the grid: light changes little from one to the next
-# frames of a ramp that are looked at: it repeats itself, or fills the turn evenly by then
+SAMPLES = 96  # pixels along each side of the grid: light changes little between them
+# most frames of a ramp that are used: by then it repeats, or fills the cycle evenly
 MAX_PHASES = 2000
-FRAMES_DRAWN = 20_000  # for how light and contrast change from frame to frame
+FRAMES_DRAWN = 20_000  # to measure frame-to-frame changes of light and contrast
 DARKNESS = 1e-12  # least information of one frame, 1/rad²
-NEGLIGIBLE = 1e-3  # share of the frames that the noise of calibration frames may cost
+NEGLIGIBLE = 1e-3  # relative increase in frames allowed for the noise of calibration frames
 
 
 @dataclass(frozen=True)
 class FrameSpread:
-    """How light and contrast change from frame to frame, as places and weights of a quadrature."""
+    """Frame-to-frame changes of light and contrast, as nodes and weights of a quadrature."""
 
     level: F64  # level, amplitude: (n,) B and A, mean about 1
     amplitude: F64
@@ -65,13 +65,13 @@ STEADY = FrameSpread(np.ones(1), np.ones(1), np.ones(1))
 def phase_information(
     iota: ArrayLike, alpha: ArrayLike, variance: float, spread: FrameSpread = STEADY
 ) -> F64:
-    """Information of one frame on a pixel's phase, 1/rad², at uniform phases, over the spread.
+    """Information of one frame on a pixel's phase, 1/rad², averaged over phases and spread.
 
     ``iota``, ``alpha``: e-, at B = A = 1. ``variance``: e-², of a sample without light.
     """
     total = np.asarray(iota, float)[..., None] * spread.level + variance
     swing = np.asarray(alpha, float)[..., None] * spread.amplitude
-    # The difference of two nearly equal numbers at faint contrast, written as a quotient.
+    # At low contrast, a difference of two nearly equal numbers: written as a quotient.
     root = np.sqrt(np.maximum(total**2 - swing**2, 0.0))
     return spread.mean(swing**2 / (total + root))
 
@@ -79,7 +79,7 @@ def phase_information(
 def unweighted_variance(
     iota: ArrayLike, alpha: ArrayLike, variance: float, spread: FrameSpread = STEADY
 ) -> F64:
-    """Variance (rad²) of one frame with equal weights: twice the bound's at full contrast."""
+    """Variance (rad²) of one frame with equal weights: twice the bound at full contrast."""
     square = spread.amplitude**2
     noise = np.asarray(iota, float)[..., None] * spread.level + variance
     power = np.asarray(alpha, float) ** 2 * spread.mean(square) ** 2
@@ -87,9 +87,9 @@ def unweighted_variance(
 
 
 def sampling_loss(iota: float, alpha: float, variance: float, phases: F64) -> tuple[float, float]:
-    """Frames needed with given phases (t,), over uniform ones: at the median and worst phase.
+    """Ratio of frames needed with phases (t,) to uniform phases, at the median and worst phase.
 
-    Few phases favour some pixels and mix iota, alpha and phase: infinite where they are not told.
+    Few phases favour some pixels and mix iota, alpha and phase; infinite if these are degenerate.
     """
     psi = 2 * np.pi * np.arange(TURN) / TURN
     information = np.zeros((TURN, 3, 3))
@@ -113,9 +113,9 @@ class WeightErrors:
     Weights ``(1 + e(u)) / variance`` add the variance of e over the phases, by their information.
     """
 
-    # for each e-² of a constant error of a sample's variance: a wrong bias or read noise
+    # per e-² of a constant error of a sample's variance, from a wrong bias or read noise
     offset: float
-    scale: float  # for a relative error of the light, squared: a wrong flat
+    scale: float  # per squared relative error of the light, from a wrong flat
 
     @classmethod
     def of(cls, iota: float, alpha: float, variance: float) -> "WeightErrors":
@@ -140,12 +140,12 @@ def sample_variance(bench: Bench) -> float:
 
 
 def own_effects(bench: Bench, where: str) -> tuple[Effect, ...]:
-    """Effects of a bench, those that pixcal knows, as `parse_effects` reads them."""
+    """Effects of a bench that pixcal knows, as read by `parse_effects`."""
     return parse_effects({n: v for n, v in bench.effects.items() if n in effects()}, where)
 
 
 def frame_rms(bench: Bench, number: int) -> tuple[float, float]:
-    """Relative rms of light and of contrast from frame to frame, by the effects of a bench."""
+    """Relative frame-to-frame rms of light and of contrast, from the effects of a bench."""
     scan, f = replace(bench.frames.fringes[number], count=FRAMES_DRAWN), bench.frames
     sets = (*f.fringes[:number], scan, *f.fringes[number + 1 :])
     drawn = Recording(
@@ -167,7 +167,7 @@ class SetBound:
     ky: F64
     variance: float  # of a sample without light, e-²
     frames: FrameSpread
-    # what the choice of phases costs, of the frames: median and worst fringe phase
+    # factor on frames by the choice of phases: at the median and worst fringe phase
     loss: tuple[float, float]
 
     @classmethod
@@ -204,9 +204,9 @@ class SetBound:
 
     @cached_property
     def information(self) -> F64:
-        """Of one frame on each pixel's phase, 1/rad², at the median fringe phase."""
+        """Information of one frame on each pixel's phase, 1/rad², at the median fringe phase."""
         per_pixel = phase_information(self.iota, self.alpha, self.variance, self.frames)
-        # A pixel beyond the beams would take for ever; it still must have a number.
+        # A pixel outside the beams has no information, but must get a finite number.
         return np.asarray(np.maximum(per_pixel, DARKNESS) / self.loss[0])
 
     @property
@@ -222,7 +222,7 @@ class SetBound:
 
     @property
     def interfringe(self) -> float:
-        """At the typical pixel, px."""
+        """Fringe period at the typical pixel, px."""
         return float(2 * np.pi / self.k[self.typical])
 
     @property
@@ -232,18 +232,18 @@ class SetBound:
 
     @property
     def per_frame(self) -> F64:
-        """Variance of the offset along the set's axis that one frame gives, px²."""
+        """Variance of the offset along the set's axis from one frame, px²."""
         return np.asarray(1 / (self.information * self.k**2))
 
     def reach(self, frames: Shares) -> tuple[float, float]:
-        """Variance (px²) of the median pixel, and of the worst at the worst fringe phase."""
+        """Variance (px²) of the median pixel, and of the worst pixel at the worst fringe phase."""
         variance = self.per_frame / sum(frames)
         return float(np.median(variance)), float(variance.max()) * self.loss[1] / self.loss[0]
 
     def shares(self) -> dict[str, float]:
-        """Variance (px²) by ``photons`` alone, of one frame, and the factors that increase it.
+        """Variance (px²) of one frame from ``photons`` alone, and the factors that increase it.
 
-        Each factor is for what its name says, given those before.
+        Each factor is relative to the preceding ones.
         """
         peak = float((self.iota + self.alpha).max())
         bright = np.array([peak / 2])
@@ -269,7 +269,7 @@ class SetBound:
 
 
 def grid(shape: tuple[int, int]) -> list[I64]:
-    """Columns and rows of a window at which its bound is taken, the outermost among them."""
+    """Columns and rows of a window at which the bound is evaluated, edges included."""
     return [
         np.unique(np.linspace(0, n - 1, min(n, SAMPLES)).round().astype(int)) for n in shape[::-1]
     ]
@@ -277,18 +277,18 @@ def grid(shape: tuple[int, int]) -> list[I64]:
 
 @dataclass(frozen=True)
 class JoinedBound:
-    """Fringe sets joined by weighted least squares."""
+    """Fringe sets combined by weighted least squares."""
 
     sets: tuple[SetBound, ...]  # on the same grid
 
     @property
     def components(self) -> tuple[str, ...]:
-        """What the sets together give."""
+        """Components that the combined sets give."""
         both = axes_span_plane([s.axis for s in self.sets])
         return ("delta_x", "delta_y") if both else ("delta_fringe",)
 
     def variance(self, frames: Shares, *, worst: bool = False) -> F64:
-        """Variance (component, pixel), px², with so many frames, or shares of one, of each set."""
+        """Variance (component, pixel), px², with given frames, or shares of one, of each set."""
         xx, xy, yy = np.zeros((3, len(self.sets[0].iota)))
         for n, s in zip(frames, self.sets, strict=True):
             weight = n * s.information / (s.loss[1] / s.loss[0] if worst else 1.0)
@@ -302,20 +302,20 @@ class JoinedBound:
         return np.asarray(np.median(self.variance(frames), axis=1))
 
     def reach(self, n: int) -> Callable[[Shares], tuple[float, float]]:
-        """As `SetBound.reach`, of one component."""
+        """As `SetBound.reach`, for one component."""
         return lambda frames: (
             float(self.median(frames)[n]),
             float(self.variance(frames, worst=True)[n].max()),
         )
 
     def best_split(self) -> F64:
-        """Share of each set's frames with which the worse component is best."""
+        """Shares of the sets' frames that minimise the variance of the worse component."""
         n = len(self.sets)
         if len(self.components) == 1 or n == 1:
             best = int(np.argmin([np.median(s.per_frame) for s in self.sets]))
             return np.asarray(np.eye(n)[best])
         scale = float(self.median(np.full(n, 1 / n)).max())
-        # Least t with every component below it: smooth where the largest itself is not.
+        # Minimise t subject to every component below t: smooth, unlike the maximum.
         split = minimize(
             lambda v: v[-1],
             [*np.full(n, 1 / n), 1.0],
@@ -329,19 +329,19 @@ class JoinedBound:
 
 
 def joined(bench: Bench, contrast: Sequence[float] | None = None) -> JoinedBound:
-    """Bounds of all sets of a bench; ``contrast`` as in `SetBound.of`, one for each."""
+    """Bounds of all sets of a bench; ``contrast`` of each as in `SetBound.of`."""
     factors = contrast or [1.0] * len(bench.frames.fringes)
     return JoinedBound(tuple(SetBound.of(bench, n, c) for n, c in enumerate(factors)))
 
 
 def planned_split(bench: Bench) -> F64:
-    """Share of each set in the frames that the bench plans."""
+    """Share of each set in the planned frames of the bench."""
     counts = np.array([s.count for s in bench.frames.fringes], float)
     return np.asarray(counts / counts.sum())
 
 
 def frames_needed(variance: float, precision: float) -> int:
-    """Frames after which a variance (px²) of one frame has become the precision (px) squared."""
+    """Frames that reduce a variance (px²) of one frame to the squared precision (px)."""
     return max(1, ceil(variance / precision**2))
 
 
@@ -351,16 +351,16 @@ def pixel_contrast(kx: float, ky: float) -> float:
 
 
 def brightest_allowed(bench: Bench) -> float | None:
-    """Largest signal of full well and converter, e-; None without a limit."""
+    """Largest signal allowed by full well and converter, e-; None without a limit."""
     d = bench.detector
     converter = (d.top_adu - d.bias_adu) * d.gain_e_per_adu
     return converter if d.full_well_e is None else min(d.full_well_e, converter)
 
 
 def bias_frames_needed(errors: WeightErrors, variance: float) -> int:
-    """Bias frames whose noise costs less than `NEGLIGIBLE` of the fringe frames."""
-    # A pixel's bias is absorbed by its iota; what is left is that the weights take a wrong level
-    # and, where each pixel's read noise is measured from the same frames, a wrong read noise.
+    """Bias frames needed for a cost below `NEGLIGIBLE` of the fringe frames."""
+    # A pixel's iota absorbs its bias. The remaining cost is from weights with a wrong level and, if
+    # each pixel's read noise is measured from the same frames, a wrong read noise.
     n = 2
     while errors.offset * (variance / n + 2 * variance**2 / (n - 1)) > NEGLIGIBLE:
         n += 1
@@ -368,7 +368,7 @@ def bias_frames_needed(errors: WeightErrors, variance: float) -> int:
 
 
 def flat_error(bench: Bench) -> float | None:
-    """Relative error of a pixel's flat from the flats that the bench plans; None without any."""
+    """Relative error of a pixel's flat from the planned flats of the bench; None without any."""
     f = bench.frames
     if not f.flats or f.flat_rate_e_s is None:
         return None
@@ -379,8 +379,8 @@ def flat_error(bench: Bench) -> float | None:
 
 
 def flats_needed(errors: WeightErrors, level: float, variance: float) -> int:
-    """Flats of a level (e-) whose noise costs less than `NEGLIGIBLE` of the fringe frames.
+    """Flats of a level (e-) needed for a cost below `NEGLIGIBLE` of the fringe frames.
 
-    A flat's error leaves the phase: only weights from neighbouring pixels take notice.
+    An error of the flat does not change the phase; it only affects weights from neighbours.
     """
     return max(1, ceil(errors.scale * (level + variance) / level**2 / NEGLIGIBLE))

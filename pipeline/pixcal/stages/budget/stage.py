@@ -40,17 +40,17 @@ from pixcal.stages.budget.expected import (
 from pixcal.storage.manifest import digest, write_json, write_whole
 
 SCHEMA = "pixcal/budget/1"
-MARGIN = 4.0  # standard deviations that the brightest fringe should keep below the end of the range
-DOMINANT = 1.5  # a factor of the frames below this does not limit a set: photons do
+MARGIN = 4.0  # least margin of the brightest fringe below the end of the range, standard deviations
+DOMINANT = 1.5  # factors on frames below this do not limit a set: photons do
 
 # frames of each set -> variances (px²) of the median and of the worst pixel
 Reach = Callable[[Shares], tuple[float, float]]
-# interfringes that a longer baseline is tried for; the paper keeps to 5 px (section 4.2)
+# fringe periods (px) to try with a longer baseline; the paper uses at least 5 px (section 4.2)
 FINER_PX = (5.0, 4.0, 3.0)
 
 
 def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, Any]:
-    """Work out the budget of a bench; ``budget.json`` and ``budget.png`` go to ``out``."""
+    """Compute the budget of a bench; write ``budget.json`` and ``budget.png`` to ``out``."""
     bench = load_bench(bench_file)
     own_effects(bench, str(bench_file))
     if not bench.frames.fringes:
@@ -65,7 +65,7 @@ def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, 
             )
     precision = config.precision_px
     if precision is None and config.frames is None:
-        precision = 5e-5  # what the paper asks for (section 1)
+        precision = 5e-5  # target of the paper (section 1)
     result = {
         "schema": SCHEMA,
         "pixcal": __version__,
@@ -97,7 +97,7 @@ def _budget(
         return {"frames": n, "hours": n * f.period_s / 3600, "bytes": size}
 
     def facts(reach: Reach, one: Shares, planned: Shares, given: Shares | None) -> dict[str, Any]:
-        """What one frame and others reach, and the cost of the wanted precision."""
+        """Precision of one frame and of given frames, and the cost of the required precision."""
         (median, worst), wanted = reach(one), cost(reach(one)[0])
         if wanted and precision is not None:
             wanted["frames_worst"] = frames_needed(worst, precision)
@@ -164,7 +164,7 @@ def _reached(reach: Reach, frames: Shares) -> dict[str, Any]:
 
 
 def _calibration(bench: Bench, s: SetBound) -> dict[str, Any]:
-    """Bias and flat frames that are needed, and the cost of those planned."""
+    """Bias and flat frames needed, and the cost of those planned."""
     errors, f = s.calibration(), bench.frames
     level, flat = float(np.median(s.iota)), flat_error(bench)
     return {
@@ -179,7 +179,7 @@ def _calibration(bench: Bench, s: SetBound) -> dict[str, Any]:
 
 
 def _left_out(bench: Bench) -> list[str]:
-    """What the bound does not include."""
+    """Effects that the bound does not include."""
     d, sentences = bench.detector, []
     sentences.append(
         "systematic errors (crosstalk, drifts, ghosts, nonlinearity): no number of frames removes "
@@ -231,13 +231,13 @@ def _warnings(bench: Bench, bound: JoinedBound) -> list[str]:
 
 @dataclass(frozen=True)
 class Lever:
-    """A change of the bench, and what it does to the variance of one frame of all sets joined."""
+    """A change of the bench, and the variance of one frame of all combined sets with it."""
 
     name: str
     # of the worse component at the median pixel, px², for one frame shared by the sets
     variance: float
     period_s: float  # from frame to frame
-    note: str = ""  # what it assumes, or ""
+    note: str = ""  # its assumption, or ""
 
 
 def levers(bench: Bench, now: JoinedBound) -> list[Lever]:
@@ -270,7 +270,7 @@ Change = tuple[str, Bench, list[float] | None, str]
 
 
 def _changes(bench: Bench, now: JoinedBound) -> list[Change]:
-    """(name, bench, contrast of each set, note) of every change that is one."""
+    """(name, bench, contrast of each set, note) of every applicable change."""
     d, f = bench.detector, bench.frames
     changes = _finer_fringes(bench, now)
 
@@ -304,7 +304,7 @@ def _changes(bench: Bench, now: JoinedBound) -> list[Change]:
 
 
 def _finer_fringes(bench: Bench, now: JoinedBound) -> list[Change]:
-    """Longer baselines, down to the next interfringe of `FINER_PX`."""
+    """Longer baselines, down to the next fringe period of `FINER_PX`."""
     widest = max(s.interfringe for s in now.sets)
     wanted = next((w for w in FINER_PX if w < 0.9 * widest), None)
     if wanted is None:

@@ -1,13 +1,13 @@
 """Agreement of two maps of the same pixels, scale by scale: common signal and noise.
 
-The squares of a map's means over blocks of 1, 2, 4, ... pixels a side fall from side to side; what
-they lose from one to the next is the part of the map at that scale (a nested analysis of variance).
-The parts add up, and for white noise each holds as much per degree of freedom as a pixel does.
+The squares of a map's means over blocks of 1, 2, 4, ... pixels a side fall with the side. The loss
+from one side to the next is the part of the map at that scale (a nested analysis of variance). The
+parts add up, and for white noise each has the variance of a pixel per degree of freedom.
 Products of two maps are decomposed alike: the common signal is their covariance at a scale.
 
-Modes that neither map can know are removed from the sums of products, so maps of any size are read
-once, tile by tile. Sums over blocks are one array (k + 3, y, x): of the two maps and their modes
-(k), of the maps' variances (2), and of the good pixels.
+Modes degenerate in either map are removed from the sums of products, so that maps of any size are
+read once, tile by tile. Sums over blocks are one array (k + 3, y, x): of the two maps and their
+modes (k), of the maps' variances (2), and of the good pixels.
 """
 
 import math
@@ -21,13 +21,13 @@ from scipy.special import ndtri
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64
 
-SEEN = 5.0  # sigma at which a covariance is a signal that a line can be drawn through
-# relative error of the maps' own errors that a difference is allowed before it counts
+SEEN = 5.0  # sigma above which a covariance is a signal to which a line can be fitted
+# relative error of the maps' errors to tolerate before a difference counts
 SIGMA_ACCURACY = 0.02
 
 
 def halve(sums: F64) -> F64:
-    """Sums (..., y, x) over blocks of twice the side; those at the far edges may be smaller."""
+    """Sums (..., y, x) over blocks of twice the side; blocks at the far edges may be smaller."""
     ny, nx = sums.shape[-2:]
     rows = np.add.reduceat(sums, range(0, ny, 2), axis=-2)
     return np.asarray(np.add.reduceat(rows, range(0, nx, 2), axis=-1))
@@ -36,8 +36,8 @@ def halve(sums: F64) -> F64:
 class Grouping(NamedTuple):
     """Sums of squares of the means of groups of pixels."""
 
-    groups: int  # those with a good pixel
-    products: F64  # (k, k) sum over groups of products of means, each times its pixels
+    groups: int  # number of groups with a good pixel
+    products: F64  # (k, k) sum over groups of products of means, each times its number of pixels
     noise: F64  # (2,) expected squares of the maps from their variances
 
     @classmethod
@@ -59,26 +59,26 @@ def double(sums: F64, times: int) -> tuple[list[Grouping], F64]:
 
 @dataclass(frozen=True)
 class Projection:
-    """The modes removed from both maps, by least squares on all good pixels alike."""
+    """The modes removed from both maps, by unweighted least squares on all good pixels."""
 
     change: F64  # (2, 2 + mode) the maps without their modes, from maps and modes
-    # (mode, mode) inverse of the modes' normal matrix; of modes that are alike, one counts
+    # (mode, mode) inverse of the modes' normal matrix; equal modes count once
     inverse: F64
 
     @classmethod
     def of(cls, pixels: Grouping) -> "Projection":
         """From blocks of one pixel; the first two values are the maps."""
-        # Modes of the two sides that are alike to 1e-8 (in their squares) count as one.
+        # Modes of the two sides that agree to 1e-8 (in their squares) count once.
         inverse = inverse_normal(pixels.products[2:, 2:], 1e-8)
         return cls(np.hstack([np.eye(2), -pixels.products[:2, 2:] @ inverse]), inverse)
 
     def difference(self, values: F64) -> tuple[F64, F64, F64]:
-        """Both maps (k, ...) without their modes, and the second less the first."""
+        """Both maps (k, ...) without their modes, and the second minus the first."""
         first, second = np.tensordot(self.change, values, 1)
         return first, second, second - first
 
     def part(self, fine: Grouping, coarse: Grouping, pixels: int) -> "Part":
-        """Part of the maps at the scale of ``fine``: its sums less those of ``coarse``."""
+        """Part of the maps at the scale of ``fine``: its sums minus those of ``coarse``."""
         between = fine.products - coarse.products
         (first, both), (_, second) = self.change @ between @ self.change.T
         raw = fine.groups - coarse.groups
@@ -87,7 +87,7 @@ class Projection:
         return Part(pixels, freedom, float(first), float(second), float(both), (noise[0], noise[1]))
 
     def taken(self, products: F64) -> float:
-        """Degrees of freedom that the modes took from products (k, k)."""
+        """Degrees of freedom that the modes remove from products (k, k)."""
         return float(np.sum(self.inverse * products[2:, 2:]))
 
 
@@ -98,7 +98,7 @@ class VarianceEstimate(NamedTuple):
     error: float
 
     def facts(self) -> dict[str, float]:
-        """As rms (px; zero at the least) with its error and 95 % upper limit, and as variance."""
+        """As rms (px, at least 0) with its error and 95 % upper limit, and as variance."""
         positive = max(self.variance, 0.0)
         rms = math.sqrt(positive)
         return {
@@ -111,11 +111,11 @@ class VarianceEstimate(NamedTuple):
 
 
 class StructuralLine(NamedTuple):
-    """The second map against the first, with errors in both, and the correlation of both."""
+    """Line fitted to the second map against the first, errors in both, and their correlation."""
 
     correlation: float
     correlation_error: float
-    slope: float | None  # None where there is nothing in common to draw a line through
+    slope: float | None  # None without a common signal
     slope_error: float | None
 
 
@@ -124,7 +124,7 @@ class Part:
     """The two maps at one scale, as sums of squares over the window's good pixels (px²)."""
 
     pixels: float  # good pixels of the window
-    freedom: float  # degrees of freedom, without those of the removed modes
+    freedom: float  # degrees of freedom, less those of the removed modes
     first: float  # first, second, both: squares of the maps, and their product
     second: float
     both: float
@@ -137,16 +137,16 @@ class Part:
 
     @property
     def expected(self) -> float:
-        """Square of the difference that noise alone gives."""
+        """Square of the difference expected from noise alone."""
         return sum(self.noise)
 
     @property
     def correlation(self) -> float:
-        """Of the two maps."""
+        """Correlation of the two maps."""
         return float(self.both / np.sqrt(max(self.first * self.second, 1e-300)))
 
     def _estimate(self, square: float, chance: float, noise: float = 0.0) -> VarianceEstimate:
-        """From a sum of squares, its variance by chance, and noise known with an error."""
+        """From a sum of squares, its chance variance, and noise with an error."""
         error = math.sqrt(chance / self.freedom + noise**2)
         return VarianceEstimate(square / self.pixels, error / self.pixels)
 
@@ -155,12 +155,12 @@ class Part:
         return self._estimate(self.both, self.first * self.second + self.both**2)
 
     def beyond_noise(self, accuracy: float = SIGMA_ACCURACY) -> VarianceEstimate:
-        """Excess of the difference over noise, whose size is known to a relative accuracy."""
+        """Excess of the difference over noise of the given relative accuracy."""
         excess, chance = self.difference - self.expected, max(self.difference, self.expected)
         return self._estimate(excess, 2 * chance**2, 2 * accuracy * self.expected)
 
     def own(self, accuracy: float = SIGMA_ACCURACY) -> list[VarianceEstimate]:
-        """Signal of each map that is neither noise nor common."""
+        """Signal of each map that is neither noise nor common to both."""
         return [
             self._estimate(
                 square - self.both - noise,
@@ -171,7 +171,7 @@ class Part:
         ]
 
     def significance(self, accuracy: float = SIGMA_ACCURACY) -> float:
-        """Of the difference beyond noise, sigma (Wilson and Hilferty's cube root)."""
+        """Significance of the excess difference, sigma (Wilson and Hilferty's cube root)."""
         if self.freedom < 1 or self.expected <= 0:
             return 0.0
         chance = 2 / (9 * self.freedom)
@@ -187,7 +187,7 @@ class Part:
         ratio = self.noise[1] / self.noise[0]
         lead = self.second - ratio * self.first
         slope = (lead + np.sqrt(lead**2 + 4 * ratio * self.both**2)) / (2 * self.both)
-        # Variances of one degree of freedom: of the signal, of the noise along x, about the line.
+        # Variances per degree of freedom: of the signal, of the noise along x, about the line.
         along, first = max(self.both / slope, 1e-300) / self.freedom, self.noise[0] / self.freedom
         about = max(self.second - 2 * slope * self.both + slope**2 * self.first, 0.0) / self.freedom
         variance = (along * about + first * about - (slope * first) ** 2) / along**2 / self.freedom
@@ -200,11 +200,11 @@ class Period(NamedTuple):
 
     px: float  # its period
     amplitude_px: float
-    chance: float  # of noise making one as strong, anywhere in the spectrum
+    chance: float  # probability of so strong a wave from noise, anywhere in the spectrum
 
 
 def strongest_period(difference: F64, sigma: F64) -> Period | None:
-    """Strongest wave of a profile (n,) px with its errors; None if it is too short."""
+    """Strongest wave of a profile (n,), px, given its errors; None if it is too short."""
     good = np.isfinite(difference) & np.isfinite(sigma) & (sigma > 0)
     n = len(difference)
     if good.sum() < 8:
@@ -221,7 +221,7 @@ def strongest_period(difference: F64, sigma: F64) -> Period | None:
 def three_cornered_hat(
     pairs: Sequence[tuple[int, int]], excess: Sequence[VarianceEstimate]
 ) -> list[VarianceEstimate]:
-    """Own errors of three or more maps, from the differences of all pairs."""
+    """Individual errors of three or more maps, from the differences of all pairs."""
     # A difference's variance beyond noise (`Part.beyond_noise`) is the sum of those of its maps
     # (Gray and Allan 1974).
     values, errors = np.array(excess).T

@@ -1,4 +1,4 @@
-"""Two sides along one direction, read tile by tile: the sums, then the pixels."""
+"""Two sides along one direction, read tile by tile: first the sums, then the pixels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,11 +18,11 @@ from pixcal.stages.compare.sides import Side, Tile, Vector
 COARSE = 256  # most blocks along the longer side that are kept in memory
 SHOWN_BLOCKS = 16  # blocks along the longer side of the map of differences, or up to twice as many
 MIN_BLOCK = 4  # least side of its blocks, px
-DISAGREE = 5.0  # sigma beyond which a pixel is listed
+DISAGREE = 5.0  # sigma above which a pixel is listed
 LISTED = 1000  # most pixels of a tile that are listed
 PULLS = np.linspace(-50, 50, 2001)  # edges of the histogram of differences over their errors
-PICTURE = 96  # bins a side of the histogram of one map against the other
-REACH = 4.5  # its half width, in rms of the maps
+PICTURE = 96  # bins per side of the histogram of one map against the other
+REACH = 4.5  # half width of that histogram, in rms of the maps
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,12 @@ class Pair:
 
     @property
     def levels(self) -> int:
-        """Times that blocks are doubled, up to a quarter of the window's shorter side."""
+        """Number of doublings of the block side, up to a quarter of the window's shorter side."""
         return max(0, int(np.log2(max(1.0, min(self.window) / 4))))
 
     @property
     def coarse(self) -> int:
-        """Times that blocks are doubled inside a tile; a block of it is kept in memory."""
+        """Number of doublings of the block side inside a tile; these blocks are kept in memory."""
         most = int(np.log2(min(self.tile_side)))
         return min(most, max(0, int(np.ceil(np.log2(max(self.window) / COARSE)))))
 
@@ -71,13 +71,13 @@ class Pair:
         return list(product(rows, columns))
 
     def together(self, pieces: Sequence[F64]) -> F64:
-        """Pieces (..., y, x) of all tiles side by side."""
+        """Pieces (..., y, x) of all tiles, joined."""
         columns = -(-self.window[1] // self.tile_side[1])
         rows = range(0, len(pieces), columns)
         return np.block([list(pieces[n : n + columns]) for n in rows])
 
     def read(self, tile: Tile) -> F64:
-        """Sums over blocks of one pixel (k + 3, y, x); zero where either side has no offset."""
+        """Sums over blocks of one pixel (k + 3, y, x); zero if either side has no offset."""
         sides = [side.read(tile, self.direction) for side in (self.first, self.second)]
         maps, variances = (np.stack([side[n] for side in sides]) for n in (0, 1))
         good = np.isfinite(maps).all(axis=0) & (variances > 0).all(axis=0)
@@ -94,7 +94,7 @@ class Pair:
         )
         sets = (*self.first.sets, *self.second.sets)
         batches = max(len(s.batches or ()) for s in sets)
-        # The modes and their sums over blocks; each set's maps; its batches as read and as used.
+        # Modes and their sums over blocks; maps of each set; batches as read and as used.
         task = int(np.prod(self.tile_side)) * (8 * (4 * k + 12 * len(sets)) + 40 * batches)
         blocks = np.prod([-(-n // 2**self.coarse) for n in self.window])
         held = int(8 * (k + 4) * (3 * blocks + 2 * sum(self.window)))
@@ -102,12 +102,12 @@ class Pair:
 
 
 def _power_of_two(value: float) -> int:
-    """The largest up to a value; 1 at least."""
+    """Largest power of two up to a value; at least 1."""
     return 1 << max(0, int(np.log2(value)))
 
 
 def pulls(projection: Projection, sums: F64) -> F64:
-    """Difference of the maps without their modes over its error (y, x); NaN where there is none."""
+    """Difference of the maps without modes, over its error (y, x); NaN without data."""
     *_, difference = projection.difference(sums[:-3])
     variance = np.where(sums[-1] > 0, sums[-3] + sums[-2], np.nan)
     return np.asarray(difference / np.sqrt(variance))
@@ -120,7 +120,7 @@ class PairSums:
     fine: list[Grouping]  # blocks of 1, 2, 4, ... pixels, up to the coarse ones
     coarse: F64  # (k + 3, y, x) of the whole window
     profiles: dict[str, F64]  # (k + 3, n) of the `columns` and of the `rows`
-    levels: int  # times that blocks are doubled in all
+    levels: int  # total number of doublings of the block side
 
     @property
     def pixels(self) -> int:
@@ -153,11 +153,11 @@ class PairSums:
         return self.part(self.fine[0], self.whole)
 
     def of_means(self, sums: F64) -> Part:
-        """The maps of the means of columns or rows."""
+        """The part of the maps in means of columns or rows."""
         return self.part(Grouping.of(sums), self.whole)
 
     def differences(self, sums: F64) -> tuple[F64, F64]:
-        """Mean difference, second less first, of each block and its error, px; NaN where empty."""
+        """Mean difference, second minus first, of each block, and its error, px; NaN if empty."""
         *_, difference = self.projection.difference(sums[:-3])
         count = np.where(sums[-1] > 0, sums[-1], np.nan)
         return difference / count, np.sqrt(sums[-3] + sums[-2]) / count
@@ -166,7 +166,7 @@ class PairSums:
 def read_sums(
     pair: Pair, runtime: Runtime, keep: tuple[Projection, float] | None = None
 ) -> PairSums:
-    """Read both sides once, without pixels that differ, but for modes, by more than ``keep``."""
+    """Read both sides once, without pixels whose difference, modes removed, exceeds ``keep``."""
     task = partial(_sums_task, pair, keep)
     results = run_tasks(task, pair.tiles(), runtime, label=f"sums {pair.name}")
     groupings, *pieces = zip(*results, strict=True)
@@ -196,8 +196,8 @@ class Pixels(NamedTuple):
     pulls: I64  # (bin,) histogram of differences over their errors, `PULLS`
     picture: I64  # (bin, bin) second map (y) against the first (x), within `reach`
     far: list[tuple[int, int, float, float]]  # y, x, difference, error of pixels beyond `DISAGREE`
-    beyond: int  # how many there are; the farthest of each tile are listed
-    # (2, y, x) sum of squared pulls of each coarse block and its pixels, those beyond left out
+    beyond: int  # number of these; the farthest of each tile are listed
+    # (2, y, x) sum of squared pulls and number of pixels of each coarse block, without those beyond
     squares: F64
     reach: float  # px
 
@@ -210,7 +210,7 @@ class Pixels(NamedTuple):
 
 
 def read_pixels(pair: Pair, sums: PairSums, runtime: Runtime) -> Pixels:
-    """Read both sides once more, with the modes known."""
+    """Read both sides again, with the modes known."""
     total = sums.total()
     reach = REACH * (max(total.first, total.second) / max(total.pixels, 1)) ** 0.5 or 1.0
     task = partial(_pixels_task, pair, sums.projection, reach)

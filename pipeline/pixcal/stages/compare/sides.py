@@ -1,7 +1,7 @@
 """The two sides of a comparison: fitted runs, or parts of one, read tile by tile.
 
 A side gives the offset along any direction that its fringe sets measure, its variance, and the
-modes that this side's fit took off, as they come out in that direction.
+modes removed by its fit, projected on that direction.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ Range = tuple[int, int]
 Tile = tuple[Range, Range]
 Vector = tuple[float, float]
 
-PART_OF = 1e-3  # a set whose share in a direction is below this brings no modes of its own there
+PART_OF = 1e-3  # least share of a set in a direction to include its modes there
 
 
 def _middle(tile: Tile) -> Vector:
@@ -46,14 +46,14 @@ class ComparedSet:
     name: str
     folder: Path  # `fit.zarr/<set name>`
     shape: FringeShape  # of the fringes, as fitted
-    batches: tuple[int, ...] | None = None  # those that count; None for the whole run
+    batches: tuple[int, ...] | None = None  # batches to use; None for the whole run
 
     def axis(self, tile: Tile) -> Vector:
         """Unit vector along which the set measures, at the middle of a tile."""
         return self.shape.axis(*_middle(tile))
 
     def delta(self, tile: Tile) -> tuple[F64, F64]:
-        """Offset along the axis and its error (y, x), px; NaN where there is none."""
+        """Offset along the axis and its error (y, x), px; NaN without data."""
         if self.batches is None:
             return self._map("delta", tile), self._map("sigma", tile)
         readers = [ArrayReader(self.folder / f"batch_{name}") for name in ("delta", "sigma")]
@@ -63,7 +63,7 @@ class ComparedSet:
         return weighted_mean(delta, sigma)[:2]
 
     def modes(self, tile: Tile) -> F64:
-        """What the fit took off the set's map, (mode, y, x), px but for a factor."""
+        """Modes that the fit removed from the set's map, (mode, y, x), px up to a factor."""
         (y0, y1), (x0, x1) = tile
         y, x = np.arange(y0, y1, dtype=float)[:, None], np.arange(x0, x1, dtype=float)[None, :]
         iota, alpha = self._map("iota", tile), self._map("alpha", tile)
@@ -87,11 +87,11 @@ class Side:
     sets: tuple[ComparedSet, ...]
     window: tuple[int, int]  # (y, x), px
     chunk: tuple[int, int]  # of its maps on disk
-    facts: dict[str, Any]  # what to say of it
+    facts: dict[str, Any]  # its description in the results
 
     @property
     def axes(self) -> list[Vector]:
-        """Of the sets, at the middle of the window."""
+        """Axes of the sets, at the middle of the window."""
         return [s.axis(((0, self.window[0]), (0, self.window[1]))) for s in self.sets]
 
     @property
@@ -109,7 +109,7 @@ class Side:
         offsets = [s.delta(tile) for s in self.sets]
         delta, sigma = (np.stack(maps) for maps in zip(*offsets, strict=True))
         shares = self._shares([s.axis(tile) for s in self.sets], sigma, direction)
-        # A set without an offset at a pixel has no share in it.
+        # A set without an offset at a pixel has zero weight there.
         parts = np.where(np.isfinite(sigma), [shares * delta, (shares * sigma) ** 2], 0.0)
         lacking = ~np.isfinite(shares).all(axis=0)
         value, variance = np.where(lacking, np.nan, parts.sum(axis=1))

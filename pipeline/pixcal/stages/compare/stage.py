@@ -44,19 +44,19 @@ from pixcal.storage.manifest import (
 STAGE = STAGES["compare"]
 SCHEMA = "pixcal/compare/1"
 RESULT = "compare.json"
-STRAY = 0.05  # pixels of a window that may be left out by chance
-FEWEST = 50  # pixels in common that are needed
-PARALLEL_DEG = 10.0  # axes of single sets that differ by more have nothing in common
-NOTED_DEG = 0.5  # from here on it is said that the axes differ
-CLAIM = 1e-3  # chance of a false claim of a difference, of all that is looked at together
+STRAY = 0.05  # expected number of pixels of a window left out by chance
+FEWEST = 50  # fewest common pixels
+PARALLEL_DEG = 10.0  # largest angle between axes of single sets that can be compared
+NOTED_DEG = 0.5  # angle between axes above which the difference is reported
+CLAIM = 1e-3  # false-alarm rate of differences, over all tests together
 # kinds of evidence: scales, columns, rows, means of blocks, scatter in blocks, single pixels
 FAMILIES = 6
 SHARE = CLAIM / FAMILIES
-LISTED = 10  # most blocks, and most pixels, that are named
+LISTED = 10  # most blocks, and most pixels, that are listed
 
 
 def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Manifest:
-    """Compare maps of the same pixels, of two runs or more or of two parts of one."""
+    """Compare maps of the same pixels, of two or more runs or of two parts of one run."""
     if out.exists():
         if not out.is_dir():
             raise InputError(f"--out {out}: is a file; choose another directory")
@@ -92,7 +92,7 @@ def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Ma
 def _sides(runs: Sequence[Path], config: Config) -> list[Side]:
     if len(runs) == 1:
         return parts_of(runs[0], interleaved=config.split == "odd-even")
-    # Runs of the same name in different places are told apart by their paths.
+    # Runs of the same name in different places are distinguished by their paths.
     alike = len({run.name for run in runs}) < len(runs)
     sides = [whole_run(run, str(run) if alike else None) for run in runs]
     first = sides[0]
@@ -122,7 +122,7 @@ def _components(sides: Sequence[Side]) -> dict[str, Vector]:
 
 
 def _angle(a: Vector, b: Vector) -> float:
-    """Between two axes, degrees; their sense does not matter."""
+    """Angle between two axes, degrees, regardless of their sense."""
     return float(np.degrees(np.arccos(min(1.0, abs(float(np.dot(a, b)))))))
 
 
@@ -164,7 +164,7 @@ def compare_pair(
             f"both; {FEWEST} are needed"
         )
     pixels = read_pixels(pair, sums, runtime)
-    # Where all pixels scatter more than noise, or are many, few of those far off are outliers.
+    # If all pixels scatter more than noise, or are many, few of those far off are outliers.
     chance = float(-ndtri(STRAY / sums.pixels))
     limit = max(DISAGREE, chance) * max(1.0, pixels.spread)
     if any(abs(d / e) > limit for _, _, d, e in pixels.far):
@@ -173,7 +173,7 @@ def compare_pair(
 
 
 def _summary(pairs: list[dict[str, Any]], components: Iterable[str]) -> dict[str, Any]:
-    """Own errors of each side, from all pairs."""
+    """Individual errors of each side, from all pairs."""
     summary: dict[str, Any] = {}
     for name in components:
         facts = [pair["components"][name] for pair in pairs]
@@ -204,7 +204,7 @@ def _warnings(sides: Sequence[Side], components: dict[str, Vector]) -> list[str]
 def describe(
     pair: Pair, sums: PairSums, pixels: Pixels, limit: float, accuracy: float
 ) -> tuple[dict[str, Any], ComponentView]:
-    """Results and figure of one component, its sums without pixels off by ``limit`` sigma.
+    """Results and figure of one component; ``sums`` exclude pixels beyond ``limit`` sigma.
 
     ``accuracy``: relative error of SIGMA to tolerate.
     """
@@ -268,14 +268,14 @@ def _evidence(facts: dict[str, Any]) -> list[str]:
     for kind, number in blocks["beyond"].items():
         if number:
             evidence.append(f"{kind} of {number} of {blocks['number']} blocks")
-    # The chance of so many or more, by the Poisson law.
+    # Poisson probability of this number or more.
     if gammainc(outliers["beyond_5_sigma"], outliers["expected"]) < SHARE:
         evidence.append(f"{outliers['beyond_5_sigma']} single pixels")
     return evidence
 
 
 def _suspicion(scales: list[dict[str, Any]]) -> str | None:
-    """Maps that agree better than they can."""
+    """Warning on maps that agree better than their errors allow."""
     limit = ndtri(CLAIM / max(1, len(scales)))
     close = [str(s["side_px"]) for s in scales if s["significance"] < limit]
     if not close:
@@ -287,7 +287,7 @@ def _suspicion(scales: list[dict[str, Any]]) -> str | None:
 
 
 def _amounts(p: Part, accuracy: float) -> dict[str, Any]:
-    """Sizes at one scale, or at all of them; those of the scales add up in squares."""
+    """Sizes at one scale, or at all; sizes of the scales add in quadrature."""
     return {
         "freedom": p.freedom,
         "rms_px": [(square / p.pixels) ** 0.5 for square in (p.first, p.second)],
@@ -303,7 +303,7 @@ def _amounts(p: Part, accuracy: float) -> dict[str, Any]:
 
 
 def _profile(p: Part, mean: F64, error: F64, accuracy: float) -> dict[str, Any]:
-    """Means of the columns (or rows): how far they differ, and the strongest wave."""
+    """Means of the columns (or rows): their differences, and the strongest wave."""
     if p.freedom < 1 or p.expected <= 0:
         return {"ratio": None, "significance": 0.0, "worst": None, "period": None}
     worst = int(np.argmax(np.abs(np.nan_to_num(mean / error))))
@@ -320,7 +320,7 @@ def _profile(p: Part, mean: F64, error: F64, accuracy: float) -> dict[str, Any]:
 
 
 def _blocks(pair: Pair, sums: PairSums, pixels: Pixels) -> tuple[dict[str, Any], F64, F64]:
-    """Blocks whose mean or scatter differs, and the significance of both in every block."""
+    """Blocks with different mean or scatter, and the significance of both in every block."""
     blocks, squares = sums.coarse, pixels.squares
     for _ in range((pair.shown >> pair.coarse).bit_length() - 1):
         blocks, squares = halve(blocks), halve(squares)
@@ -331,7 +331,7 @@ def _blocks(pair: Pair, sums: PairSums, pixels: Pixels) -> tuple[dict[str, Any],
     shift = mean / error
     number, side = int((squares[1] > 0).sum()), pair.shown
     share = SHARE / max(1, number)
-    # Means differ in either direction, scatter only by an excess.
+    # Means are tested on both sides, scatter only for an excess.
     limits = {"mean": float(-ndtri(share / 2)), "scatter": float(-ndtri(share))}
     beyond = {"mean": np.abs(shift) > limits["mean"], "scatter": scatter > limits["scatter"]}
     listed: list[dict[str, Any]] = [

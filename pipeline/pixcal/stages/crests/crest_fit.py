@@ -14,9 +14,9 @@ from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
 from pixcal.stages.crests.crests import CrestPaths
 
-OUTLIER = 5.0  # points farther from the fit, in robust standard deviations, are left out
-MAP_POINTS = 400  # points that a cost map is computed with; its numbers are scaled to all of them
-NOTABLE_CHI2 = 3.0  # from here on the reduced chi-square of the points is pointed out
+OUTLIER = 5.0  # robust standard deviations from the fit above which points are left out
+MAP_POINTS = 400  # points used to compute a cost map, which is scaled to all points
+NOTABLE_CHI2 = 3.0  # reduced chi-square of the points above which a warning is given
 
 
 @dataclass(frozen=True)
@@ -24,18 +24,18 @@ class Prior:
     """Prior knowledge of the geometry."""
 
     nominal: Geometry
-    # (6,) 1-sigma errors, mm, in the order of `PARAMETERS`; 0 holds a parameter, infinity frees
-    # it; the same for baseline_x and baseline_y
+    # (6,) 1-sigma errors, mm, in the order of `PARAMETERS`; 0 fixes a parameter, infinity frees
+    # it; equal for baseline_x and baseline_y
     sigma: F64
 
     @classmethod
     def of_bench(cls, nominal: Geometry) -> "Prior":
-        """The errors that the hyperbolic fit assumes of a bench's nominal values."""
+        """Errors of a bench's nominal values as assumed by the hyperbolic fit."""
         return cls(nominal, prior_errors(nominal))
 
     @classmethod
     def none(cls, nominal: Geometry) -> "Prior":
-        """Nothing known: every parameter is free."""
+        """No prior: every parameter is free."""
         return cls(nominal, np.full(len(PARAMETERS), np.inf))
 
 
@@ -45,14 +45,14 @@ class CrestFit:
 
     geometry: Geometry
     phase0: float  # phase at the frame's centre, rad
-    # (6, 6) mm², in the order of `PARAMETERS`, scaled by the spread; zero for what was held
+    # (6, 6) mm², in the order of `PARAMETERS`, scaled by the spread; zero for fixed parameters
     covariance: F64
-    used: Mask  # (point,) points that are no outliers
+    used: Mask  # (point,) points that are not outliers
     residual: F64  # (point,) phase of the fit minus k pi, rad
     cost: float  # equation 7: sum of the squared residuals of the points used, rad²
-    chi2_reduced: float  # the same weighted, for each degree of freedom
-    # `max(1, chi2_reduced)`: squares of errors are scaled by it, since true offsets of the
-    # pixels scatter the points too
+    chi2_reduced: float  # weighted sum per degree of freedom
+    # `max(1, chi2_reduced)`: factor on squared errors, because true pixel offsets also scatter
+    # the points
     spread: float
     evaluations: int  # of the model, in the last fit
     prior: Prior
@@ -64,7 +64,7 @@ class CrestFit:
 
     @property
     def from_prior(self) -> Mask:
-        """Parameters (6,) that the prior constrains more than the points."""
+        """Parameters (6,) that the prior constrains more than the points do."""
         return np.asarray(self.sigma > np.sqrt(0.5) * self.prior.sigma)
 
     def warnings(self) -> list[str]:
@@ -96,9 +96,9 @@ def relative_phase(paths: CrestPaths, geometry: Geometry) -> F64:
 
 
 def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior | None = None) -> CrestFit:
-    """Weighted least squares of equation 7 over fibre positions and phase."""
-    # Far starts converge (tested: 10 mm of distance, 18 mm of offset, 5 % of the baseline). Without
-    # a prior nothing is known: only a large window determines all six parameters.
+    """Fit equation 7 by weighted least squares over fibre positions and phase."""
+    # Distant starts converge (tested: 10 mm of distance, 18 mm of offset, 5 % of the baseline).
+    # Without a prior, only a large window determines all six parameters.
     prior = Prior.none(start) if prior is None else prior
     unknown, number = 1 + int(np.isinf(prior.sigma).sum()), len(np.unique(paths.k))
     if len(paths) <= unknown or number < 3:
@@ -134,7 +134,7 @@ DISTANCE, LENGTH, ANGLE = 2, 3, 4
 
 
 def _polar(geometry: Geometry) -> F64:
-    """The parameters, with length and direction (rad) of the baseline in place of its x and y."""
+    """The parameters, with length and direction (rad) of the baseline instead of its x and y."""
     x, y, distance, bx, by, bz = geometry.vector()
     return np.array([x, y, distance, np.hypot(bx, by), np.arctan2(by, bx), bz])
 
@@ -180,8 +180,8 @@ def cost_map(
 ) -> F64:
     """Cost (d, s) of equation 7 over distance and B (mm) or, with ``ratio``, B / D: figure 17.
 
-    The minimum ``fit`` gives errors, outliers and priors, but those of distance and length.
-    ``refit``: centre, direction and tilt too are fitted again at each place, as the phase is.
+    The minimum ``fit`` gives errors, outliers and priors, except those of distance and length.
+    ``refit``: at each place, refit centre, direction and tilt in addition to the phase.
     """
     few = _thinned(paths, fit)
     lengths = np.multiply.outer(distance if ratio else np.ones_like(distance), second)
@@ -190,8 +190,8 @@ def cost_map(
 
 
 def valley(paths: CrestPaths, fit: CrestFit, distance: F64) -> tuple[F64, F64]:
-    """Best ratio B / D and its cost, (d,), with the distance (d,) mm held (figure 17, right)."""
-    # The other parameters are fitted again, with the priors that `cost_map` takes.
+    """Best ratio B / D and its cost, (d,), at fixed distance (d,), mm (figure 17, right)."""
+    # The other parameters are refitted, with the priors of `cost_map`.
     few = _thinned(paths, fit)
     cost, length = np.array([_least_cost(few, fit, d, None, True) for d in distance]).T
     return length / distance, cost
@@ -208,9 +208,9 @@ def _thinned(paths: CrestPaths, fit: CrestFit) -> CrestPaths:
 def _least_cost(
     paths: CrestPaths, fit: CrestFit, distance: float, length: float | None, refit: bool
 ) -> tuple[float, float]:
-    """Cost with the distance held, and the length too unless it is None; and that length."""
+    """Cost at fixed distance, and at fixed length unless that is None; and the length."""
     origin = _polar(fit.geometry)
-    # With the ratio kept the phases hardly change: the way along the valley.
+    # At constant ratio the phases hardly change: this follows the valley.
     origin[LENGTH] *= distance / origin[DISTANCE]
     origin[DISTANCE] = distance
     sigma = fit.prior.sigma.copy() if refit else np.zeros(len(origin))
@@ -225,10 +225,10 @@ def _least_cost(
 
 def falls_then_rises(cost: F64) -> bool:
     """Whether a curve (or every row of a map) falls to one minimum and rises after it."""
-    # A map whose rows do, and whose valley does, has one minimum. Counting the low places of a
-    # sampled map would not tell: a valley narrower than the samples shows many.
+    # A map has one minimum if its rows and its valley each have one. Counting local minima of a
+    # sampled map fails: a valley narrower than the samples shows many.
     steps = np.diff(np.atleast_2d(cost), axis=1)
-    # What the fits at each place leave undone.
+    # Ignore the convergence error of the fits at each place.
     steps[np.abs(steps) < 1e-5 * np.atleast_2d(cost)[:, 1:]] = 0
     rising = np.cumsum(steps > 0, axis=1) > 0
     return not bool(np.any(rising & (steps < 0)))

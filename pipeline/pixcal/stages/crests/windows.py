@@ -1,6 +1,6 @@
-"""Windows that follow the fringes of a frame, and the phase of the fringes in each.
+"""Windows that follow the fringes of a frame, and the phase of the fringes in each window.
 
-The frame is first divided by a smooth illumination. What is left in each window is a quadratic
+The frame is first divided by a smooth illumination. The model of each window is a quadratic
 background and fringes whose contrast and phase may change linearly,
 ``b0 + b1 u + b2 v + b3 u² + b4 u v + b5 v² + (1, u, v) × (cos P, sin P)``, u and v from -1 to 1
 across and along the fringes and P a smooth carrier. The normal equations of this model add up:
@@ -27,9 +27,9 @@ N_TERMS = 12
 COSINE, SINE = 6, 9
 # upper triangle of the normal matrix, right-hand side, sum of squares, number of samples
 N_SUMS = N_TERMS * (N_TERMS + 1) // 2 + N_TERMS + 2
-# Fewest across a window. Half an odd number: points of neighbours lie on crest and valley.
+# Fewest fringes across a window. Half an odd number: neighbours' points lie on crest and valley.
 FRINGES_A_WINDOW = 2.5
-# fewest pixels across a window: where fringes run along the columns, the model's seven functions
+# fewest pixels across a window: if fringes run along the columns, the model's seven functions
 # across them need as many samples and more
 MIN_WIDTH = 12.0
 
@@ -65,7 +65,7 @@ class Windows:
         n_across = int(np.ptp(across) / width)
         n_along = max(1, round(np.ptp(along) / segment))
         size = (float(np.ptp(across) / n_across), float(np.ptp(along) / n_along))
-        # A hair outwards: the outermost pixels must not fall out by rounding.
+        # Slightly outwards, so that rounding does not exclude the outermost pixels.
         edge = (float(across.min()) - 1e-9, float(along.min()) - 1e-9)
         return cls(frame, (ux, uy), edge, size, (n_across, n_along))
 
@@ -78,21 +78,21 @@ class Windows:
         return uy * u + ux * v, ux * u - uy * v
 
     def touched(self, y: tuple[int, int], x: tuple[int, int]) -> tuple[tuple[int, int], ...]:
-        """First window, and the one after the last, across and along, that a tile touches."""
+        """First and one past the last window, across and along, that a tile overlaps."""
         ux, uy = self.direction
         at_x = np.array([x[0], x[1] - 1, x[0], x[1] - 1])
         at_y = np.array([y[0], y[0], y[1] - 1, y[1] - 1])
         spans = []
         for n, at in enumerate((ux * at_x + uy * at_y, ux * at_y - uy * at_x)):
             number = np.floor((at - self.edge[n]) / self.size[n])
-            # One more on each side for what rounding does to pixels on a border.
+            # One more on each side, because of rounding at pixels on a border.
             spans.append((int(number.min()) - 1, int(number.max()) + 2))
         return tuple((max(0, a), min(n, b)) for (a, b), n in zip(spans, self.shape, strict=True))
 
 
 @dataclass(frozen=True)
 class CrestCarrier:
-    """What a frame is demodulated with: polynomials ``sum c[i, j] Y^i X^j`` of scaled pixels."""
+    """Carrier to demodulate a frame: polynomials ``sum c[i, j] Y^i X^j`` of scaled pixels."""
 
     phase: F64  # (n, n) of the phase, rad
     light: F64  # (n, n) of the natural logarithm of the illumination
@@ -101,7 +101,7 @@ class CrestCarrier:
 
     @classmethod
     def straight(cls, k: Vector, frame: tuple[int, int]) -> Self:
-        """Straight fringes of a vector (kx, ky), of phase zero at the centre, and even light."""
+        """Straight fringes of a vector (kx, ky), zero phase at the centre, and uniform light."""
         scale = max(frame) / 2
         slope = np.array([[0.0, k[0]], [k[1], 0.0]]) * scale
         return cls(slope, np.zeros((2, 2)), ((frame[0] - 1) / 2, (frame[1] - 1) / 2), scale)
@@ -129,7 +129,7 @@ def tile_sums(
     windows: Windows,
     carrier: CrestCarrier,
 ) -> tuple[tuple[int, int], F64]:
-    """Sums (across, along, N_SUMS) of the windows a tile touches, and the first one's numbers.
+    """Indices of the first window that a tile overlaps, and sums (across, along, N_SUMS).
 
     ``signal, good``: e- and samples to use (y, x), from pixel ``start`` (y, x) of the frame on.
     """
@@ -219,13 +219,13 @@ def solve_windows(sums: F64) -> tuple[F64, F64, F64]:
     normal = symmetric(sums[use, :size])
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-300))
     normal /= scale[:, :, None] * scale[:, None, :]
-    # Far below rounding of good windows; those that it changes get errors beyond use.
+    # Below rounding errors of good windows; windows that it changes get unusably large errors.
     normal += 1e-13 * np.eye(N_TERMS)
     inverse = np.linalg.inv(normal)
     right = sums[use, size : size + N_TERMS] / scale
     solved = np.einsum("nij,nj->ni", inverse, right)
     rest = sums[use, -2] - np.einsum("ni,ni->n", solved, right)
-    # The difference of two large numbers keeps so many digits.
+    # Limited by the digits of a difference of two large numbers.
     variance = np.maximum(rest, 1e-15 * sums[use, -2]) / (count[use] - N_TERMS)
     theta, pair = solved / scale, [COSINE, SINE]
     covariance = inverse[:, pair][:, :, pair] / (scale[:, pair, None] * scale[:, None, pair])

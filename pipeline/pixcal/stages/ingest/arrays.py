@@ -1,9 +1,9 @@
-"""The arrays of ``RUN/ingest``: made, closed, and taken over from an earlier ingest.
+"""The arrays of ``RUN/ingest``: create, close, and reuse those of an earlier ingest.
 
-Of every frame the catalogue is kept: checksums and largest samples. The samples themselves are
-copied where they could not be read again from where they are, or where that is asked for.
-An array whose files are all as they were is not read again: its chunks are linked from the earlier
-artefact, and what the headers said is taken from its tables. Its files are not even opened.
+The catalogue holds checksums and largest samples of every frame. Samples are copied only if they
+cannot be read again from their files, or on request.
+If no file of an array has changed, the files are not even opened: chunks are linked from the
+earlier artefact, and header values are taken from its tables.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ from pixcal.storage.manifest import Manifest, damaged_files, digest, file_digest
 from pixcal.storage.place import Place
 from pixcal.storage.sources import SourceFile
 
-FRAMES_A_PIECE = 16  # frames that one task catalogues: a chunk of the catalogue
+FRAMES_A_PIECE = 16  # frames catalogued by one task: a chunk of the catalogue
 
 
 def _create_groups(store: Place, array: str) -> None:
@@ -37,7 +37,7 @@ def _create_groups(store: Place, array: str) -> None:
 
 
 def _finish(writer: ArrayWriter) -> str:
-    """Close an array; its digest, DamagedError if a chunk is missing or cut."""
+    """Close an array and return its digest; DamagedError if a chunk is missing or cut."""
     index = writer.finish()
     content = hashlib.sha256(repr((writer.shape, writer.dtype.str)).encode())
     content.update(index.tobytes())
@@ -46,10 +46,10 @@ def _finish(writer: ArrayWriter) -> str:
 
 @dataclass(frozen=True)
 class Writers:
-    """What an array of frames is written to."""
+    """Writers of an array of frames."""
 
     catalogue: ArrayWriter  # (time, band, fact): what `pixcal.storage.fits_rows.read_rows` returns
-    samples: ArrayWriter | None  # (time, y, x) in ADU, where they are copied
+    samples: ArrayWriter | None  # (time, y, x) in ADU, if they are copied
     shape: tuple[int, ...]  # shape, dtype: of the frames
     dtype: str
 
@@ -86,14 +86,14 @@ class Writers:
 
 @dataclass(frozen=True)
 class Kept:
-    """An array of an earlier ingest whose files are still the same."""
+    """An array of an earlier ingest whose files are unchanged."""
 
     array: str  # its name now
     name: str  # its name then
     folder: Path  # the earlier artefact
     facts: Mapping[str, Any]  # what `Writers.finish` returned then
-    # the files as their headers described them then; where the samples of those that were copied
-    # are is not known
+    # the files as described by their headers then; without positions of the samples if these were
+    # copied
     files: list[FrameFile]
 
 
@@ -105,16 +105,16 @@ def find_kept(
     *,
     copy: bool,
 ) -> list[Kept]:
-    """Arrays of an earlier ingest that can be taken over, if their chunks are whole.
+    """Arrays of an earlier ingest that can be reused if their chunks are whole.
 
-    Those that its tables do not describe, or that are damaged, must be read again.
+    Arrays that its tables do not describe, or that are damaged, must be read again.
 
     Parameters
     ----------
     folder, earlier : the earlier artefact and its manifest
-    same : name now to earlier name, of the arrays made from the same files
+    same : present name to earlier name, of arrays made from the same files
     sources : files of each array now
-    copy : only those whose samples were copied
+    copy : only arrays whose samples were copied
     """
     try:
         tables, places = (_intact(folder, earlier, name) for name in ("frames.json", "files.json"))
@@ -138,7 +138,7 @@ def find_kept(
 
 
 def _intact(folder: Path, earlier: Manifest, name: str) -> Any:
-    """Content of a file of an earlier artefact, held against its digest."""
+    """Content of a file of an earlier artefact, verified by its digest."""
     content = read_json(folder / name)
     if file_digest(folder / name) != earlier.files.get(name):
         raise DamagedError(f"{folder / name}: altered since it was written", folder / name)
@@ -168,7 +168,7 @@ def _described(
 
 
 def _order(files: Sequence[FrameFile]) -> list[tuple[str, int]]:
-    """File and plane of each frame; they depend on the headers, not on the frame period."""
+    """File and plane of each frame, which depend on headers but not on the frame period."""
     frames, _ = tabulate("", files, None)
     return [(frame.file.source.name, frame.plane) for frame in frames]
 
@@ -176,10 +176,10 @@ def _order(files: Sequence[FrameFile]) -> list[tuple[str, int]]:
 def take_over(made: Build, kept: Sequence[Kept], runtime: Runtime) -> dict[str, dict[str, Any]]:
     """Link the chunks of earlier arrays into a build, and verify their digests.
 
-    From one place to another they are copied. Returns what `Writers.finish` returns, by array, of
-    those that are whole; the others must be read again.
+    Between different places they are copied. Returns the result of `Writers.finish` by array, for
+    whole arrays only; the others must be read again.
     """
-    # Made here, one by one: they share groups, which two tasks must not make at once.
+    # Created here in turn: they share groups, which two tasks must not create at once.
     writers = [
         Writers.create(made, k.array, k.facts["shape"], k.facts["dtype"], copied=k.facts["copied"])
         for k in kept
@@ -202,5 +202,5 @@ def _take_over(task: tuple[Kept, Writers]) -> dict[str, Any] | None:
         if error.errno in DISK_FULL:
             raise
         return None
-    # Of the sizes and checksums that the chunks have now, against those of the earlier index.
+    # Compare sizes and checksums of the present chunks with those of the earlier index.
     return facts if facts["digest"] == kept.facts["digest"] else None

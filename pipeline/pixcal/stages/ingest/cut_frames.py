@@ -1,4 +1,4 @@
-"""Frames whose transfer was cut off: one value, zero mostly, from some row to the end."""
+"""Frames with interrupted transfer: constant, mostly zero, from some row to the end."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,19 +12,19 @@ _NAMED = 3
 
 
 def cut_from(array: str, facts: Mapping[str, F64], rows: int) -> list[int | None]:
-    """First row without samples of each frame, None where all rows have them.
+    """First row without samples of each frame; None if all rows have them.
 
-    Noise makes an exactly constant last row unlikely. Where most frames have one, or nearly, it is
-    no mark: rows without light on a camera whose noise is cut off at zero or below a code. Nor are
-    rows that saturate. ``array``: ``bias``, ``dark``, ``flat``, ``fringes/<set>``. ``facts``:
-    `pixcal.storage.fits_rows.FACTS` by name, (time, band). ``rows``: of a frame.
+    Noise makes an exactly constant last row unlikely. It is no evidence if most frames have one, or
+    nearly: rows may be dark on a camera whose noise is cut off at zero or below one code. Saturated
+    rows are no evidence either. ``array``: ``bias``, ``dark``, ``flat``, ``fringes/<set>``.
+    ``facts``: `pixcal.storage.fits_rows.FACTS` by name, (time, band). ``rows``: of a frame.
     """
     share = facts["share"][:, -1]
     if np.quantile(share, 0.5, method="lower") >= 0.5:
         return [None] * len(share)
     largest, level = np.fmax.reduce(facts["largest"], axis=1), facts["last"][:, -1]
     usual = np.median(largest)
-    # Flats of a ladder saturate one and all; of others, most frames reach the end of the converter.
+    # At a saturated step, all flats reach the converter's end; in other arrays, most frames do.
     full = (level == largest) & ((level >= usual) if array == "flat" else (level == usual))
     cut = (share == 1) & ~full
     return [
@@ -34,7 +34,7 @@ def cut_from(array: str, facts: Mapping[str, F64], rows: int) -> list[int | None
 
 
 def _first_row(last: F64, constant: F64, rows: int) -> int:
-    """Where the last rows of one value begin, by the last sample and such rows of each band."""
+    """First of the final constant rows, from the last sample and constant rows of each band."""
     first = rows
     for band in range(len(last) - 1, -1, -1):
         if not np.array_equal(last[band], last[-1], equal_nan=True):
@@ -48,7 +48,7 @@ def _first_row(last: F64, constant: F64, rows: int) -> int:
 def cut_warning(
     array: str, frames: Sequence[Frame], first: Sequence[int | None], facts: Mapping[str, F64]
 ) -> list[str]:
-    """What to say of the frames of an array, given what `cut_from` was given and returned."""
+    """Warnings on the frames of an array, given the arguments and result of `cut_from`."""
     found = [
         f"{frame.file.source.name}{f' [{frame.plane}]' * (frame.file.shape[0] > 1)} "
         f"(all samples {value:g} from row {row} on)"

@@ -1,10 +1,10 @@
-"""Ingest: the FITS frames of an acquisition checked and catalogued, each frame read once.
+"""Ingest: check and catalogue the frames of an acquisition, reading each frame once.
 
-Everything that can be told from headers and file lengths is checked before any data are read. Every
-frame is then read for its checksums; from plain files nothing is copied, since `reduce` reads them
-where they are. Samples of compressed files, which cannot be read in bands of rows, go into cubes,
-and all do with ``copy``. A run that was cut short goes on with the blocks of frames that are
-missing. Arrays whose files have not changed since an earlier ingest are taken over, unread.
+Headers and file lengths are checked before any data are read. Every frame is then read for its
+checksums. Plain files are not copied, since `reduce` reads them in place. Samples of compressed
+files, which cannot be read in bands of rows, are copied into cubes, as are all samples with
+``copy``. An interrupted run resumes with the missing blocks of frames. Arrays whose files have not
+changed since an earlier ingest are reused without reading.
 """
 
 import os
@@ -47,7 +47,7 @@ from pixcal.storage.stage import make
 
 STAGE = STAGES["ingest"]
 
-# heights of a band, the first that fits the memory: whole chunks, and long reads
+# heights of a band, of which the first that fits in memory is used: whole chunks, and long reads
 _BAND_ROWS = (512, 384, 256, 128)
 
 _DTYPES = tuple(map(np.dtype, ("u1", "i1", "u2", "i2", "u4", "i4", "f4")))
@@ -58,7 +58,7 @@ _BYTES_A_FRAME = 4096
 def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
     """Make ``RUN/ingest`` from an acquisition (directory or its YAML file), unless up to date.
 
-    Of an earlier ingest, arrays made from the same files are taken over; when there are none, it
+    Arrays of an earlier ingest that were made from the same files are reused; if there are none, it
     was of another acquisition and is only replaced with `Config.overwrite`. In the manifest,
     ``inputs`` holds the fingerprint of the files of each array; ``summary`` holds the shape, type
     and content digest of each array, and ``warnings``.
@@ -102,7 +102,7 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
 
 
 def _place(out: Path, folder: Path) -> Manifest:
-    """Note in the manifest where the files are now; they may have been moved as they are."""
+    """Note the present paths of the files in the manifest, since they may have been moved."""
     manifest = read_manifest(out / STAGE.name)
     assert manifest is not None
     where = {
@@ -116,7 +116,7 @@ def _place(out: Path, folder: Path) -> Manifest:
 
 
 def _earlier(out: Path) -> Manifest | None:
-    """Manifest of an earlier ingest; what cannot be read is made again."""
+    """Manifest of an earlier ingest; None if it is unreadable."""
     try:
         cubes_of(out / STAGE.name)
         return read_manifest(out / STAGE.name)
@@ -125,7 +125,7 @@ def _earlier(out: Path) -> Manifest | None:
 
 
 def _same_files(earlier: Manifest | None, inputs: Mapping[str, str]) -> dict[str, str]:
-    """Arrays made from the same files as an earlier one, whose name is the value."""
+    """Arrays made from the same files as an earlier array, with its name as value."""
     if earlier is None:
         return {}
     names = {files: array for array, files in earlier.inputs.items()}
@@ -135,7 +135,7 @@ def _same_files(earlier: Manifest | None, inputs: Mapping[str, str]) -> dict[str
 def _refuse_other(
     out: Path, earlier: Manifest, plain: Mapping[str, Any], inputs: Mapping[str, str]
 ) -> None:
-    """Refuse to replace an ingest of another acquisition, saying what is different."""
+    """Refuse to replace an ingest of another acquisition, and name the differences."""
     arrays = sorted(inputs.keys() | earlier.inputs.keys())
     other = [f"the files of {a}" for a in arrays if inputs.get(a) != earlier.inputs.get(a)]
     if earlier.config != plain:
@@ -146,7 +146,7 @@ def _refuse_other(
     )
 
 
-# What the headers say
+# Headers
 
 
 def _check(
@@ -180,7 +180,7 @@ def _check(
 
 
 def _inspect_batch(batch: Sequence[SourceFile]) -> list[FrameFile | str]:
-    """What each file holds, or what is wrong with it."""
+    """Description of each file, or its error."""
     answers: list[FrameFile | str] = []
     for source in batch:
         try:
@@ -191,7 +191,7 @@ def _inspect_batch(batch: Sequence[SourceFile]) -> list[FrameFile | str]:
 
 
 def _check_shapes(by_array: Mapping[str, Sequence[FrameFile]]) -> None:
-    """Refuse frames of another size than that of most files."""
+    """Refuse frames whose size differs from that of most files."""
     files = [file for its_files in by_array.values() for file in its_files]
     usual = Counter(file.shape[1:] for file in files).most_common(1)[0][0]
     odd = next((file for file in files if file.shape[1:] != usual), None)
@@ -229,7 +229,7 @@ def _plan(
     cubes: Place,
     runtime: Runtime,
 ) -> tuple[int, Plan]:
-    """Rows that are copied at once, and the memory: rather fewer rows than fewer workers."""
+    """Rows to copy at once, and memory plan: reduces rows before workers."""
     shared = _BYTES_A_FRAME * sum(map(len, tables.values()))
     rows, need = 0, 0
     for rows in _BAND_ROWS:
@@ -243,7 +243,7 @@ def _plan(
 
 
 def _task_bytes(array: str, frames: Sequence[Frame], rows: int, copied: bool) -> int:
-    """Peak of one task: the rows, some samples in conversion, chunks in compression."""
+    """Peak memory of one task: its rows, samples in conversion, chunks in compression."""
     files = _files(frames)
     _, ny, nx = files[0].shape
     dtype = _common_dtype(array, files)
@@ -262,7 +262,7 @@ def _files(frames: Sequence[Frame]) -> list[FrameFile]:
 
 @dataclass(frozen=True)
 class _Piece:
-    """A task: some frames, from a border of chunks on; samples are copied in strips of rows."""
+    """A task: frames from a chunk border on; samples are copied in strips of rows."""
 
     writers: Writers
     start: int
@@ -275,7 +275,7 @@ def _pieces(
     array: str, frames: Sequence[Frame], writers: Writers, rows: int, scratch: Path
 ) -> Iterator[tuple[str, _Piece]]:
     """Steps of an array and their tasks: a block of frames each."""
-    # Compressed files can only be read whole: blocks that share one are one task.
+    # Compressed files can only be read whole: blocks that share a file form one task.
     borders = [0]
     for t in range(0, len(frames), CHUNK[0] if writers.samples else FRAMES_A_PIECE):
         if t and (frames[t].plane == 0 or frames[t].file.container == "plain"):
@@ -334,7 +334,7 @@ def _write_piece(piece: _Piece) -> None:
 def _unpack_block(
     block: Sequence[Frame], unpacked: Mapping[str, FrameFile], scratch: Path
 ) -> dict[str, FrameFile]:
-    """Unpack the compressed files of a block, dropping those that only earlier ones needed."""
+    """Unpack the compressed files of a block, and delete those of earlier blocks only."""
     scratch.mkdir()
     wanted = {f.source.name: f for f in _files(block) if f.container != "plain"}
     for name in unpacked.keys() - wanted.keys():
@@ -371,10 +371,9 @@ def _close(
     copied: Mapping[str, bool],
     facts: Mapping[str, dict[str, Any]],
 ) -> list[str]:
-    """Check that nothing is missing or was changed meanwhile, and write the tables.
+    """Check that no data are missing or were changed meanwhile, and write the tables.
 
-    The ``facts`` are those of the arrays that were taken over. Returns what to say of frames that
-    were cut off.
+    ``facts``: of reused arrays. Returns warnings on frames with interrupted transfer.
     """
     try:
         for files in sources.values():
@@ -388,7 +387,7 @@ def _close(
     except RemoteError:
         raise
     except InputError:
-        # What was read cannot be trusted.
+        # The data that were read are unreliable.
         made.discard()
         raise
     write_json(made.folder / "acquisition.json", to_plain(described))
