@@ -1,4 +1,4 @@
-"""Work that is ended when it takes more processor time or memory than was planned for it."""
+"""End work that takes more processor time or memory than planned."""
 
 import ctypes
 import os
@@ -12,12 +12,12 @@ from pathlib import Path
 
 from numba.core import event
 
-LOOK_S = 0.2  # from one look at what is used to the next
-OWN = 256 << 20  # bytes: a process that has loaded pixcal and nothing else
+LOOK_S = 0.2  # interval between checks of the usage
+OWN = 256 << 20  # bytes of a process that has only loaded pixcal
 
 
 class Exceeded(BaseException):
-    """More was used than planned; no `Exception`, lest who tries several ways goes on."""
+    """Usage exceeds the plan; not an `Exception`, so that handlers do not continue the work."""
 
 
 class _Compiling(event.Listener):  # type: ignore[misc]
@@ -28,18 +28,18 @@ class _Compiling(event.Listener):  # type: ignore[misc]
         self._began: dict[int, list[float]] = {}  # kernels may be compiled within others
 
     def on_start(self, event: event.Event) -> None:
-        """Note when."""
+        """Note the start of a compilation."""
         self._began.setdefault(threading.get_ident(), []).append(time.thread_time())
 
     def on_end(self, event: event.Event) -> None:
-        """Add it up."""
+        """Add its time."""
         thread = threading.get_ident()
         began = self._began[thread].pop()
         if not self._began[thread]:
             self._spent[thread] = self._spent.get(thread, 0.0) + time.thread_time() - began
 
     def of(self, thread: int, now: float) -> float:
-        """Of a thread, by a time of its clock."""
+        """Compiling time of a thread up to a time of its clock."""
         begun = self._began.get(thread)
         return self._spent.get(thread, 0.0) + (now - begun[0] if begun else 0.0)
 
@@ -50,18 +50,18 @@ event.register("numba:compile", _COMPILING)
 
 @dataclass(frozen=True)
 class Bound:
-    """What work may use."""
+    """Limits of processor time and memory for work."""
 
-    # processor time of its own thread, but for compiling: neither what others do on the machine
-    # nor a first use makes a difference
+    # processor time of the work's own thread, without compiling, so that neither other processes
+    # nor first use matter
     seconds: float
     memory: int = sys.maxsize  # bytes of this process
-    beside: int = 0  # bytes that it holds for other work and that do not count
+    beside: int = 0  # bytes held for other work, which do not count
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """Context whose work is ended by `Exceeded` once it uses more."""
-        # That shows between two steps of the interpreter: a compiled kernel still comes to its end.
+        """Context that ends its work by `Exceeded` above the limits."""
+        # It acts between two steps of the interpreter: a compiled kernel runs to its end.
         thread, done, lock = threading.get_ident(), threading.Event(), threading.Lock()
         clock = time.pthread_getcpuclockid(thread)
 
@@ -90,18 +90,18 @@ class Bound:
             watcher.join()
 
     def told(self) -> str:
-        """What it allows, in words."""
+        """The limits in words."""
         memory = "" if self.memory == sys.maxsize else f" and {self.memory >> 20} MiB of memory"
         return f"{self.seconds:g} s of processor time{memory}"
 
 
 def held_by_others() -> int:
-    """Bytes that this process holds now for other work than pixcal's."""
+    """Bytes that this process now holds for work other than pixcal's."""
     return max(0, _resident() - OWN)
 
 
 def _beyond(memory: int) -> bool:
-    """Whether the process uses more, once free memory that it only keeps has gone back."""
+    """Whether the process uses more memory, after cached free memory was returned."""
     if _resident() <= memory:
         return False
     with suppress(AttributeError):
@@ -113,5 +113,5 @@ def _resident() -> int:
     try:
         pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
     except OSError:
-        return 0  # Another system does not tell.
+        return 0  # Not available on other systems.
     return int(pages) * os.sysconf("SC_PAGE_SIZE")

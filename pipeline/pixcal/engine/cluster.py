@@ -1,7 +1,7 @@
-"""Tasks on a cluster of Dask workers, reached by the address of its scheduler.
+"""Run tasks on a cluster of Dask workers, given the address of its scheduler.
 
-The scheduler sees a bounded number of tasks at a time, each as a few kilobytes. When a worker dies
-it gives that worker's tasks to others (`distributed.scheduler.allowed-failures` times).
+The scheduler holds a bounded number of tasks at a time, each of a few kilobytes. If a worker dies,
+the scheduler gives its tasks to others (`distributed.scheduler.allowed-failures` times).
 """
 
 import logging
@@ -27,11 +27,11 @@ from distributed.comm import CommClosedError
 from pixcal.engine.parcel import Job, RemoteTask, abandon, pack, versions
 from pixcal.model.errors import ClusterError, InputError
 
-AHEAD = 4  # tasks handed to the scheduler for each thread: it takes a while to hear that one ended
-# tasks handed over however few threads there are: a cluster that grows does so by demand
+AHEAD = 4  # tasks submitted per thread, because the end of a task is reported with a delay
+# least number of submitted tasks, so that an adaptive cluster grows by demand
 MIN_AHEAD = 32
-LOOK_S = 5.0  # time between two looks at how many threads there are
-# by these a run directory that is worked on is known (`pixcal.storage.lock`)
+LOOK_S = 5.0  # interval between checks of the number of threads
+# files that mark a run directory in use (`pixcal.storage.lock`)
 HELD = (".lock", ".partial")
 
 Ended = Callable[[int, Any], None]
@@ -39,7 +39,7 @@ Ended = Callable[[int, Any], None]
 
 @dataclass(frozen=True)
 class DaskWorker:
-    """A worker of a cluster; ``memory`` (bytes) is its limit, 0 when it has none."""
+    """A worker of a cluster; ``memory``: its limit (bytes), 0 without one."""
 
     address: str
     threads: int
@@ -47,7 +47,7 @@ class DaskWorker:
 
 
 def workers_of(address: str, *, quiet: bool) -> list[DaskWorker]:
-    """The workers that a cluster has now, at least one: it is waited for."""
+    """The present workers of a cluster; waits for at least one."""
     with _connect(address, quiet=quiet) as client:
         workers = client.scheduler_info(n_workers=-1)["workers"]
         if not workers and not quiet:
@@ -71,7 +71,7 @@ def run_on_cluster(
     at_once: int,
     quiet: bool,
 ) -> None:
-    """Do tasks on a cluster, ``at_once`` at a time in one worker process (0: one a thread).
+    """Do tasks on a cluster, ``at_once`` at a time per worker process (0: one per thread).
 
     ``ended`` gets the number and result of each. InputError: no scheduler, or workers lack files or
     versions; ClusterError: the scheduler is lost, or a task kills workers again and again.
@@ -105,7 +105,7 @@ def _connect(address: str, *, quiet: bool) -> Iterator[Client]:
             f"--cluster {address}: Dask's configuration names no certificates; give them there "
             "(distributed.comm.tls)"
         )
-    # What it says of a lost connection, and in how many lines, an exception says in one.
+    # An exception reports a lost connection in one line, instead of its many.
     log = logging.getLogger("distributed.client")
     disabled, log.disabled = log.disabled, True
     try:
@@ -130,15 +130,15 @@ def _first_line(error: BaseException) -> str:
 
 @lru_cache
 def _announce(dashboard: str, quiet: bool) -> None:
-    """Print, once, where to watch."""
+    """Print the address of the dashboard once."""
     if not quiet:
         print(f"dashboard {dashboard}", file=sys.stderr)
 
 
 @contextmanager
 def _witness(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
-    """A file in the run directory, while it is worked on: who does not see it has another disk."""
-    # A directory of the same name on the worker's own disk would do for all other checks.
+    """A temporary file in the run directory: a worker that does not see it has another disk."""
+    # A directory of the same name on the worker's own disk would pass all other checks.
     ups = (up for path in paths for up in path.parents)
     runs = (up for up in ups if all((up / name).exists() for name in HELD))
     run = next(runs, None)
@@ -153,7 +153,7 @@ def _witness(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
 
 @contextmanager
 def _ctrl_c(heard: Callable[[], None]) -> Iterator[None]:
-    """Tell of Ctrl-C beside raising it: what is raised in a callback of the library is lost."""
+    """Report Ctrl-C in addition to raising it: exceptions in the library's callbacks are lost."""
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield
@@ -171,7 +171,7 @@ def _ctrl_c(heard: Callable[[], None]) -> Iterator[None]:
 
 
 class _Tasks:
-    """Tasks of a job on a cluster, some of them at a time."""
+    """Tasks of a job on a cluster, a limited number at a time."""
 
     def __init__(
         self, client: Client, address: str, job: Job, items: Sequence[Any], name: str
@@ -209,7 +209,7 @@ class _Tasks:
             ended.update(self._submit())
 
     def _wait(self, ended: as_completed) -> list[Future]:
-        """The tasks that have ended since, at least one; as long as there is a scheduler."""
+        """Wait for at least one more task to end, as long as there is a scheduler."""
         while not ended.has_ready():
             if self._client.status != "running":
                 raise CommClosedError
@@ -224,14 +224,14 @@ class _Tasks:
         if not numbers:
             return []
         tasks = [RemoteTask(self._job, pack(self._items[n])).dumps() for n in numbers]
-        # Keys in pairs: the dashboard groups tasks by the first, and shows it up to the dash.
+        # Keys in pairs: the dashboard groups tasks by the first element, shown up to the dash.
         keys = [(self._name, n) for n in numbers]
         futures: list[Future] = self._client.map(self._do, tasks, key=keys, pure=False)
         self._running.update(futures)
         return futures
 
     def _window(self) -> int:
-        """Tasks that the scheduler may know of; more as workers come."""
+        """Number of tasks that the scheduler may hold, which grows with the workers."""
         if time.monotonic() >= self._look_again:
             at_once = self._job.at_once
             threads = self._client.nthreads().values()
@@ -256,7 +256,7 @@ class _Tasks:
         return error.with_traceback(trace)
 
     def cancel(self) -> None:
-        """Take back what has not begun, and wait for the rest: two must not write one chunk."""
+        """Cancel tasks not yet begun, and wait for the rest: two must not write one chunk."""
         if not self._running or self._client.status != "running":
             return
         with suppress(OSError, TimeoutError, CancelledError):

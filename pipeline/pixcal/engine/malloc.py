@@ -1,4 +1,4 @@
-"""Memory that a process keeps for its next task."""
+"""Settings of malloc to keep freed memory for the next task."""
 
 import ctypes
 import os
@@ -7,7 +7,7 @@ from contextlib import suppress
 # From malloc.h, see mallopt(3).
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 
-OF_THE_NANNY = "65536"  # what Dask's nanny gives its workers as MALLOC_TRIM_THRESHOLD_
+OF_THE_NANNY = "65536"  # MALLOC_TRIM_THRESHOLD_ that Dask's nanny sets for its workers
 
 
 def keep_freed_memory() -> None:
@@ -28,12 +28,12 @@ def keep_arrays() -> None:
 
 
 def _set(mmap: int, trim: int) -> None:
-    """Sizes (bytes) from which arrays are mapped by themselves, and free memory goes back."""
+    """Set sizes (bytes) above which arrays are mapped separately, and free memory is returned."""
     _mallopt(_MMAP_THRESHOLD, mmap)
     _mallopt(_TRIM_THRESHOLD, trim)
 
 
 def _mallopt(option: int, value: int) -> None:
-    # Another C library has no such function.
+    # Other C libraries lack this function.
     with suppress(AttributeError):
         ctypes.CDLL(None).mallopt(option, value)

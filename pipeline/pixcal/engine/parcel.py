@@ -1,4 +1,4 @@
-"""Tasks made ready for other processes, and what those do with them."""
+"""Serialise tasks for other processes, and run them there."""
 
 import pickle
 import platform
@@ -23,9 +23,9 @@ from pixcal.engine.malloc import keep_freed_memory
 from pixcal.model.code import code_digest
 from pixcal.model.errors import ClusterError, InputError
 
-PATIENCE_S = 1.0  # time in which a file made on one machine must show on the others
-KEPT = 2  # functions that a worker keeps unpacked: those of so many runs at the same time
-# libraries on which the last bit of a result may depend
+PATIENCE_S = 1.0  # time within which a new file must be visible on other machines
+KEPT = 2  # unpacked functions cached per worker: one for each concurrent run
+# libraries that may affect the last bit of a result
 PACKAGES = ("numpy", "scipy", "numba", "numcodecs", "zarr", "astropy")
 CODE, MACHINE = "code of pixcal", "machine"
 
@@ -34,9 +34,9 @@ CODE, MACHINE = "code of pixcal", "machine"
 class PickledArguments:
     """An object for another process."""
 
-    # the object pickled, its paths made absolute: elsewhere the current folder is another one
+    # the pickled object, with absolute paths, because the current folder differs elsewhere
     data: bytes
-    # the files and folders among those paths that exist, which must exist there as well
+    # existing files and folders among those paths, which must also exist there
     paths: tuple[Path, ...]
 
 
@@ -65,19 +65,19 @@ def pack(obj: Any) -> PickledArguments:
 
 @dataclass(frozen=True)
 class Job:
-    """What the tasks of one run have in common; unpacked once in every process."""
+    """Common part of the tasks of one run; unpacked once in every process."""
 
     function: bytes = field(compare=False)  # pickled; called with the item of a task
-    # files and folders that must exist where it is called
+    # files and folders that must exist on the worker
     paths: tuple[Path, ...] = field(compare=False)
-    # tasks that one process may do at the same time; 0 for as many as it likes
+    # most concurrent tasks per process; 0: no limit
     at_once: int = field(default=0, compare=False)
-    # what must be installed there (see `versions`)
+    # versions required on the worker (see `versions`)
     versions: dict[str, str] = field(default_factory=dict, compare=False)
     name: str = field(default_factory=lambda: uuid4().hex)
 
     def do(self) -> Callable[[bytes], Any]:
-        """What does a task of the job, given as `RemoteTask.dumps`, wherever that is called."""
+        """Function that runs a task of the job, given as `RemoteTask.dumps`, in any process."""
         return partial(pickle.loads, buffers=[self.function])
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -87,7 +87,7 @@ class Job:
 
 @dataclass(frozen=True)
 class RemoteTask:
-    """A task unpickled where it is done, so that schedulers without pixcal can hold its bytes."""
+    """A task unpickled only on the worker, so that schedulers without pixcal can hold it."""
 
     job: Job
     item: PickledArguments
@@ -96,7 +96,7 @@ class RemoteTask:
         return call, (self.job, self.item)
 
     def dumps(self) -> bytes:
-        """For `Job.do`, whose value is the task's result."""
+        """Bytes for the function of `Job.do`, which returns the task's result."""
         apart: list[pickle.PickleBuffer] = []
         return pickle.dumps(self, protocol=5, buffer_callback=apart.append)
 
@@ -124,7 +124,7 @@ def call(job: Job, item: PickledArguments) -> Any:
 
 
 def abandon(name: str) -> int:
-    """Begin no more tasks of a job in this process; returns how many are still going on."""
+    """Begin no more tasks of a job in this process; return the number still running."""
     with _counting:
         _abandoned.add(name)
         return _going_on[name]
@@ -132,19 +132,19 @@ def abandon(name: str) -> int:
 
 @lru_cache(maxsize=KEPT)
 def _open(job: Job) -> tuple[Callable[[Any], Any], AbstractContextManager[Any]]:
-    """The function of a job, and what to hold while it runs."""
+    """The function of a job, and the context in which it runs."""
     _compare(job.versions)
     _see(job.paths)
     function = cloudpickle.loads(job.function)
-    # For good, as Dask's own workers have it: nobody can tell which task ends last. Now, not
-    # earlier: the libraries that the function needs are loaded.
+    # Permanently, as in Dask's own workers, since the last task is unknown. Only now, when the
+    # libraries that the function needs are loaded.
     threadpool_limits(limits=1, user_api="blas")
     keep_freed_memory()
     return function, BoundedSemaphore(job.at_once) if job.at_once else nullcontext()
 
 
 def _see(paths: tuple[Path, ...]) -> None:
-    """Refuse work on files that are not there; network disks may show them a little late."""
+    """Refuse work on missing files; network disks may show them with a delay."""
     begin = time.monotonic()
     for path in paths:
         while not path.exists():
@@ -158,7 +158,7 @@ def _see(paths: tuple[Path, ...]) -> None:
 
 @lru_cache(maxsize=1)
 def versions() -> dict[str, str]:
-    """What must be the same wherever tasks run, lest results differ."""
+    """Versions that must agree in all processes, so that results do not differ."""
     return {
         "Python": ".".join(platform.python_version_tuple()[:2]),
         "pixcal": pixcal.__version__,
@@ -172,7 +172,7 @@ def _compare(wanted: dict[str, str]) -> None:
     if not wanted:
         return
     there = versions()
-    # On one machine the code is one, only edited since; two may have other clones of one version.
+    # One machine has one code, possibly edited; two may have different clones of one version.
     free = {MACHINE, CODE} if there[MACHINE] == wanted[MACHINE] else {MACHINE}
     for name, here in wanted.items():
         if name not in free and there[name] != here:

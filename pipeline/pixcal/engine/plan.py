@@ -10,7 +10,7 @@ from pixcal.model.errors import PlanError
 # interpreter with all libraries loaded and kernels compiled (measured, see the tests)
 BASE_BYTES = 350 << 20
 
-DASK_WORKER_BYTES = 420 << 20  # the same of a Dask worker, which lives on from stage to stage
+DASK_WORKER_BYTES = 420 << 20  # same for a Dask worker, which persists between stages
 
 USABLE = 0.8  # share of its memory limit above which a Dask worker starts no task (Dask's default)
 
@@ -32,12 +32,12 @@ class Plan:
 def make_plan(what: str, bytes_per_task: int, shared_bytes: int, runtime: Runtime) -> Plan:
     """Choose the number of workers so that the work fits the memory allowed.
 
-    Fewer than asked for are told on stderr. Raises PlanError, with both numbers, if none fits.
+    Reports a reduced number on stderr. Raises PlanError, with both numbers, if none fits.
     """
     if runtime.remote:
         return _plan_on_cluster(what, bytes_per_task, shared_bytes, runtime)
     if runtime.cluster == "processes":
-        # Each has an interpreter of its own.
+        # Each has its own interpreter.
         bytes_per_task += BASE_BYTES
     workers = runtime.n_workers
     while workers > 1 and Plan(bytes_per_task, shared_bytes, workers).total > runtime.memory:
@@ -62,13 +62,13 @@ def within_memory(what: str, bytes_per_task: int, shared_bytes: int, runtime: Ru
 
 @cache
 def _tell(note: str) -> None:
-    """On stderr, once."""
+    """Print a note on stderr, once."""
     print(note, file=sys.stderr)
 
 
 def _plan_on_cluster(what: str, bytes_per_task: int, shared_bytes: int, runtime: Runtime) -> Plan:
-    """As many tasks at a time in each worker as the one with the least memory can hold."""
-    # Here, not at the top: it takes long to import, and starts threads.
+    """As many concurrent tasks in each worker as fit in the one with the least memory."""
+    # Here, not at the top: its import is slow and starts threads.
     from pixcal.engine.cluster import workers_of
 
     make_plan(what, 0, shared_bytes, Runtime(memory=runtime.memory))

@@ -32,7 +32,7 @@ from pixcal.model.errors import ClusterError, InputError
 from pixcal.model.options import Running
 
 R = TypeVar("R")
-DEATHS = 3  # deaths of workers in a row, without a task done in between, that are put up with
+DEATHS = 3  # tolerated successive deaths of workers without a completed task in between
 
 Ended = Callable[[int, Any], None]
 
@@ -79,7 +79,7 @@ class Runtime(Running):
 
     @property
     def here(self) -> "Runtime":
-        """The same in this process, for what is too large to be sent about."""
+        """The same in this process, for data too large to send."""
         return self if self.cluster == "sync" else replace(self, cluster="threads")
 
     def with_workers(self, workers: int) -> "Runtime":
@@ -99,7 +99,7 @@ def one_blas_thread() -> AbstractContextManager[Any]:
 
 @lru_cache(maxsize=1)
 def _libraries(modules: int) -> ThreadpoolController:
-    """Libraries with threads, once for as many imported modules: to look for them takes time."""
+    """Libraries with threads, cached by the number of imported modules: the search is slow."""
     return ThreadpoolController()
 
 
@@ -182,7 +182,7 @@ def run_in_processes(
         do = job.do()
         tasks = {n: partial(do, RemoteTask(job, pack(item)).dumps()) for n, item in left.items()}
         try:
-            # One by one: a task is noted when it ends, not when some others do.
+            # One by one, so that each task is noted when it ends.
             _run_graph(
                 tasks, noted, dask.multiprocessing.get, num_workers=workers, pool=pool, chunksize=1
             )
@@ -195,7 +195,7 @@ def run_in_processes(
                     "memory?); give fewer --workers"
                 ) from error
         except BaseException:
-            # What has begun ends while this process holds its lock: two must not write one chunk.
+            # Running tasks end while this process holds its lock: two must not write one chunk.
             _process_pool.cache_clear()
             pool.shutdown(cancel_futures=True)
             raise
@@ -211,7 +211,7 @@ def _run_graph(
         if key in names:
             ended(names[key], result)
 
-    # Given, not looked up by name: for that Dask would import distributed.
+    # Passed as a function: to find it by name, Dask would import distributed.
     with Callback(posttask=posttask):
         get(graph, list(names), **options)
 
@@ -223,13 +223,13 @@ def _process_pool(workers: int) -> ProcessPoolExecutor:
 
 
 def _begin_worker() -> None:
-    # Ctrl-C reaches workers too; what to do about it is the business of the process they work for.
+    # Ctrl-C also reaches workers; their parent process handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """End when the process that this one works for was killed: nobody else would end it."""
+    """End when the parent process was killed, since nothing else would end this one."""
     parent = parent_process()
     assert parent is not None
     parent.join()

@@ -20,16 +20,16 @@ COLOURS = {"perfect": PERFECT, "measured": MEASURED}
 
 @dataclass(frozen=True)
 class AstrometryView:
-    """What the picture shows."""
+    """Contents of the figure."""
 
     result: Mapping[str, Any]  # `astrometry.json`
-    target_px: float  # what the mission needs
+    target_px: float  # requirement of the mission
     # rows: case, axis, error on a perfect grid, error with the maps, gain
     table: Sequence[Sequence[str]]
     photons: F64  # (2, n) electrons, and the bound of a centroid from photon noise, px
-    weights: F64  # (y, x) what each pixel tells of the first axis of a star in the middle, sum 1
+    weights: F64  # (y, x) weight of each pixel along the first axis of a centred star, sum 1
     # (grid, y, x) error along the first axis of a star in the middle of each pixel, px; NaN
-    # where none is
+    # without a star
     detail: F64
     detail_at: tuple[int, int]  # first row and column of it
     rms: F64  # (grid, y, x) of the errors, over blocks of the whole detector, px

@@ -1,4 +1,4 @@
-"""The figure of a budget: precision against frames, and which change of the bench helps most."""
+"""The figure of a budget: precision against frames, and the gain of changes of the bench."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -81,7 +81,7 @@ def _precision(axes: Axes, result: Mapping[str, Any]) -> None:
     wanted, given = result["precision_px"], result["frames"]
     frames = _span(sets, joined, result)
     for order, (line, colour) in enumerate(zip(sets, cycle(COLOURS), strict=False)):
-        # Sets are often alike: the later ones are thinner, so that none is hidden.
+        # Sets are often alike: later ones are thinner, so that none is hidden.
         before = len(sets) - 1 - order
         bound = line.median / np.sqrt(frames)
         axes.plot(frames, bound, color=colour, lw=2.0 + 3.0 * before, label=line.label)

@@ -16,11 +16,11 @@ BLUE = "#2667b0"
 RED = "#c1431f"
 GREEN = "#1b8a5a"
 GREY = "#7d8896"
-# one for each map or set that is drawn in the same axes
+# one for each map or set in the same axes
 LINES = (BLUE, RED, GREEN, INK)
 # bars of histograms
 BAR = "#b9cbe4"
-# what chance allows
+# range expected by chance
 BAND = "#dfe3e9"
 UNFLAGGED = "#eef1f5"
 SEVERAL = "#000080"

@@ -30,7 +30,7 @@ LINES = 1500  # most means of a profile that are drawn with an error each
 
 @dataclass(frozen=True)
 class ComponentView:
-    """What the figure shows of one component."""
+    """Contents of the figure for one component."""
 
     name: str
     window: tuple[int, int]  # (y, x), px
@@ -111,7 +111,7 @@ def _scales(axes: Axes, view: ComponentView) -> None:
         [s["common"]["variance_px2"] > 2 * s["common"]["variance_error_px2"] for s in scales], bool
     )
     beyond = np.array([s["significance"] > 3 for s in scales], bool)
-    # Upper limits as arrows, where nothing is significant.
+    # Upper limits as arrows, if not significant.
     top = line("upper_px", "common")[~seen]
     axes.plot(at[~seen], top, marker=r"$\downarrow$", color=INK, ms=11, ls="none")
     for which, key, marker, colour, label in (
@@ -140,7 +140,7 @@ def _round_off(axes: Axes, values: F64) -> None:
 
 
 def _places(figure: SubFigure, axes: Axes, view: ComponentView) -> None:
-    """Blocks: by how many sigma their means differ; those whose pixels scatter are framed."""
+    """Significance of the mean difference of each block; blocks with excess scatter are framed."""
     (ny, nx), side = view.window, view.facts["blocks"]["side_px"]
     scattered = np.argwhere(np.nan_to_num(view.scatter) > SHIFT_SPAN)
     drawn = draw_blocks(
@@ -163,7 +163,7 @@ def _places(figure: SubFigure, axes: Axes, view: ComponentView) -> None:
 
 
 def _profile(axes: Axes, profile: tuple[F64, F64], label: str, view: ComponentView) -> None:
-    """Mean difference of every column or row, over what noise gives."""
+    """Mean difference of every column or row, over that expected from noise."""
     mean, error = profile
     known = error[np.isfinite(error)]
     unit = unit_for([np.median(known)] if len(known) else [], "px")

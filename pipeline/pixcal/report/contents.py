@@ -1,4 +1,4 @@
-"""Contents of a report, as plain data: read by the stage, drawn by the page."""
+"""Contents of a report as plain data, which the stage reads and the page draws."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -74,7 +74,7 @@ class DetectorContents:
 
     def shown(self) -> list[tuple[str, str, MapSummary]]:
         """Title, unit and summary of each map that was measured."""
-        # A map of one value is what the reduction takes where there are no frames.
+        # Without frames, the reduction assumes a map of one value.
         there = {key: self.maps[key] for key in DETECTOR_MAPS if key in self.maps}
         return [(*DETECTOR_MAPS[key], m) for key, m in there.items() if m.std > 0]
 
@@ -87,10 +87,10 @@ class DiagnosisContents:
     # of `curves.json`: each statistic as measured, as simulated, and with the effects
     curves: Sequence[dict[str, Any]]
     titles: Mapping[str, str]  # of the effects of pixcal, by name
-    # significance (sigma) from which a statistic counts as different; that of the curves allows
-    # for how many were tested
+    # significance (sigma) above which a statistic differs; that of the curves is corrected for
+    # the number of statistics
     noticed: float
-    settled: bool = False  # whether no cause asks for anything to be done
+    settled: bool = False  # whether no cause requires action
 
 
 @dataclass(frozen=True)
@@ -116,13 +116,13 @@ class Contents:
     detector: DetectorContents = field(default_factory=DetectorContents)
     fit: dict[str, Any] | None = None  # `fit.json`
     offsets: tuple[MapContents, ...] = ()
-    corrected: tuple[MapContents, ...] = ()  # freed of the causes, where there is one to correct
+    corrected: tuple[MapContents, ...] = ()  # corrected for the causes, if there are any
     sets: tuple[SetContents, ...] = ()
     flags: FlagSummary | None = None  # of the products
-    diagnosis: DiagnosisContents | None = None  # where the run was diagnosed
-    warnings: tuple[str, ...] = ()  # sentences that the stages left
-    advice: tuple[str, ...] = ()  # which map to use, and what limits it
-    # what each cause does to the map, and what is done about it; the header first
+    diagnosis: DiagnosisContents | None = None  # if the run was diagnosed
+    warnings: tuple[str, ...] = ()  # warnings of the stages
+    advice: tuple[str, ...] = ()  # which map to use, and its limits
+    # effect of each cause on the map, and its treatment; the header first
     causes: tuple[tuple[str, ...], ...] = ()
 
     @property
@@ -147,7 +147,7 @@ class Contents:
         return list(given[0] or ()) if given else []
 
     def masks(self) -> dict[str, FlagSummary]:
-        """Every mask there is, by title."""
+        """All masks by title."""
         masks = {f"set {s.name}": s.flags for s in self.sets}
         if self.detector.flags is not None:
             masks = {"calibration frames": self.detector.flags} | masks

@@ -16,7 +16,7 @@ from pixcal.model.arrays import F64, I64, Indices, Mask
 from pixcal.report.colours import BLUE, GREY, INK, RED, SEQUENTIAL
 from pixcal.report.drawing import WIDE, draw_blocks, finish, new_figure, note
 
-LONG_TITLE = 10  # points, so that numbers of many digits stay within their panel
+LONG_TITLE = 10  # points, so that long numbers stay within their panel
 CREST, VALLEY = RED, BLUE
 
 
@@ -30,7 +30,7 @@ class Extract:
 
 @dataclass(frozen=True)
 class CrestView:
-    """What the figure shows of one fringe set."""
+    """Contents of the figure for one fringe set."""
 
     name: str
     frame: tuple[int, int]  # (y, x) size, px
@@ -45,11 +45,11 @@ class CrestView:
     extracts: tuple[Extract, ...]  # about the first and the last path
     best: tuple[float, float]  # distance and baseline of the minimum, mm
     distance_sigma: float  # mm
-    distance_from_prior: bool  # whether that is mostly the error of the bench's nominal value
+    distance_from_prior: bool  # whether the prior dominates this error
 
     @property
     def used(self) -> Mask:
-        """Points (point,) that are no outliers."""
+        """Points (point,) that are not outliers."""
         return self.arrays["used"] > 0
 
     @cached_property
@@ -87,7 +87,7 @@ def crest_figure(view: CrestView) -> Figure:
 
 def outermost(k: I64) -> tuple[I64, I64]:
     """Numbers of the paths to show, of the first and of the last."""
-    # Paths through a corner of a turned frame are too short to show their shape.
+    # Paths through a corner of a rotated frame are too short to show their shape.
     paths, number = np.unique(k, return_counts=True)
     long = paths[number >= 0.5 * number.max()]
     shown = min(4, max(1, len(long) // 2))  # paper, figure 16
@@ -99,7 +99,7 @@ def _colour(k: int) -> str:
 
 
 def _stretched(axes: Axes, view: CrestView, paths: I64, title: str) -> None:
-    """Shapes of some paths side by side: position across the fringes less its mean."""
+    """Shapes of given paths side by side: position across the fringes less its mean."""
     across, along = view.turned
     chosen = {int(k): (on := view.on(k))[view.used[on]] for k in paths}
     reach = max([float(np.ptp(across[on])) for on in chosen.values() if len(on)], default=0.0)

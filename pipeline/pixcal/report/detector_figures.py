@@ -47,7 +47,7 @@ def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
         if saturation is not None:
             axes.axvline(saturation, color=RED, ls="--", lw=1, label="saturation")
         finish(axes, xlabel="level (ADU)")
-    # Empty room above the rising points, for the legend.
+    # Empty space above the rising points, for the legend.
     left.set_ylim(top=4 * left.get_ylim()[1])
     left.legend(fontsize=9, frameon=False, loc="upper left")
     return figure

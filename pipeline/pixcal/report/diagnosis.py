@@ -30,8 +30,8 @@ from pixcal.report.text import (
 Facts = Mapping[str, Any]
 
 SHOWN = 12  # rows of a table that are not folded
-PLOTS = 3  # statistics that are drawn for each cause, and of what remains
-LISTED = 8  # numbers of a list that are shown one by one
+PLOTS = 3  # statistics that are drawn for each cause, and for the residual gap
+LISTED = 8  # most numbers of a list that are shown individually
 
 
 # Causes
@@ -51,7 +51,7 @@ def causes(result: DiagnosisContents) -> Table:
 
 
 def about_cause(cause: Facts) -> str:
-    """What an effect is, its evidence, and its law with the share that this closes by itself."""
+    """Description of an effect, its evidence, and its law with the share that it closes."""
     sentences = [cause["about"]]
     if evidence := cause.get("why"):
         sentences.append(f"Evidence: {evidence.rstrip('.')}.")
@@ -79,7 +79,7 @@ def evidence(result: DiagnosisContents, cause: Facts) -> list[Facts]:
 def parameters(cause: Facts) -> Iterator[tuple[str, Table]]:
     """Parameters with their errors; lists of like mappings have tables of their own."""
     errors, values = cause["uncertainty"], cause["parameters"]
-    # What was measured frame by frame replaces the law, whose strengths are zero then.
+    # A replay frame by frame replaces the law, whose strengths are then zero.
     replayed = any(is_table(value) and "value" in value[0] for value in values.values())
     rows = []
     for name, value in values.items():
@@ -113,7 +113,7 @@ def _fitted(name: str, value: Any, errors: Facts) -> str:
 
 
 def _list_of(name: str, entries: Sequence[Facts], errors: Facts) -> tuple[Table, str]:
-    """A list of like mappings, and what is the same in all of them."""
+    """Table of a list of like mappings, and the values common to all."""
     keys = list(dict.fromkeys(key for entry in entries for key in entry))
     fitted = {k for k in keys if any(f"{name}[{n}].{k}" in errors for n in range(len(entries)))}
 
@@ -138,7 +138,7 @@ def _is_long(value: Any) -> bool:
 
 
 def _in_short(value: Any) -> str:
-    """A value in full; of a long list of numbers how many there are, their range and rms."""
+    """A value in full; for a long list of numbers their count, range and rms."""
     if isinstance(value, list) and not _is_long(value):
         return ", ".join(number(one) if isinstance(one, float) else exact(one) for one in value)
     if not _is_long(value):

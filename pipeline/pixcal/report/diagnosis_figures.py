@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: the gap by domain, what each cause closes, statistics as three curves."""
+"""Figures of a diagnosis: gap by domain, share closed by each cause, curves of statistics."""
 
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,16 +16,16 @@ from pixcal.report.diagnosis_words import DETECTOR, axis_label, effect_title, pe
 from pixcal.report.drawing import TITLE, WIDE, Unit, axes_grid, finish, note, plain_ticks, unit_for
 from pixcal.report.text import unit
 
-ROOM = 50  # letters that fit below a panel; where names of places have more, they are turned
-SPAN = 12.0  # ratio of values from which an axis is logarithmic
+ROOM = 50  # letters that fit below a panel; longer tick labels are rotated
+SPAN = 12.0  # ratio of values above which an axis is logarithmic
 QUIET = 5.0  # least half height of the axis of deviations, sigma
 ORDER = ("measured", "nominal simulation", "with the causes")
-BESIDE = 0.2  # how far simulations are drawn from the data's place, where places are not numbers
+BESIDE = 0.2  # offset of simulations from the data, if abscissae are names
 
 
 @dataclass(frozen=True)
 class Bar:
-    """A share of the gap, before and after, and the interval of what is left where it is known."""
+    """A share of the gap, before and after, and the interval of the residual if known."""
 
     name: str
     before: float
@@ -34,7 +34,7 @@ class Bar:
 
 
 def gap(result: DiagnosisContents) -> Figure:
-    """The gap by domain, what differs only with the causes, and the share of each cause."""
+    """The gap by domain, differences that appear only with the causes, and share of each cause."""
     facts, causes = result.facts["gap"], result.facts["causes"]
     low, high = facts["interval"]
     whole = Bar("all", facts["total"], facts["after"], (low, high))
@@ -47,7 +47,7 @@ def gap(result: DiagnosisContents) -> Figure:
 
 
 def gap_figure(bars: Sequence[Bar], causes: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """The gap by domain, before and after, and beside it what each cause closes, by its title."""
+    """The gap by domain, before and after, and beside it the share closed by each cause."""
     size = WIDE, 1.6 + 0.5 * max(len(bars), len(causes))
     margin = _room(_domain_names(bars))
     if not causes:
@@ -129,7 +129,7 @@ def _room(names: Sequence[str]) -> float:
 def curves_figure(curves: Sequence[Mapping[str, Any]], *, with_effects: bool = True) -> Figure:
     """Statistics side by side (up to three): above the values, below their deviations."""
     named = [places(c) for c in curves if _is_named(c)]
-    # room for the longest of the names that are written upwards, inches
+    # space for the longest rotated label, inches
     turned = max(
         [0.075 * min(len(n), 12) for names in named if _turned(names) for n in names] or [0]
     )
@@ -194,7 +194,7 @@ def _simulated(
         )  # fmt: skip
         return
     axes.fill_between(x, low, high, color=colour, alpha=0.25, lw=0)
-    # The nominal curve shows below one that lies on it.
+    # The nominal curve stays visible below one that coincides with it.
     width = 3.0 if colour == RED else 1.4
     axes.plot(x, band["value"], color=colour, lw=width, label=label)
 
@@ -251,7 +251,7 @@ def _turned(names: Sequence[str]) -> bool:
 
 
 def _is_named(curve: Mapping[str, Any]) -> bool:
-    """Whether places have names, or count things; else they are frequencies."""
+    """Whether abscissae are names or counts; otherwise they are frequencies."""
     x = _numbers(curve["x"])
     return not (str(curve["x_label"]).startswith("cycles a ") and len(x) > 1 and x.min() > 0)
 
@@ -262,7 +262,7 @@ def _numbers(values: Sequence[Any]) -> F64:
 
 
 def _plain(text: str, most: int) -> str:
-    """Foreign text in a figure: one line, not too long, no formulas, letters that are there."""
+    """External text for a figure: one short line, no formulas, available letters."""
     line = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     short = line if len(line) <= most else line[: most - 1] + "…"
     return short.replace("$", r"\$")

@@ -14,9 +14,9 @@ from pixcal.report.colours import DIVERGING, GREY, INK
 from pixcal.report.drawing import TITLE, WIDE, axes_grid
 
 CELLS = "cell of 4 × 4"  # `x_label` of curves whose values are cells of the window
-ASIDE = 3.0  # standard deviations below which a map is not worth looking at
-LARGEST = 12.0  # standard deviations at which colours end
-# least side of a window in the picture, share of the detector's: real ones would be dots
+ASIDE = 3.0  # standard deviations below which a map is not shown
+LARGEST = 12.0  # standard deviations at the end of the colour scale
+# least side of a drawn window, share of the detector's: true windows would be dots
 SMALLEST = 0.17
 
 

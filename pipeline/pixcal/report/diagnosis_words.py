@@ -7,7 +7,7 @@ from typing import Any
 from pixcal.report.contents import DiagnosisContents
 from pixcal.report.text import number
 
-# what `curves.json` has for the name of a set where a curve is of no single set
+# name of the set in `curves.json` for a curve that is not of a single set
 DETECTOR = "detector"
 _STEPS = ("x+1", "y+1", "x+1 y+1", "x−1 y+1", "x+2", "y+2", "x+3", "y+3", "x+4", "y+4")
 
@@ -36,14 +36,14 @@ def listed(names: Iterable[str], last: str = "and") -> str:
 
 
 def effect_title(diagnosis: DiagnosisContents, name: str) -> str:
-    """An effect in a few words and its name: own effects are known by the causes alone."""
+    """Title and name of an effect; titles of users' own effects are only in the causes."""
     given = {c["effect"]: c["title"] for c in diagnosis.facts["causes"]}
     title = given.get(name) or diagnosis.titles.get(name)
     return f"{title} ({name})" if title else name
 
 
 def level(diagnosis: DiagnosisContents) -> str:
-    """Severity of a verdict; causes that were identified may ask for something to be done."""
+    """Severity of a verdict; identified causes may require action."""
     verdict = diagnosis.facts["verdict"]
     if verdict == "unexplained":
         return "bad"
@@ -86,18 +86,18 @@ def answer(diagnosis: DiagnosisContents) -> str:
 
 
 def considered(facts: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Candidates, without those that show in fringes alone where there are none."""
+    """Candidates; without fringes, excluding those that show only in fringes."""
     sets = facts.get("looked_at", {}).get("sets", True)
     return [c for c in facts["candidates"] if sets or "fringes would" not in c["rejected_because"]]
 
 
 def _shared(facts: Mapping[str, Any]) -> bool:
-    """Whether some frames were too few to fit effects on one half and test them on the other."""
+    """Whether any frames were too few to fit effects to one half and test them on the other."""
     return bool(facts.get("looked_at", {}).get("shared"))
 
 
 def _main_domain(gap: Mapping[str, Any], *, residual: bool) -> str:
-    """', mostly in noise', or an empty text where no domain dominates."""
+    """', mostly in noise', or an empty text if no domain dominates."""
     shares = {domain: ends[residual] for domain, ends in gap.get("domains", {}).items()}
     whole = sum(shares.values())
     most = max(shares, key=lambda d: shares[d], default="")
@@ -105,7 +105,7 @@ def _main_domain(gap: Mapping[str, Any], *, residual: bool) -> str:
 
 
 def worst(curve: Mapping[str, Any]) -> int:
-    """Number of the value that differs most; with effects, where only they make it differ."""
+    """Index of the value that differs most; with effects, if it differs only with them."""
     sigmas = curve["z"] if curve["in_gap"] else curve["z_after"]
     return max(range(len(sigmas)), key=lambda n: abs(sigmas[n]))
 
@@ -115,7 +115,7 @@ def worst(curve: Mapping[str, Any]) -> int:
 
 @dataclass(frozen=True)
 class _Axis:
-    """The places of a curve: the label of the axis, a place within a sentence, its names."""
+    """Abscissae of a curve: label of the axis, wording within a sentence, names."""
 
     label: str
     phrase: str
@@ -131,7 +131,7 @@ _CELLS = tuple(f"{row},{column}" for row in range(1, 5) for column in range(1, 5
 _TERMS = tuple(f"{of} {f} {n}φ" for of in "VB" for n in ("", 2, 3) for f in ("cos", "sin"))
 _SIGMAS = ("−5", "−7", "−10", "+5", "+7", "+10")
 
-# by `x_label` of `curves.json`, where numbers alone would say little
+# by `x_label` of `curves.json`, for which numbers alone are not informative
 _AXES = {
     "neighbour": _Axis("neighbour", "neighbour {}", _STEPS),
     "far neighbour": _Axis("neighbour", "neighbour {}", _STEPS[4:]),
@@ -160,7 +160,7 @@ _AXES = {
 
 
 def axis_label(curve: Mapping[str, Any]) -> str:
-    """What the places of a curve are."""
+    """Label of the abscissae of a curve."""
     label = str(curve["x_label"])
     return _AXES[label].label if label in _AXES else label.replace(" a ", " per ")
 

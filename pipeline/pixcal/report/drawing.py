@@ -1,4 +1,4 @@
-"""What all figures share: axes, colour scales, units, and the PNG.
+"""Common parts of all figures: axes, colour scales, units, and the PNG.
 
 Figures are made without pyplot: no state is global, so threads do not interfere.
 """
@@ -27,7 +27,7 @@ from pixcal.report.text import exact
 
 WIDE = 10.4  # width of a figure that takes the whole page, inches
 DPI = 130
-# of titles at a fixed height: the labels around them need not be measured
+# style of titles at a fixed height, so that labels around them need not be measured
 TITLE: dict[str, Any] = {"fontsize": 11, "y": 1.0}
 
 
@@ -35,7 +35,7 @@ TITLE: dict[str, Any] = {"fontsize": 11, "y": 1.0}
 class Unit:
     """A unit with its power of ten, for axes whose numbers stay short."""
 
-    factor: float  # what values are multiplied by
+    factor: float  # factor on values
     label: str  # E.g. `10⁻³ px`
 
 
@@ -163,12 +163,12 @@ def draw_blocks(
 def note(
     axes: Axes, text: str, at: tuple[float, float], aside: tuple[float, float], **style: Any
 ) -> None:
-    """A text beside a place, at a distance (right, up) in points."""
+    """A text at a distance (right, up) from a place, in points."""
     axes.annotate(text, at, aside, textcoords="offset points", **style)
 
 
 def second_axis(axes: Axes, side: Literal["top", "right"], factor: float) -> Any:
-    """The same axis once more, its numbers times a factor."""
+    """A second axis with the numbers times a factor."""
     functions = (lambda v: np.asarray(v) * factor, lambda v: np.asarray(v) / factor)
     if side == "top":
         return axes.secondary_xaxis("top", functions=functions)
@@ -184,7 +184,7 @@ def covered(
 
 
 def block_note(summary: MapSummary) -> str:
-    """How pixels were averaged for the figure; empty where they were not."""
+    """Note on the averaging of pixels for the figure; empty without averaging."""
     n = summary.block
     return f"mean of {n} × {n} px" if n > 1 else ""
 

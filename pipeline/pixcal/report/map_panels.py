@@ -1,4 +1,4 @@
-"""Maps as parts of the page: an image of one pixel a block, with axes and colour bar in SVG.
+"""Maps as parts of the page: an image with one pixel per block, axes and colour bar in SVG.
 
 The browser enlarges the image. Matplotlib would take 80 ms for each map with its colour bar.
 """
@@ -51,7 +51,7 @@ class Panel:
     labels: tuple[str, str]  # of x and y
     x: Ticks
     y: Ticks
-    bar: str = ""  # data URL of the colour bar; empty where colours are classes
+    bar: str = ""  # data URL of the colour bar; empty if colours are classes
     label: str = ""  # quantity and unit of the colours
     colours: Ticks = field(default_factory=list)
     beyond: str = "neither"  # ends of the colours that values exceed: neither, min, max, both
@@ -83,7 +83,7 @@ def _image(classes: U8, colours: Sequence[str]) -> str:
 
 
 def scaled(image: NDArray[np.floating], low: float, high: float, *, log: bool = False) -> U8:
-    """Number of the colour of each value; the one after the last where there is no value."""
+    """Index of the colour of each value; one past the last if there is no value."""
     ends = np.log([low, high]) if log else np.array([low, high])
     with np.errstate(invalid="ignore", divide="ignore"):
         values = np.log(image) if log else image.astype(float)
@@ -198,7 +198,7 @@ def folded(frequency: F64) -> F64:
 
 
 def flags(masks: Mapping[str, FlagSummary]) -> tuple[list[Panel], Legend]:
-    """Maps of flags; those that are the same are drawn once."""
+    """Maps of flags; identical ones are drawn once."""
     # Pixel by pixel each flag has its colour; of larger maps the share of masked pixels is shown.
     most = 100 * max(float(s.share.max()) for s in masks.values()) or 1.0
     merged: dict[tuple[bytes, tuple[int, ...]], tuple[list[str], FlagSummary]] = {}

@@ -1,7 +1,7 @@
-"""Maps of any size, reduced in one pass over bands of rows to what a figure shows.
+"""Reduce maps of any size to the contents of a figure, in one pass over bands of rows.
 
-A map of 46 Mpix does not fit a page: it is shown as means of n × n pixels. Profiles, counts and
-spectra use every pixel they are said to use.
+A map of 46 Mpix does not fit on a page: it is shown as means of n × n pixels. Profiles, counts and
+spectra use all pixels.
 """
 
 from collections.abc import Iterator
@@ -72,12 +72,12 @@ class Profile:
 
     mean: F64  # (n,) NaN where no pixel is good
     scatter: F64  # (n,) standard deviation of the pixels that were averaged
-    count: I64  # (n,) how many they were
+    count: I64  # (n,) number of averaged pixels
 
 
 @dataclass(frozen=True)
 class MapSummary:
-    """What is shown of a map."""
+    """Contents of a figure of a map."""
 
     shape: tuple[int, int]  # of the map, pixels
     block: int  # side of the blocks of pixels that `image` averages
@@ -135,14 +135,14 @@ def bands(source: Source, side: int = 1) -> Iterator[tuple[int, NDArray[Any]]]:
 
 
 def summarise(source: Source, most: int = SHOWN_PIXELS) -> MapSummary:
-    """What is shown of a map in ``most`` blocks a side; values that are not finite are masked."""
+    """Summarise a map in at most ``most`` blocks a side; non-finite values are masked."""
     ny, nx = source.shape
     side = block_side((ny, nx), most)
     step = _sample_step(ny * nx, nx)
     image, samples = [], []
     columns = np.zeros((3, nx))
     rows = np.zeros((3, ny))
-    # Sums are taken about a first value: pixels that hardly differ must not cancel.
+    # Sums are relative to a first value, to avoid cancellation of nearly equal pixels.
     origin: float | None = None
     for y0, values in bands(source, side):
         good = np.isfinite(values)
@@ -192,7 +192,7 @@ class Spectrum:
 
     # (my, mx) px² per (cycle/px)², zero frequency in the middle; its mean is the map's variance
     power: F64
-    white: float  # what the map's errors alone would give, at every frequency
+    white: float  # power expected from the map's errors alone, at every frequency
     windows: int  # windows averaged
 
     @property
@@ -272,7 +272,7 @@ def detail(delta: Source, sigma: Source) -> Detail:
 
 @dataclass(frozen=True)
 class FlagSummary:
-    """What is shown of a map of flags."""
+    """Contents of a figure of a map of flags."""
 
     shape: tuple[int, int]
     block: int
@@ -283,7 +283,7 @@ class FlagSummary:
 
 
 def summarise_flags(source: Source, most: int = SHOWN_PIXELS) -> FlagSummary:
-    """Reduce a map of flags (uint8 bits) to what is shown of it."""
+    """Summarise a map of flags (uint8 bits)."""
     ny, nx = source.shape
     side = block_side((ny, nx), most)
     columns = np.arange(0, nx, side)

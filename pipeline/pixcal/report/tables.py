@@ -61,7 +61,7 @@ def allan(measured: Sequence[SetContents]) -> Table:
 
 
 def flags(masks: Mapping[str, FlagSummary]) -> Table:
-    """How many pixels have each flag, one column each mask."""
+    """Number of pixels with each flag, one column per mask."""
     rows = []
     fitted = any(title.startswith("set ") for title in masks)
     for flag in PixelFlag:
@@ -149,7 +149,7 @@ def saturation(facts: Mapping[str, Any]) -> float | None:
 
 
 def patterns(curves: Mapping[str, Any]) -> dict[str, Any]:
-    """What was measured of DSNU and PRNU."""
+    """Measured patterns of DSNU and PRNU."""
     return {key.upper(): curves[key] for key in ("dsnu", "prnu") if key in curves}
 
 
@@ -200,7 +200,7 @@ def is_table(value: Any) -> bool:
 
 
 def _stages(stages: Sequence[StageRecord]) -> Iterator[Table]:
-    """What each stage was made from, by key; and the digests of the files."""
+    """Inputs of each stage, by key; and the digests of the files."""
     present = {stage.name: stage.key for stage in stages}
     rows, files = [], []
     for stage in stages:

@@ -76,7 +76,7 @@ def _grouped(text: str) -> str:
     return text.replace(",", "\u202f").replace("-", "−")
 
 
-# share of a value below which an error says nothing of a measurement
+# share of a value below which an error is not that of a measurement
 SMALLEST = 1e-9
 
 
@@ -116,7 +116,7 @@ _NOTATION = {
 
 
 def sigmas(value: float | None) -> str:
-    """A significance; beyond a thousand sigma the number says nothing more."""
+    """A significance; limited to a thousand sigma, beyond which numbers are meaningless."""
     if value is None:
         return "–"
     return "> 1000 σ" if value > 1000 else f"{number(float(value), 2)} σ"

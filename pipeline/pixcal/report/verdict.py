@@ -11,7 +11,7 @@ from pixcal.report.text import NAMES, NO_OFFSETS, duration, number, share, unit,
 
 TARGET_PX = 5e-5  # target precision of a calibration (paper, section 4.2)
 
-# a place of the fibres that a laboratory would notice: twice its 2 cm (paper, section 5.2)
+# offset of the fibres that a laboratory would notice: twice its 2 cm (paper, section 5.2)
 FAR_MM = 40.0
 
 GOOD, CHECK, BAD = SEVERITY = ("good", "check", "bad")
@@ -97,7 +97,7 @@ def cards(contents: Contents) -> Iterator[Card]:
 
 
 def _detector_cards(facts: dict[str, Any]) -> Iterator[Card]:
-    """What a data sheet begins with."""
+    """Key numbers of a data sheet."""
     figures = facts.get("figures_of_merit") or {}
     for key in ("conversion_gain", "read_noise", "full_well", "dynamic_range", "dsnu", "prnu",
                 "dark_current"):  # fmt: skip

@@ -1,12 +1,12 @@
-"""Versioned artefacts: what a stage leaves on disk (docs/explanation/artefacts.md).
+"""Versioned artefacts: results of a stage on disk (docs/explanation/artefacts.md).
 
 An artefact, a directory ``RUN/<stage>`` with a ``manifest.json``, is built in
 ``RUN/.partial/<stage>-<key>`` and renamed when complete. The key is a digest of all that the result
 depends on: options, inputs, format, and the version of pixcal. A killed build with the same key,
 begun by the same code to the letter, is resumed; others are removed when one completes.
 
-An artefact may be complete before it is on the disk (`unflushed`): until then it holds a mark with
-the boot of the machine, and after another boot it is damaged. What is damaged is noted in the
+An artefact may be complete before it is flushed to disk (`unflushed`). Until then it holds a mark
+with the boot of the machine, and counts as damaged after another boot. Damage is noted in the
 artefact (`pixcal.storage.manifest`), and its stage makes it again.
 """
 
@@ -46,7 +46,7 @@ _KEY_IN_NAME = 16
 
 @dataclass
 class Build:
-    """An artefact in the making."""
+    """An artefact under construction."""
 
     folder: Path  # where to write; becomes `RUN/<stage>` when complete
     cubes: Place  # where to write cubes: `folder`, unless they go elsewhere
@@ -57,23 +57,22 @@ class Build:
 
     @property
     def scratch(self) -> Path:
-        """Folder for what only the build itself needs."""
+        """Folder for temporary files of the build."""
         return self.folder / SCRATCH
 
     def discard(self) -> None:
-        """Remove all that was written: the next run begins again."""
+        """Remove everything written: the next run starts from the beginning."""
         discard(self.folder, self.folder.parents[1])
 
     def journal(self) -> set[str]:
         """Steps noted as done by an earlier, interrupted build."""
-        # Only those of this run of the machine: after a power failure nobody knows what reached the
-        # disk.
+        # Only steps of the present boot: after a power failure, data may not have reached the disk.
         path = self.folder / JOURNAL
         if not path.exists():
             return set()
         done = set()
         for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-            # The last line may have been cut by a kill: what does not parse was not done.
+            # A kill may have cut the last line: a line that does not parse was not done.
             try:
                 step = json.loads(line)
                 if step["boot"] == boot():
@@ -83,7 +82,7 @@ class Build:
         return done
 
     def note(self, step: str) -> None:
-        """Note a step as done. Call it when all that the step wrote is in place."""
+        """Note a step as done. Call it when all output of the step is in place."""
         with (self.folder / JOURNAL).open("a", encoding="utf-8") as file:
             file.write("\n" + json.dumps({"done": step, "boot": boot()}) + "\n")
 
@@ -92,12 +91,12 @@ Workspace = Build | MemoryBuild  # where a stage writes
 
 
 def artefact_key(stage: str, format: int, config: dict[str, Any], inputs: dict[str, str]) -> str:
-    """Digest of what a stage's result depends on."""
+    """Digest of everything on which a stage's result depends."""
     return digest(stage, format, __version__, config, inputs)
 
 
 def up_to_date(run: Path, stage: str, key: str) -> Manifest | None:
-    """The manifest of ``RUN/<stage>`` when it was made from just these inputs and is whole."""
+    """The manifest of ``RUN/<stage>`` if it was made from exactly these inputs and is whole."""
     try:
         manifest = read_manifest(run / stage)
         if manifest is None or manifest.key != key:
@@ -118,7 +117,7 @@ def build(
     *,
     cubes: Place | None = None,
 ) -> Iterator[Build]:
-    """Build an artefact aside and put it in place when the block ends without an exception.
+    """Build an artefact aside and move it into place when the block ends without an exception.
 
     If it raises, the next build with the same key resumes, or begins anew if a chunk is not as it
     was written. An artefact with another key stays until the new one is complete. ``cubes``: folder
@@ -134,7 +133,7 @@ def build(
     settle(folder, run, cubes)
     made = Build(folder, cubes_of(folder), key, resumed)
     yield made
-    # What is called complete must be on the disk, not on its way to it.
+    # A complete artefact must be flushed to disk.
     if _later.get():
         write_whole(folder / UNFLUSHED, boot().encode())
         flush_file(folder)
@@ -151,7 +150,7 @@ def build(
     if final.exists():
         final.rename(old)
     folder.rename(final)
-    # Only now: killed before, the build is resumed, with every step noted as done.
+    # Only now: if killed before, the build resumes with every step noted as done.
     tidy(final)
     for left in [old, *folder.parent.glob(f"{stage}-{'[0-9a-f]' * _KEY_IN_NAME}")]:
         discard(left, run)
@@ -163,8 +162,8 @@ _later: ContextVar[bool] = ContextVar("_later", default=False)
 
 @contextmanager
 def unflushed() -> Iterator[None]:
-    """Complete artefacts before they are on the disk; `settle_flush` ends that for each."""
-    # The disk goes on with one while the next is being made.
+    """Complete artefacts before they are flushed to disk; `settle_flush` flushes each."""
+    # The disk writes one artefact while the next is computed.
     token = _later.set(True)
     try:
         yield
@@ -180,7 +179,7 @@ def _flush(folder: Path) -> None:
 
 
 def settle_flush(run: Path) -> None:
-    """See to it that the artefacts of a run are on the disk, unless inside `unflushed`."""
+    """Flush the artefacts of a run to disk, unless inside `unflushed`."""
     for mark in run.glob(f"*/{UNFLUSHED}"):
         if not _later.get() and mark.read_bytes() == boot().encode():
             _flush(mark.parent)
@@ -188,7 +187,7 @@ def settle_flush(run: Path) -> None:
 
 
 def _whole(folder: Path) -> bool:
-    """Whether the local chunks that an interrupted build has left are as it wrote them."""
+    """Whether the local chunks of an interrupted build are unaltered."""
     from pixcal.storage.cube import chunks_whole  # here: the command line does without zarr
 
     places = {folder, cubes_of(folder)}
@@ -196,12 +195,12 @@ def _whole(folder: Path) -> bool:
 
 
 def discard(folder: Path, run: Path) -> None:
-    """Remove an artefact that is of no use any more, and its cubes elsewhere."""
+    """Remove an obsolete artefact, and its cubes elsewhere."""
     remove_cubes(folder, run)
     shutil.rmtree(folder, ignore_errors=True)
 
 
 def tidy(folder: Path) -> None:
-    """Remove from a complete artefact what only its build needed."""
+    """Remove temporary files of the build from a complete artefact."""
     (folder / JOURNAL).unlink(missing_ok=True)
     shutil.rmtree(folder / SCRATCH, ignore_errors=True)

@@ -1,9 +1,9 @@
-"""Cubes (time, y, x) on disk: Zarr 3 arrays in whole, checksummed chunks, one writer a chunk.
+"""Cubes (time, y, x) on disk: Zarr 3 arrays in whole, checksummed chunks, one writer per chunk.
 
-zarr-python makes the metadata; chunks, of the same bytes, are read and written here, because its
-own pipeline does not scale with threads. Cubes lie in folders of this machine or at URLs. Every
-chunk has a crc32c inside, and its size and crc are in an index beside the array, which ends with a
-crc of itself and of the metadata: a chunk that is missing, cut or exchanged is refused.
+zarr-python makes the metadata. Chunks in the same format are read and written here, because its own
+pipeline does not scale with threads. Cubes are in local folders or at URLs. Every chunk contains a
+crc32c; an index beside the array holds its size and crc, and ends with a crc of itself and of the
+metadata. A missing, cut or exchanged chunk is refused.
 """
 
 import errno
@@ -40,7 +40,7 @@ from pixcal.storage.read_ahead import AHEAD, ReadAhead
 
 CHUNK = (64, 128, 128)  # samples of a chunk along (time, y, x): 2 MiB of uint16
 
-# errors of the system that mean that a file is damaged; others may pass
+# system errors that mean a damaged file; others may be temporary
 _LOST = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EIO)
 _RESIDUE = 0x48674BC7  # CRC-32C of anything that ends with its own CRC-32C, least byte first
 _INDEX_DTYPE = np.dtype([("size", "<u4"), ("crc", "<u4")])
@@ -87,7 +87,7 @@ def create_map(
     )  # fmt: skip
 
 
-# Kept: arrays are many and alike, and zarr-python takes a millisecond for each.
+# Cached: many arrays are alike, and zarr-python takes a millisecond for each.
 @lru_cache(maxsize=512)
 def _array_metadata(
     shape: tuple[int, ...],
@@ -97,7 +97,7 @@ def _array_metadata(
     dims: tuple[str, ...],
     attrs: str,
 ) -> bytes:
-    """What zarr-python writes for an array; attributes as JSON."""
+    """Metadata as zarr-python writes it for an array; attributes as JSON."""
     made: dict[str, Any] = {}
     size = np.dtype(dtype).itemsize
     blosc_codec = BloscCodec(typesize=size, cname="lz4", clevel=1, shuffle="bitshuffle")
@@ -118,7 +118,7 @@ def _array_metadata(
 
 
 def create_group(path: Place, attrs: dict[str, Any] | None = None) -> None:
-    """Create a Zarr group (a folder that xarray opens as a dataset) if it is not there."""
+    """Create a Zarr group (a folder that xarray opens as a dataset) if it does not exist."""
     if isinstance(path, MemoryPath):
         return
     _write_metadata(path, _group_metadata(json.dumps(attrs or {})))
@@ -126,7 +126,7 @@ def create_group(path: Place, attrs: dict[str, Any] | None = None) -> None:
 
 @lru_cache(maxsize=512)
 def _group_metadata(attrs: str) -> bytes:
-    """What zarr-python writes for a group; attributes as JSON."""
+    """Metadata as zarr-python writes it for a group; attributes as JSON."""
     made: dict[str, Any] = {}
     zarr.create_group(store=made, attributes=json.loads(attrs))
     content: bytes = made["zarr.json"].to_bytes()
@@ -134,12 +134,12 @@ def _group_metadata(attrs: str) -> bytes:
 
 
 def _write_metadata(path: Place, content: bytes) -> None:
-    """Put down what describes an array or a group, unless just that is there already."""
+    """Write the metadata of an array or a group, unless the same content exists already."""
     try:
         there = (path / "zarr.json").read_bytes()
     except (FileNotFoundError, NotADirectoryError):
         there = b""
-    # What an unfinished build has left is not trusted: it has no checksum yet.
+    # Metadata of an unfinished build are rewritten: they have no checksum yet.
     if there != content:
         open_folder(path).write([("zarr.json", [content])])
 
@@ -167,7 +167,7 @@ def _chunk_name(index: Sequence[int]) -> str:
 
 
 def _names(grid: tuple[int, ...]) -> Iterator[list[str]]:
-    """Names of all chunks, those of one step along the first axis at a time."""
+    """Names of all chunks, by steps along the first axis."""
     for first in range(grid[0]):
         yield [_chunk_name((first, *rest)) for rest in np.ndindex(grid[1:])]
 
@@ -187,7 +187,7 @@ class ArrayWriter:
         """Write a block that begins and ends on chunk borders (or at the array's end).
 
         A chunk that exists is whole. Blocks that share no chunk may be written at the same time.
-        Raises RemoteError if the array is at a URL that does not take it.
+        Raises RemoteError if the array is at a URL that refuses it.
         """
         first = []
         for s, n, c, size in zip(start, data.shape, self.chunks, self.shape, strict=True):
@@ -218,7 +218,7 @@ class ArrayWriter:
             yield name, (body, crc.to_bytes(4, "little"))
 
     def take(self, source: Place) -> None:
-        """Take the chunks of another such array, linked or copied, unchecked; own ones stay."""
+        """Link or copy the chunks of another such array, unchecked; existing chunks stay."""
         if isinstance(source, Path) and isinstance(self.path, Path):
             link_files(source / "c", self.path / "c")
             return
@@ -257,7 +257,7 @@ class ArrayWriter:
 
 
 def chunks_whole(folder: Path) -> bool:
-    """Whether every chunk below a folder agrees with its crc, in arrays that have no index yet."""
+    """Whether every chunk below a folder agrees with its crc, in arrays without an index yet."""
     for at, folders, names in os.walk(folder):
         if "zarr.json" in names and "c" in folders:
             folders.clear()
@@ -268,7 +268,7 @@ def chunks_whole(folder: Path) -> bool:
 
 
 def remove_arrays(path: Place) -> None:
-    """Remove the groups and arrays that lie in a folder, and nothing else that is there."""
+    """Remove the groups and arrays in a folder, but no other files."""
     folder = open_folder(path)
     for child in folder.children():
         try:
@@ -282,7 +282,7 @@ def remove_arrays(path: Place) -> None:
             grid = _grid(meta["shape"], meta["chunk_grid"]["configuration"]["chunk_shape"])
             for names in _names(grid):
                 node.remove(names)
-        # Last, so that a removal that was cut short can be repeated.
+        # Last, so that an interrupted removal can be repeated.
         node.remove([INDEX, "zarr.json"])
 
 
@@ -310,7 +310,7 @@ class ArrayReader:
             metadata = (path / "zarr.json").read_bytes()
             if _seal(metadata, body[:-4]) != body[-4:]:
                 raise ValueError(f"zarr.json or {INDEX} was altered")
-            # Sealed, so it is what zarr wrote: no need of zarr's event loop, which takes its time
+            # The seal guarantees zarr's metadata, so zarr's event loop is not needed, which is slow
             # when many threads open many arrays.
             meta = json.loads(metadata)
             grid = _grid(meta["shape"], meta["chunk_grid"]["configuration"]["chunk_shape"])
@@ -330,7 +330,7 @@ class ArrayReader:
         self.chunks = tuple(meta["chunk_grid"]["configuration"]["chunk_shape"])
         self.dtype, self.attrs = np.dtype(meta["data_type"]), meta["attributes"]
         self._ahead = ReadAhead(path) if isinstance(path, UrlPath) else None
-        # Absolute: a reader may be sent to a process that works in another folder.
+        # Absolute, because a reader may be sent to a process in another folder.
         self._folder = f"{path.absolute() if isinstance(path, Path) else path}/"
 
     @property
@@ -370,21 +370,21 @@ class ArrayReader:
         return buffer
 
     def _next(self, index: Sequence[int]) -> str | None:
-        """File of the chunk that is read after the next one, if time goes on."""
+        """File of the chunk to read after the next one, if reading proceeds in time."""
         first, *rest = index
         if first + 2 >= len(self._index):
             return None
         return f"{self._folder}{_chunk_name((first + 2, *rest))}"
 
     def _fetch(self, ahead: ReadAhead, index: Sequence[int]) -> bytes:
-        """Content of a chunk at a URL; those that follow it in time are on their way then."""
+        """Content of a chunk at a URL; starts to fetch those that follow in time."""
         first, *rest = index
         places = [(n, *rest) for n in range(first, min(first + 1 + AHEAD, len(self._index)))]
         file, *following = [(_chunk_name(at), int(self._index[at]["size"])) for at in places]
         return ahead.read(file, following)
 
     def read(self, *ranges: tuple[int, int], out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """A block, given (start, stop) of the first axes; fastest when it follows the chunks."""
+        """A block, given (start, stop) of the first axes; fastest if aligned to chunks."""
         full = [(0, n) for n in self.shape]
         full[: len(ranges)] = [(max(0, a), min(b, n)) for (a, b), (_, n) in zip(ranges, full)]  # noqa: B905
         shape = tuple(b - a for a, b in full)
@@ -404,7 +404,7 @@ class ArrayReader:
         return block
 
     def _within(self, ranges: Sequence[tuple[int, int]]) -> Iterator[tuple[int, ...]]:
-        """Chunks that hold a block."""
+        """Indices of the chunks that contain a block."""
         return product(
             *(range(a // c, -(-b // c)) for (a, b), c in zip(ranges, self.chunks, strict=True))
         )

@@ -1,8 +1,8 @@
-"""Where the cubes of an artefact lie: in its folder, or in one of their own elsewhere.
+"""Places of an artefact's cubes: in its folder, or in a separate folder elsewhere.
 
-Cubes elsewhere lie in a folder that is made for one artefact, ``<base>/<stage>-<key>-<random>``,
-laid out as the artefact is. The artefact names it in ``cubes.json``, and owns it as long as it lies
-in the run directory that it was made in: a copy of a run reads the cubes, and never removes them.
+Cubes elsewhere are in a folder for one artefact, ``<base>/<stage>-<key>-<random>``, with the layout
+of the artefact. The artefact names it in ``cubes.json``, and owns it while in its original run
+directory: a copy of a run reads the cubes, but never removes them.
 """
 
 import json
@@ -20,25 +20,25 @@ from pixcal.storage.folder import open_folder
 from pixcal.storage.place import Local, Place, parse_place
 
 POINTER = "cubes.json"
-NOTE = "pixcal.json"  # file beside the cubes that tells whoever finds them what they are
+NOTE = "pixcal.json"  # file beside the cubes that describes them
 
 log = logging.getLogger(__name__)
 
 
 def cubes_of(artefact: Local) -> Place:
-    """The folder of an artefact's cubes; DamagedError if ``cubes.json`` cannot be understood."""
+    """The folder of an artefact's cubes; DamagedError if ``cubes.json`` is invalid."""
     pointer = _read(artefact)
     return artefact if pointer is None else parse_place(pointer["place"])
 
 
 def base_of(artefact: Path) -> Place | None:
-    """The folder for all cubes that an artefact was given, or None when it keeps its own."""
+    """The folder for all cubes given to an artefact; None if it keeps its cubes itself."""
     pointer = _read(artefact)
     return None if pointer is None else parse_place(pointer["base"])
 
 
 def chosen_base(named: StrPath | None, run: Path, like: Path) -> Place | None:
-    """The folder for all cubes that the user wants; None: cubes stay in the artefacts.
+    """The folder for all cubes chosen by the user; None: cubes stay in the artefacts.
 
     ``named``: path or URL, or the run directory for None; None for the same as the artefact
     ``like``.
@@ -50,7 +50,7 @@ def chosen_base(named: StrPath | None, run: Path, like: Path) -> Place | None:
 
 
 def settled(artefact: Path, run: Path, base: Place | None) -> bool:
-    """Whether an artefact in the making can go on where its cubes are."""
+    """Whether an artefact under construction can continue with its present place of cubes."""
     pointer = _read(artefact)
     if pointer is None:
         return base is None
@@ -58,19 +58,19 @@ def settled(artefact: Path, run: Path, base: Place | None) -> bool:
 
 
 def settle(artefact: Path, run: Path, base: Place | None) -> None:
-    """Make the folder for the cubes of an artefact in the making, unless it has one already."""
+    """Make the folder for the cubes of an artefact under construction, unless it has one."""
     if base is None or _read(artefact) is not None:
         return
     place = base / f"{artefact.name}-{secrets.token_hex(4)}"
     note = {"pixcal": __version__, "run": str(run.absolute()), "artefact": artefact.name}
-    # The first thing that is written: what is wrong with a place shows before any work is done.
+    # Written first, so that errors of the place show before any work is done.
     _write_json(place, NOTE, note)
     owner = run.stat().st_ino
     _write_json(artefact, POINTER, {"base": str(base), "place": str(place), "owner": owner})
 
 
 def remove_cubes(artefact: Path, run: Path) -> None:
-    """Remove the cubes elsewhere that an artefact owns; warn when that is not possible."""
+    """Remove the cubes elsewhere that an artefact owns; warn if that fails."""
     from pixcal.storage.cube import remove_arrays  # here: the command line does without zarr
 
     try:
@@ -88,7 +88,7 @@ def remove_cubes(artefact: Path, run: Path) -> None:
 
 
 def _owns(run: Path, pointer: Mapping[str, Any]) -> bool:
-    # The number of a directory stays when it is renamed, and is another in a copy.
+    # The inode of a directory is unchanged by renaming, and different in a copy.
     return bool(pointer["owner"] == run.stat().st_ino)
 
 

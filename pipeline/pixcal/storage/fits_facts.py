@@ -1,7 +1,7 @@
 """Facts in FITS headers: numbers, exposure time, temperature, time stamp.
 
-What describes a frame may be missing or written in any way, and is then None; what the data cannot
-be read without (`integer`) is an error.
+Descriptive values may be missing or in any format, and are then None. Missing values that are
+needed to read the data (`integer`) are an error.
 """
 
 import math
@@ -20,7 +20,7 @@ _CARD = 80  # characters
 
 
 class Header:
-    """Values and comments of a header by keyword; of a keyword that is repeated, the first."""
+    """Values and comments of a header by keyword; of a repeated keyword, the first."""
 
     def __init__(self, cards: Iterable[tuple[str, Any, str]]) -> None:
         self._cards: dict[str, tuple[Any, str]] = {}
@@ -47,7 +47,7 @@ class Header:
         return self._cards[key][1]
 
 
-# Kept: most cards are the same in all files, and astropy takes a millisecond for a header.
+# Cached: most cards are equal in all files, and astropy takes a millisecond per header.
 @lru_cache(maxsize=4096)
 def _card(text: str) -> tuple[str, Any, str]:
     card = fits.Card.fromstring(text)
@@ -97,7 +97,7 @@ def exposure_s(headers: tuple[Header, ...]) -> float | None:
 
 
 def temperature_c(headers: tuple[Header, ...]) -> float | None:
-    """Temperature in degrees Celsius; in kelvin in the header where its comment says so."""
+    """Temperature in degrees Celsius, converted from kelvin if the comment says so."""
     for key in ("CCD-TEMP", "DET-TEMP", "TEMPERAT", "CCDTEMP", "TEMP"):
         for header in headers:
             degrees = number(header, key)
@@ -130,5 +130,5 @@ def time_stamp_mjd(headers: tuple[Header, ...]) -> float | None:
 
 
 def date_of(mjd: float) -> str:
-    """UTC date and time of a modified Julian date, as ``DATE-OBS`` has it, to the millisecond."""
+    """UTC date and time of a modified Julian date in ``DATE-OBS`` format, to the millisecond."""
     return (_MJD_EPOCH + timedelta(days=mjd)).isoformat("T", "milliseconds").partition("+")[0]

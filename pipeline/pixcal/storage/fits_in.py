@@ -1,7 +1,7 @@
 """What a FITS file of a bench holds, read from its header and held against its length.
 
-Nothing is taken from the data here: all files of an acquisition can be checked in seconds before
-hours of reading begin. The samples are read by `pixcal.storage.fits_rows`.
+No data are read here: all files of an acquisition can be checked in seconds before hours of reading
+begin. `pixcal.storage.fits_rows` reads the samples.
 """
 
 import gzip
@@ -33,7 +33,7 @@ _Stream = io.BufferedReader | gzip.GzipFile
 
 _BLOCK = 2880
 
-# FITS 4.0, section 5.2.5 and table 11: the offsets that make signed integers of unsigned ones.
+# FITS 4.0, section 5.2.5 and table 11: offsets to store unsigned integers as signed ones.
 _EXACT = {
     (8, 0): "u1",
     (8, -128): "i1",
@@ -57,7 +57,7 @@ class SampleFormat:
 
     @cached_property
     def exact(self) -> bool:
-        """Whether the values are a native type, at most with the sign bit turned."""
+        """Whether the values are of a native type, at most with the sign bit flipped."""
         plain = self.bscale == 1 and self.blank is None
         return plain and (self.bitpix, self.bzero) in _EXACT
 
@@ -68,7 +68,7 @@ class SampleFormat:
 
     @cached_property
     def dtype(self) -> np.dtype[Any]:
-        """Type of the values: float32 where they are scaled or may be missing (NaN)."""
+        """Type of the values: float32 if they are scaled or may be missing (NaN)."""
         return np.dtype(_EXACT[self.bitpix, int(self.bzero)] if self.exact else "f4")
 
 
@@ -80,7 +80,7 @@ class FrameFile:
     # ``tiles``: an image compressed by tiles, in a binary table. ``picture``: TIFF or PNG.
     container: Container
     hdu: int  # number of the header and data unit that holds the image
-    offset: int  # byte where its data begin (once decompressed, for ``gzip``)
+    offset: int  # first byte of its data (after decompression, for ``gzip``)
     shape: tuple[int, int, int]  # (planes, y, x)
     coding: SampleFormat  # how the samples are stored
     # (planes, rows) of a compressed tile; (1, 1) for other containers
@@ -97,10 +97,10 @@ class FrameFile:
 
 
 def inspect(source: SourceFile) -> FrameFile:
-    """Read a file's header and hold it against the file's length.
+    """Read a file's header and check it against the file's length.
 
-    The image is the first data unit of 2-D or 3-D. Raises InputError naming the file: not FITS, cut
-    short, no image, other dimensions or types than frames have.
+    The image is the first data unit of 2-D or 3-D. Raises InputError naming the file: not FITS,
+    truncated, no image, dimensions or types unsuitable for frames.
     """
     with source.open() as handle:
         try:
@@ -167,11 +167,11 @@ def _require(source: SourceFile, needed: int) -> None:
 
 
 def _check_rest(stream: _Stream, end: int) -> None:
-    """Refuse data after the image: its header calls for less than there is, and tells no truth."""
+    """Refuse data after the image, which its header does not account for."""
     stream.seek(end)
     fill, following = stream.read(-end % _BLOCK), stream.read(_BLOCK)
     extension = following.startswith(b"XTENSION")
-    # Fill of any one value is no data: zeros by the standard, blanks of some writers.
+    # Constant fill is not data: zeros by the standard, blanks from some writers.
     if len(set(fill)) > 1 or (len(set(following)) > 1 and not extension):
         raise ValueError(
             f"its header describes {end} bytes, but the file holds more; correct NAXISn and "
@@ -254,7 +254,7 @@ def _frames_shape(axes: list[int]) -> tuple[int, int, int]:
 
 
 def _tile(header: Header) -> tuple[int, int]:
-    """(planes, rows) of a compressed tile; a row where nothing is said (FITS 4.0, 10.1.1)."""
+    """(planes, rows) of a compressed tile; one row by default (FITS 4.0, 10.1.1)."""
     lengths = [
         min(integer(header, f"ZTILE{n + 1}", 1), length)
         for n, length in enumerate(_axes(header, "Z"))
@@ -280,7 +280,7 @@ def _coding(header: Header, prefix: str) -> SampleFormat:
 
 
 def _check_gzip_length(file: FrameFile, handle: io.FileIO) -> None:
-    """Hold a gzip file's length modulo 2^32 (RFC 1952) against the header; if in doubt, unpack."""
+    """Check a gzip file's length modulo 2^32 (RFC 1952) against the header; unpack if in doubt."""
     handle.seek(-4, io.SEEK_END)
     length = int.from_bytes(handle.read(4), "little")
     needed = file.offset + file.data_bytes

@@ -1,7 +1,7 @@
 """Writing FITS images piece by piece, from several tasks.
 
-A file is written under another name (hidden, ``.aside``) and takes its own when it is complete and
-on the disk: a file that exists is whole.
+A file is written under another name (hidden, ``.aside``) and renamed when it is complete and on
+disk: a file that exists is whole.
 """
 
 import os
@@ -35,7 +35,7 @@ class FrameWriter:
     def create(
         cls, path: Path, shape: tuple[int, ...], dtype: str, cards: Cards | None = None
     ) -> "FrameWriter":
-        """Write the header and take the room on the disk; OSError where there is none."""
+        """Write the header and allocate the space on disk; OSError if there is none."""
         header = _header(shape, dtype, cards or {}).tostring(padding=True).encode("ascii")
         writer = cls(path, shape, dtype, len(header))
         with aside_of(path).open("wb") as file:

@@ -1,6 +1,6 @@
-"""Samples of FITS frames: bands of rows of some planes, straight from the byte where they are.
+"""Samples of FITS frames: bands of rows of given planes, read directly from their byte offset.
 
-Only plain files can be read so. Compressed ones are first unpacked, once, by `unpack`.
+This works for plain files only. Compressed ones are first unpacked, once, by `unpack`.
 """
 
 import gzip
@@ -24,7 +24,7 @@ from pixcal.storage.fits_in import FrameFile, SampleFormat, damaged_gzip
 from pixcal.storage.pictures import picture_bytes, unpack_picture
 from pixcal.storage.sources import SourceFile, unreadable
 
-BAND = CHUNK[1]  # rows that have a checksum in common: those of a chunk
+BAND = CHUNK[1]  # rows with a common checksum: those of a chunk
 
 FACTS = {
     "crc": "CRC-32C of the bytes",
@@ -36,7 +36,7 @@ FACTS = {
 
 
 def by_fact(catalogue: F64) -> dict[str, F64]:
-    """Facts (time, band) by their names, of a catalogue (time, band, fact)."""
+    """Facts (time, band) by name, from a catalogue (time, band, fact)."""
     return dict(zip(FACTS, np.moveaxis(catalogue, -1, 0), strict=True))
 
 
@@ -56,7 +56,7 @@ def read_rows(
     *,
     crc_alone: bool = False,
 ) -> F64:
-    """Read rows of some planes of a plain file, each byte once.
+    """Read rows of given planes of a plain file, each byte once.
 
     Returns (plane, band, fact): `FACTS` of each `BAND` rows, NaN where not looked for. ``rows``:
     first, which begins a band, and the one after the last. ``out``: (plane, y, x), ADU; each plane
@@ -80,7 +80,7 @@ def read_rows(
             parts = [slice(a - y0, b - y0) for a, b in some]
             of_bands = found[n, first : first + each]
             of_bands[:, 0] = [google_crc32c.value(raw[part]) for part in parts]
-            # As they are: to turn bytes and sign bits takes longer than to find the facts.
+            # In stored form: swapping bytes and sign bits takes longer than finding the facts.
             values, zero = raw.view(stored.newbyteorder(">")), coding.bzero
             if target is not None or not coding.exact:
                 native = spare[: y1 - y0]
@@ -94,7 +94,7 @@ def read_rows(
                     values, zero = converted, 0.0
             if not crc_alone:
                 of_bands[:, 1:] = [_largest_and_ending(values[part], zero) for part in parts]
-        # Written to since it was opened, it is partly another file.
+        # A file written to since it was opened is invalid.
         file.source.check_read(handle)
     return found
 
@@ -116,9 +116,9 @@ def _largest_and_ending(values: NDArray[Any], zero: float) -> tuple[float, float
 
 
 def _make_native(raw: NDArray[Any], coding: SampleFormat, native: NDArray[Any]) -> None:
-    """Stored samples of what a file holds, with the sign bit turned where the values need it."""
+    """Convert samples to native byte order, with the sign bit flipped if the values need it."""
     bits, found = (samples.view(f"u{raw.itemsize}") for samples in (raw, native))
-    # In two steps: one that turns bits and swaps bytes at once takes twice as long.
+    # In two steps: flipping bits and swapping bytes at once takes twice as long.
     np.copyto(found, bits.view(bits.dtype.newbyteorder(">")))
     if coding.exact and coding.bzero:
         # The BZERO that makes unsigned integers of signed ones, and the reverse.
@@ -149,7 +149,7 @@ def _scale(raw: NDArray[Any], coding: SampleFormat) -> F32:
 
 
 def unpack(file: FrameFile, target: Path) -> FrameFile:
-    """Write a compressed file's image as bare big-endian samples; that as a file to be read."""
+    """Write a compressed file's image as raw big-endian samples; return that file."""
     with file.source.open() as handle, target.open("wb") as out:
         if file.container == "picture":
             unpack_picture(file, out)
@@ -176,7 +176,7 @@ def unpack_bytes(file: FrameFile) -> int:
         return picture_bytes(file)
     if file.container == "gzip":
         return 4 * _PIECE
-    # Decoders hold a whole tile several times; HCOMPRESS, the hungriest, 7 times.
+    # Decoders hold several copies of a tile; HCOMPRESS, with the most, 7.
     planes, rows = _tiles_at_once(file)
     row_bytes = file.shape[2] * file.coding.stored.itemsize
     return (16 << 20) + 8 * min(planes, file.shape[0]) * min(rows, file.shape[1]) * row_bytes
@@ -187,7 +187,7 @@ def _unpack_gzip(file: FrameFile, handle: io.FileIO, out: BinaryIO) -> None:
     try:
         with gzip.GzipFile(fileobj=handle) as stream:
             stream.seek(file.offset)
-            # To the end, beyond the image too: the checksum stands there.
+            # Read to the end, beyond the image, where the checksum is.
             while part := stream.read(_PIECE):
                 out.write(part[:left])
                 left -= min(left, len(part))
@@ -200,7 +200,7 @@ def _tiles_at_once(file: FrameFile) -> tuple[int, int]:
     planes, rows = file.tile
     tile_bytes = planes * rows * file.shape[2] * file.coding.stored.itemsize
     rows *= max(1, 8 << 20 // tile_bytes)
-    # Of small frames several: astropy looks at the header again for each piece.
+    # Several small frames at once: astropy reads the header again for each piece.
     return planes * max(1, rows // file.shape[1]), rows
 
 

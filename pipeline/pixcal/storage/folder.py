@@ -1,4 +1,4 @@
-"""Whole files of a folder, many at a time: of this machine, or at a URL; linked or copied."""
+"""Whole files of a folder, many at a time: local or at a URL; linked or copied."""
 
 import errno
 import os
@@ -15,10 +15,10 @@ from pixcal.storage.place import Place, UrlPath, explained
 
 # file that an array has beside its metadata: sizes and checksums of its chunks
 INDEX = "chunks.npy"
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT)  # errors of the system that are no fault of the file
-# bytes that one task sends to a URL at the same time, and more than it reads ahead
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)  # system errors that are not due to the file
+# bytes that one task sends to a URL at once; exceeds what it reads ahead
 BATCH_BYTES = 16 << 20
-MANY_FILES = 250  # that are not flushed one by one
+MANY_FILES = 250  # number of files above which they are not flushed one by one
 
 
 # name of a file below a folder, such as `c/0/1/2`, and its content in parts
@@ -32,7 +32,7 @@ def open_folder(place: Place) -> "LocalFolder | UrlFolder":
 
 
 def transit_bytes(*places: Place) -> int:
-    """Memory that a task needs for what is on its way to some folders, or from them."""
+    """Memory of a task for data in transit to or from given folders."""
     return BATCH_BYTES * sum(isinstance(place, UrlPath) for place in places)
 
 
@@ -48,7 +48,7 @@ class LocalFolder:
         for name, content in files:
             file = self.path / name
             aside = aside_of(file)
-            # Most folders are there: to make sure of it first would take as long as the rest.
+            # Most folders exist: checking first would take as long as the rest.
             try:
                 out = aside.open("wb")
             except FileNotFoundError:
@@ -57,7 +57,7 @@ class LocalFolder:
             with out:
                 out.writelines(content)
             written.append((aside, file, sum(map(len, content))))
-        # Flushed once all are written: the disk works meanwhile (twice as fast as one by one).
+        # Flushed after all are written, while the disk works (twice as fast as one by one).
         for aside, file, size in written:
             if durable:
                 with aside.open("rb") as handle:
@@ -75,11 +75,11 @@ class LocalFolder:
                 yield size, handle.read(4)
 
     def children(self) -> list[str]:
-        """Names of the files and folders directly in it; none if it is not there."""
+        """Names of the files and folders directly in it; none if it does not exist."""
         return sorted(f.name for f in self.path.iterdir()) if self.path.is_dir() else []
 
     def remove(self, names: Sequence[str]) -> None:
-        """Remove those of the files that are there, and folders that are empty then."""
+        """Remove existing files of these names, and folders that are then empty."""
         files = [self.path / name for name in names]
         for file in files:
             file.unlink(missing_ok=True)
@@ -92,7 +92,7 @@ class LocalFolder:
 
 @contextmanager
 def written_aside(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """Another name to write a file under; it takes its own, on disk if ``durable``, at the end."""
+    """Temporary name to write a file; renamed at the end, and flushed to disk if ``durable``."""
     aside = aside_of(path)
     yield aside
     if durable:
@@ -107,11 +107,11 @@ def aside_of(path: Path) -> Path:
 
 
 def flush(folder: Path) -> None:
-    """See to it that all files below a folder are on the disk, and the folders that name them."""
+    """Flush all files and folders below a folder to disk."""
     writeback.wait()
     files = [(at, names) for at, _, names in os.walk(folder)]
     if sum(len(names) for _, names in files) > MANY_FILES:
-        os.sync()  # One by one they would take longer than all that other programs write.
+        os.sync()  # One by one would take longer than flushing the data of all programs.
         return
     for at, names in files:
         for path in (*(f"{at}/{name}" for name in names), at):
@@ -197,12 +197,12 @@ class UrlFolder:
         return True
 
     def _sizes(self, names: Sequence[str]) -> dict[str, int]:
-        """Sizes (bytes) of those of the files that are there, from fresh listings."""
+        """Sizes (bytes) of the existing files among these, from fresh listings."""
         system, root = self.path.filesystem()
         found: dict[str, Any] = {}
         with explained(self.path.url):
             system.invalidate_cache()
-            # Each of all chunks of some frames, which are few enough to hold.
+            # Each listing is of all chunks of a range of frames, few enough for memory.
             for below in {"/".join(name.split("/")[:2]) for name in names}:
                 found |= system.find(f"{root}/{below}", detail=True)
             return {

@@ -1,6 +1,6 @@
-"""The kinds of artefacts and the format that each is written in, said once.
+"""The kinds of artefacts and their formats.
 
-Another layout on the disk is another format; `docs/reference/run-directory.md` describes them all.
+A changed layout on disk is a new format; `docs/reference/run-directory.md` describes them all.
 """
 
 from dataclasses import dataclass
@@ -9,13 +9,13 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class ArtefactKind:
-    """What makes one kind of artefact, ``RUN/<name>``."""
+    """One kind of artefact, ``RUN/<name>``."""
 
     name: str
-    format: int  # that is written, and read
-    command: str  # what the user types to have it made, `RUN` standing for the run directory
-    earlier: tuple[int, ...] = ()  # formats that are read as well
-    of_fringes: bool = True  # whether there is none of an acquisition without fringes
+    format: int  # format that is written and read
+    command: str  # command to make it, with `RUN` for the run directory
+    earlier: tuple[int, ...] = ()  # earlier formats that can be read
+    of_fringes: bool = True  # whether it requires fringes
     products: str = ""  # pattern of the files that are copied to ``RUN/products``
 
     def typed(self, run: Path) -> str:

@@ -1,7 +1,7 @@
-"""Frames read from the FITS files they are in, as `pixcal.storage.cube` reads those of a cube.
+"""Read frames from their FITS files, as `pixcal.storage.cube` reads those of a cube.
 
-The files were described and read once by `ingest`. What is read of them now is held against what
-was found then: their sizes, times of change, and the checksum of every band of rows.
+`ingest` described and read the files once. Each later read is checked against its results: sizes,
+times of change, and the checksum of every band of rows.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,14 +19,14 @@ from pixcal.storage.fits_rows import BAND, read_rows
 from pixcal.storage.sources import SourceFile
 
 _CACHED = 1 << 20
-_FRAMES = (64, 32, 16, 8, 4, 2)  # that the frames of a chunk of a cube are a multiple of
+_FRAMES = (64, 32, 16, 8, 4, 2)  # divisors of the frames of a chunk of a cube
 
-# what `files.json` holds of the files of an array, in columns of equal length
+# contents of `files.json` for the files of an array, in columns of equal length
 Columns = Mapping[str, Sequence[Any]]
 
 
 def describe(files: Sequence[FrameFile]) -> dict[str, list[Any]]:
-    """Where the samples of plain files are, in columns."""
+    """Positions of the samples of plain files, in columns."""
     return {
         "file": [f.source.name for f in files],
         "size": [f.source.size for f in files],
@@ -42,13 +42,13 @@ def describe(files: Sequence[FrameFile]) -> dict[str, list[Any]]:
 
 @dataclass(frozen=True)
 class _Ingested(SourceFile):
-    """A file as it was when it was ingested."""
+    """A file as ingested."""
 
     CHANGED: ClassVar[str] = "changed since it was ingested; run 'pixcal ingest' again"
 
 
 def described(columns: Columns, number: int, folder: Path, frame: Sequence[int]) -> FrameFile:
-    """One of the files that `describe` described, with frames (y, x) of a size."""
+    """One of the files of `describe`, with its frame size (y, x)."""
     row = {name: column[number] for name, column in columns.items()}
     source = _Ingested(folder / row["file"], row["file"], row["size"], row["mtime_ns"])
     coding = SampleFormat(row["bitpix"], row["bscale"], row["bzero"], row["blank"])
@@ -79,18 +79,18 @@ class FrameReader:
         files = {name: described(columns, n, folder, self.shape[1:]) for n, name in names}
         self._files = [files[name] for name in table["file"]]
         self._planes = list(table["plane"])
-        # Samples to read at a time (time, y, x): they stay in the cache of a core.
+        # Samples to read at a time (time, y, x), such that they fit in a core's cache.
         band = BAND * self.shape[2] * self.dtype.itemsize
         frames = next((n for n in _FRAMES if n * band <= _CACHED), 1)
         self.chunks: tuple[int, ...] = (frames, BAND, self.shape[2])
         self._checksums = checksums
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Without all the paths: another process checks each that it is sent.
+        # Without the paths, since another process would check each of them.
         return FrameReader, self._made_of
 
     def read(self, *ranges: tuple[int, int], out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """A block, as `ArrayReader.read` gives it; fastest in bands of 128 rows of all columns."""
+        """A block, as by `ArrayReader.read`; fastest in bands of 128 rows over all columns."""
         full = [(0, n) for n in self.shape]
         full[: len(ranges)] = [(max(0, a), min(b, n)) for (a, b), n in zip(ranges, self.shape)]  # noqa: B905
         (t0, t1), (y0, y1), (x0, x1) = full
@@ -122,7 +122,7 @@ class FrameReader:
 
 @dataclass(frozen=True)
 class ChosenFrames:
-    """Some frames of an array (time, y, x), as an array of their own."""
+    """A subset of the frames of an array (time, y, x), as an array."""
 
     reader: ArrayReader | FrameReader
     numbers: Sequence[int]  # of the frames, increasing
@@ -152,5 +152,5 @@ class ChosenFrames:
         return np.concatenate(found, out=out)
 
 
-# what frames (time, y, x) are read with, wherever they are
+# reader of frames (time, y, x) in any storage
 Reader = ArrayReader | FrameReader | ChosenFrames

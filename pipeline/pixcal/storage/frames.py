@@ -1,4 +1,4 @@
-"""Files of frames, whatever their format, and the table of the frames of an array."""
+"""Files of frames in any format, and the table of the frames of an array."""
 
 import re
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from pixcal.storage.sources import HEADERS, SourceFile
 
 
 def inspect(source: SourceFile) -> FrameFile:
-    """Read what a file says of its frames, and hold it against the file's length."""
+    """Read the description of a file's frames, and check it against the file's length."""
     with source.open() as handle:
         start = handle.read(8)
     if is_picture(start):
@@ -57,13 +57,13 @@ def natural_key(name: str) -> tuple[list[tuple[int, str]], str]:
 def tabulate(
     array: str, files: Sequence[FrameFile], frame_period_s: float | None
 ) -> tuple[list[Frame], list[str]]:
-    """The frames of an array in the order of time, and sentences on what is odd about the times.
+    """The frames of an array in order of time, and warnings on irregular times.
 
-    By time stamp where every file has one, else by natural file name. Later planes of a cube follow
-    by ``frame_period_s``, else by their exposure time. ``array``: its name, for the sentences.
+    By time stamp if every file has one, else by natural file name. Later planes of a cube follow at
+    ``frame_period_s``, else at their exposure time. ``array``: its name, for the warnings.
     """
     ordered, stamped, warnings = _order(files)
-    # No frame is over before its exposure: darks are longer than the pace of the fringes.
+    # A frame takes at least its exposure: darks may be longer than the period of the fringes.
     steps = [max(frame_period_s or 0.0, file.exptime_s or 0.0) for file in ordered]
     if stamped and any(f.shape[0] > 1 and not s for f, s in zip(ordered, steps, strict=True)):
         stamped = False
@@ -85,7 +85,7 @@ def tabulate(
 
 
 def columns(frames: Sequence[Frame]) -> dict[str, list[Any]]:
-    """The table as ``frames.json`` holds it: columns of equal length."""
+    """The table in the format of ``frames.json``: columns of equal length."""
     return {
         "file": [f.file.source.name for f in frames],
         "plane": [f.plane for f in frames],
@@ -98,7 +98,7 @@ def columns(frames: Sequence[Frame]) -> dict[str, list[Any]]:
 
 
 def _order(files: Sequence[FrameFile]) -> tuple[list[FrameFile], bool, list[str]]:
-    """Files in order, whether by their time stamps, and what is odd about these."""
+    """Files in order, whether by time stamps, and warnings on these."""
     named = sorted(files, key=lambda file: natural_key(file.source.name))
     stamps = [file.mjd for file in named if file.mjd is not None]
     if not stamps:

@@ -1,6 +1,6 @@
-"""One process at a time in a run directory; what it finds damaged there is made again.
+"""Lock of a run directory for one process; data found damaged are made again.
 
-What turns out to be damaged is noted in its artefact, which is not up to date from then on.
+Damage is noted in the artefact, which is not up to date from then on.
 """
 
 import fcntl
@@ -17,7 +17,7 @@ from pixcal.storage.manifest import DAMAGE, MANIFEST, UNFLUSHED, damaged_files, 
 
 
 def _settle_killed(run: Path) -> None:
-    """End what a kill left half-done: artefacts put aside, or not cleaned up."""
+    """Finish steps interrupted by a kill: artefacts moved aside, or not cleaned up."""
     for old in run.glob(".partial/*-replaced"):
         final = run / old.name.removesuffix("-replaced")
         if final.exists():
@@ -29,7 +29,7 @@ def _settle_killed(run: Path) -> None:
 
 
 def _note_damage(run: Path, error: DamagedError) -> None:
-    """See to it that what is damaged is made again by the next run of its stage."""
+    """Note damaged data, so that the next run of the stage makes them again."""
     if _name_within(run / "products", error.path) is not None:
         error.advice = f"write it again with '{STAGES['fit'].typed(run)}'"
         return
@@ -61,7 +61,7 @@ def _name_within(folder: Path, path: str) -> str | None:
 
 @contextmanager
 def damage_noted(*runs: Path) -> Iterator[None]:
-    """Do what `lock` does about damage, for runs that are only read."""
+    """Note damage as `lock` does, for runs that are only read."""
     try:
         yield
     except DamagedError as error:
@@ -75,7 +75,7 @@ def damage_noted(*runs: Path) -> Iterator[None]:
 def lock(run: Path) -> Iterator[None]:
     """Hold a run directory: a second process on it is refused, not mixed in.
 
-    What turns out to be damaged in it is noted, and an unfinished build removed. Raises InputError
+    Damage found in it is noted, and an unfinished build removed. Raises InputError
     if another process holds it, or it cannot be written.
     """
     try:
@@ -107,12 +107,12 @@ def lock(run: Path) -> Iterator[None]:
 
 @contextmanager
 def flushed_last(run: Path) -> Iterator[None]:
-    """Complete artefacts of a run as they are made; all are on the disk when the block ends."""
+    """Complete artefacts of a run before flushing; all are on disk when the block ends."""
     try:
         with unflushed():
             yield
     finally:
         if any(run.glob(f"*/{UNFLUSHED}")):
-            # Another process that works there sees to it by itself.
+            # Another process that holds the run flushes them itself.
             with suppress(InputError), lock(run):
                 pass

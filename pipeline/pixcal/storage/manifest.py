@@ -1,7 +1,7 @@
-"""The manifest of an artefact: what it was made from, and whether it is as it was written.
+"""The manifest of an artefact: its inputs, and whether it is unaltered.
 
-It is sealed with its own digest, and holds a digest of every other file but the chunks of arrays,
-which have checksums of their own. What turns out to be damaged as it is read is noted beside it.
+It is sealed with its own digest, and holds a digest of every other file except chunks of arrays,
+which have their own checksums. Damage found when reading is noted beside it.
 """
 
 import hashlib
@@ -22,15 +22,15 @@ from pixcal.storage.place import Local
 MANIFEST = "manifest.json"
 JOURNAL = "journal.jsonl"
 SCRATCH = "scratch"
-# names of the files of an artefact that turned out to be damaged, found when they were read
+# names of the files of an artefact that were found damaged when read
 DAMAGE = "damage.json"
-# in an artefact that is complete but not yet on the disk: the run of the machine that made it
+# in an artefact that is complete but not yet flushed to disk: the boot during which it was made
 UNFLUSHED = "unflushed"
 
 
 @cache
 def boot() -> str:
-    """Name of this run of the machine; of this process where the system gives none."""
+    """Identifier of the present boot; of this process if the system gives none."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except OSError:
@@ -39,7 +39,7 @@ def boot() -> str:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What an artefact is and what it was made from."""
+    """Description of an artefact and its inputs."""
 
     stage: str
     format: int
@@ -48,7 +48,7 @@ class Manifest:
     inputs: dict[str, str]  # key of each artefact (or file set) that this one was made from
     pixcal: str = __version__
     summary: dict[str, Any] = field(default_factory=dict)
-    # digest of each file of the artefact, but for chunks of arrays
+    # digest of each file of the artefact, except chunks of arrays
     files: dict[str, str] = field(default_factory=dict)
 
 
@@ -74,7 +74,7 @@ def _json(data: Any) -> str:
 def write_json(path: Local, data: Any) -> None:
     """Write JSON aside, flush it to the disk, and rename it into place."""
     if isinstance(path, MemoryPath):
-        # On one line: an indent takes ten times as long, and nobody reads it.
+        # On one line, since indentation takes ten times as long.
         path.keep(json.dumps(data, allow_nan=False).encode())
     else:
         write_whole(path, _json(data).encode())
@@ -92,7 +92,7 @@ def read_json(path: Local) -> Any:
 
 
 def _read(path: Local) -> tuple[str, Any]:
-    """Text of a JSON file, and what it says."""
+    """Text of a JSON file, and its data."""
     try:
         text = path.read_text(encoding="utf-8")
         return text, json.loads(text)
@@ -104,7 +104,7 @@ def _read(path: Local) -> tuple[str, Any]:
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write the manifest of an artefact, sealed with its own digest."""
-    # As it will be read: JSON has lists for tuples, and strings for all keys.
+    # As it will be read: JSON turns tuples into lists, and all keys into strings.
     data = json.loads(_json(asdict(manifest)))
     write_json(folder / MANIFEST, data | {"seal": digest(data)})
 
@@ -125,7 +125,7 @@ def read_manifest(folder: Local) -> Manifest | None:
 
 
 def list_files(folder: Path) -> dict[str, str]:
-    """Digests of the files of an artefact, as its manifest holds them."""
+    """Digests of the files of an artefact, for its manifest."""
     return {name: file_digest(folder / name) for name in sorted(_listed(folder))}
 
 
@@ -141,7 +141,7 @@ def _listed(folder: Path) -> Iterator[str]:
 
 
 def check_intact(folder: Path, manifest: Manifest) -> None:
-    """Hold the files of an artefact against its manifest, but not their chunks.
+    """Check the files of an artefact against its manifest, except chunks.
 
     Raises DamagedError naming the first one missing or altered, or found to be so earlier.
     """
@@ -156,7 +156,7 @@ def check_intact(folder: Path, manifest: Manifest) -> None:
 
 
 def damaged_files(folder: Path) -> list[str]:
-    """Names of the files of an artefact that were found to be damaged as they were read."""
+    """Names of the files of an artefact that were found damaged when read."""
     if not (folder / DAMAGE).exists():
         return []
     try:

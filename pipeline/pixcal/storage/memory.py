@@ -1,7 +1,7 @@
-"""A folder in memory: arrays and files that only whoever makes them reads.
+"""A folder in memory: arrays and files for use within one process.
 
-A stage writes into it as into a folder of the disk, so that frames in memory take the way of frames
-in files. Nothing in it is compressed or sealed.
+A stage writes to it as to a folder on disk, so that frames in memory are processed like frames in
+files. Its contents are neither compressed nor sealed.
 """
 
 import errno
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MemoryPath:
-    """A file or folder in memory; all is gone with the last path that leads there."""
+    """A file or folder in memory, which is freed with the last path to it."""
 
     at: str = ""
     _kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
@@ -39,22 +39,22 @@ class MemoryPath:
         return MemoryPath(self.at.rpartition("/")[0], self._kept)
 
     def exists(self) -> bool:
-        """Whether there is such a file or array."""
+        """Whether the file or array exists."""
         return self.at in self._kept
 
     def keep(self, content: Any) -> None:
-        """Put down a file (bytes) or an array."""
+        """Store a file (bytes) or an array."""
         self._kept[self.at] = content
 
     @property
     def array(self) -> "MemoryArray":
-        """The array that is kept there."""
+        """The array stored at this path."""
         found = self._kept[self.at]
         assert isinstance(found, MemoryArray)
         return found
 
     def read_bytes(self) -> bytes:
-        """Content of a file; FileNotFoundError if it is not there."""
+        """Content of a file; FileNotFoundError if it does not exist."""
         found = self._kept.get(self.at)
         if not isinstance(found, bytes):
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self))
@@ -86,7 +86,7 @@ class MemoryBuild:
 
 @dataclass(frozen=True)
 class MemoryArray:
-    """An array in whole chunks, as `pixcal.storage.cube` has them."""
+    """An array in whole chunks, as in `pixcal.storage.cube`."""
 
     values: "NDArray[Any]"
     chunks: tuple[int, ...]

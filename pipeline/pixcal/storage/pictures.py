@@ -1,4 +1,4 @@
-"""Frames in TIFF and PNG files, read by Pillow: greyscale, one frame a page.
+"""Frames in TIFF and PNG files, read by Pillow: greyscale, one frame per page.
 
 Such files have no FITS header. Exposure times are taken from ``headers.csv``
 (`pixcal.storage.sources`), else from the EXIF tag ExposureTime.
@@ -31,12 +31,12 @@ _CODINGS = {
 
 
 def is_picture(start: bytes) -> bool:
-    """Whether a file that begins so is TIFF or PNG."""
+    """Whether a file with this beginning is TIFF or PNG."""
     return start.startswith((b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"))
 
 
 def inspect_picture(source: SourceFile) -> FrameFile:
-    """Frames of a TIFF or PNG file: a page each, all of one size."""
+    """Frames of a TIFF or PNG file: one per page, all of one size."""
     with _opened(source.path) as picture:
         pages = getattr(picture, "n_frames", 1)
         kinds = set()
@@ -100,7 +100,7 @@ def _exposure_s(picture: Image.Image) -> float | None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    """A file opened by Pillow; what its decoders raise becomes one line."""
+    """A file opened by Pillow; errors of its decoders become one line."""
     try:
         with Image.open(path, formats=("TIFF", "PNG")) as picture:
             yield picture

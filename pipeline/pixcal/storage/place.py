@@ -1,4 +1,4 @@
-"""Where cubes may lie: in a folder of this machine, or in one at a URL that fsspec knows."""
+"""Places of cubes: a local folder, or a folder at a URL that fsspec supports."""
 
 import errno
 import os
@@ -13,15 +13,16 @@ from urllib.parse import urlsplit
 from pixcal.model.errors import InputError, PixcalError, RemoteError
 from pixcal.storage.memory import MemoryPath
 
-# what to install for a protocol, where its name does not tell
+# package to install for a protocol, if its name differs
 _EXTRAS = {"s3": "pixcal[s3]", "s3a": "pixcal[s3]", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs"}
 
 
 @dataclass(frozen=True)
 class UrlPath:
-    """A file or folder at a URL, with as much of `pathlib.Path` as the reader of a cube needs.
+    """A file or folder at a URL, with the part of `pathlib.Path` that the reader of a cube needs.
 
-    It holds the URL alone, to be sent anywhere; settings are those of whoever opens it.
+    It holds only the URL, so that it can be sent anywhere; the process that opens it has the
+    settings.
     """
 
     url: str  # such as `s3://bucket/prefix`, without a slash at its end
@@ -65,9 +66,9 @@ Place = Local | UrlPath  # a file or folder, here or at a URL
 
 @contextmanager
 def explained(url: str) -> Iterator[None]:
-    """Turn what the driver of a file system raises into one line that names the URL.
+    """Turn errors of a file-system driver into one line that names the URL.
 
-    FileNotFoundError (with ``strerror``, ``filename``) if it is not there; else RemoteError.
+    FileNotFoundError (with ``strerror``, ``filename``) if it does not exist; else RemoteError.
     """
     try:
         yield
@@ -75,7 +76,7 @@ def explained(url: str) -> Iterator[None]:
         raise
     except FileNotFoundError as error:
         told = " ".join(str(error).split())
-        # Some say no more than the path, which the URL tells already.
+        # Some messages hold only the path, which the URL already gives.
         reason = told if " " in told else os.strerror(errno.ENOENT)
         raise FileNotFoundError(errno.ENOENT, reason, url) from error
     except ImportError as error:
@@ -93,7 +94,7 @@ def explained(url: str) -> Iterator[None]:
 
 
 def parse_place(text: str) -> Place:
-    """The folder that a user means: a path, absolute from now on, or a URL without password."""
+    """Parse a user's folder: a path, made absolute, or a URL without password."""
     scheme, is_url, rest = text.partition("://")
     if not is_url:
         if not text or re.match(r"[A-Za-z][A-Za-z0-9+.-]+:", text):

@@ -1,6 +1,6 @@
-"""Maps of a detector in FITS files, of which one of 46 Mpix need not be in memory.
+"""Maps of a detector in FITS files; a map of 46 Mpix need not be in memory.
 
-The maps that other programs read are written aside, a band of rows at a time, and renamed.
+Products are written aside, a band of rows at a time, and renamed.
 """
 
 import os
@@ -38,7 +38,7 @@ class FitsMap:
 
     @classmethod
     def open(cls, path: Path, extension: str | int = 0) -> "FitsMap":
-        """Read where an image is; DamagedError if it is not there, or not whole and unaltered."""
+        """Locate an image; DamagedError if it is missing, cut or altered."""
         try:
             with fits.open(path, memmap=True) as hdus:
                 hdu: Any = hdus[extension]
@@ -87,7 +87,7 @@ def word_sum(path: Path, start: int, n_bytes: int) -> int:
 
 
 def add_words(total: int, part: bytes, at: int = 0) -> int:
-    """Add the next part of some data, which begins at a byte, to their `word_sum`."""
+    """Add the next part of the data, which begins at byte ``at``, to their `word_sum`."""
     part = bytes(at % 4) + part
     words = np.frombuffer(part + bytes(-len(part) % 4), ">u4")
     total += int(words.sum(dtype=np.uint64))
@@ -97,11 +97,11 @@ def add_words(total: int, part: bytes, at: int = 0) -> int:
 
 
 def encoded(total: int) -> str:
-    """The complement of a `word_sum` as CHECKSUM holds it (FITS 4.0, appendix J.2)."""
+    """The complement of a `word_sum` in the format of CHECKSUM (FITS 4.0, appendix J.2)."""
     columns = []
     for byte in (total ^ 0xFFFFFFFF).to_bytes(4, "big"):
         parts = [byte // 4 + 48 + (byte % 4 if n == 0 else 0) for n in range(4)]
-        # Letters and digits only: what one of a pair gains the other loses.
+        # Letters and digits only: one of a pair is increased and the other decreased.
         while any(58 <= c <= 64 or 91 <= c <= 96 for c in parts):
             for n in (0, 2):
                 if any(58 <= c <= 64 or 91 <= c <= 96 for c in parts[n : n + 2]):
@@ -139,7 +139,7 @@ def write_map(
     ``data, sigma``: (y, x) px, NaN where masked. ``mask``: (y, x) `PixelFlag`. ``cards``: (key,
     value, comment).
     """
-    # Headers of images of this shape, which are nowhere in memory.
+    # Headers of images of this shape, without allocating them.
     maps, flags_ = (np.broadcast_to(np.zeros((), t), data.shape) for t in (">f4", "u1"))
     primary, errors = fits.PrimaryHDU(maps), fits.ImageHDU(maps, name="SIGMA")
     flags = fits.ImageHDU(flags_, name="MASK")
@@ -159,8 +159,8 @@ def write_map(
 
 
 def _write_image(file: BinaryIO, header: fits.Header, source: Rows | NDArray[Any]) -> None:
-    """Append an image with its checksums, which stand before it."""
-    # Nothing of the time in the comments: equal maps, equal bytes.
+    """Append an image; its header holds the checksums."""
+    # No time in the comments, so that equal maps have equal bytes.
     header["CHECKSUM"] = ("0" * 16, "by pixcal")
     header["DATASUM"] = ("0", "by pixcal")
     begin = file.tell()
@@ -182,7 +182,7 @@ def _write_image(file: BinaryIO, header: fits.Header, source: Rows | NDArray[Any
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a map is there and unaltered, header and data."""
+    """Whether a map exists and is unaltered, header and data."""
     try:
         with _checked(path):
             return True
@@ -192,12 +192,12 @@ def is_whole(path: Path) -> bool:
 
 @contextmanager
 def _checked(path: Path) -> Iterator[fits.HDUList]:
-    """The images of a file, every bit of which is as it was written."""
+    """The images of a file, verified by checksum."""
     # CHECKSUM makes the sum of each header and data unit, and so of the file, minus zero.
     if word_sum(path, 0, path.stat().st_size) != 0xFFFFFFFF:
         raise ValueError("altered: its checksum does not match")
     with warnings.catch_warnings():
-        # How astropy tells of a file that is cut.
+        # astropy reports a truncated file by this warning.
         warnings.simplefilter("error", AstropyUserWarning)
         with fits.open(path) as hdus:
             if [hdu.name for hdu in hdus] != ["PRIMARY", "SIGMA", "MASK"]:

@@ -1,4 +1,4 @@
-"""Chunks of a column fetched before they are asked for: an object store answers late, but many."""
+"""Prefetch chunks of a column: an object store has high latency, but serves many requests."""
 
 import asyncio
 from collections.abc import Sequence
@@ -9,14 +9,14 @@ from pixcal.storage.place import UrlPath, explained
 
 File = tuple[str, int]  # name and size (bytes)
 
-AHEAD = 4  # files on their way while one is decoded
+AHEAD = 4  # files in transit while one is decoded
 
-# files that may wait for each thread; nobody asks for those of a column that was left
+# most waiting files per thread; those of an abandoned column are never used
 _KEPT = 2 * AHEAD
 
 
 class ReadAhead:
-    """Reads files below a URL; those that follow are fetched meanwhile, once two came in order."""
+    """Reads files below a URL, and prefetches following ones after two reads in order."""
 
     def __init__(self, path: UrlPath) -> None:
         self.path = path
@@ -26,7 +26,7 @@ class ReadAhead:
         return ReadAhead, (self.path,)
 
     def expected(self) -> dict[File, Future[bytes] | None]:
-        """Files that this thread may ask for next, and those of them that are on their way."""
+        """Files that this thread may read next, with their transfers if begun."""
         found: dict[File, Future[bytes] | None] = self._thread.__dict__.setdefault("expected", {})
         return found
 
@@ -46,11 +46,11 @@ class ReadAhead:
             return fetched.result()
 
     def _fetch(self, file: File) -> Future[bytes] | None:
-        """A read that goes on by itself, where the file system can do that."""
+        """Start an asynchronous read, if the file system supports it."""
         name, size = file
         system, path = (self.path / name).filesystem()
         if not system.async_impl:
             return None
-        # On the loop that fsspec runs in a thread of its own.
+        # On the loop that fsspec runs in its own thread.
         reading = system._cat_file(path, start=0, end=size + 1)
         return asyncio.run_coroutine_threadsafe(reading, system.loop)

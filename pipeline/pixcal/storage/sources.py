@@ -1,4 +1,4 @@
-"""The files of an acquisition: which there are, and whether they are still the same.
+"""The files of an acquisition, and whether they are unchanged.
 
 ``headers.csv`` beside ``acquisition.yaml`` holds header keywords of files that have no header: its
 first column, ``file``, names or globs relative to the folder; the others are named as the keywords
@@ -81,7 +81,7 @@ def _cards(place: str, row: dict[str, str | None]) -> Iterable[tuple[str, str | 
 
 @dataclass(frozen=True)
 class SourceFile:
-    """A file as it was found."""
+    """A file as found."""
 
     CHANGED: ClassVar[str] = (
         "changed while it was being read; wait until the acquisition is complete and run again"
@@ -91,10 +91,10 @@ class SourceFile:
     name: str  # relative to the acquisition's folder, with `/`
     size: int  # bytes
     mtime_ns: int  # time of the last change (ns since 1970)
-    header: Header = ()  # what `headers.csv` says of it
+    header: Header = ()  # its entry in `headers.csv`
 
     def open(self) -> io.FileIO:
-        """Open the file for unbuffered reading; InputError if it is not the one that was found."""
+        """Open the file for unbuffered reading; InputError if it has changed."""
         try:
             handle = io.FileIO(self.path)
         except OSError as error:
@@ -107,11 +107,11 @@ class SourceFile:
         return handle
 
     def check_read(self, handle: io.FileIO) -> None:
-        """Raise InputError if the file behind a handle is not as it was found."""
+        """Raise InputError if the file behind a handle has changed."""
         self._compare(os.fstat(handle.fileno()))
 
     def check_unchanged(self) -> None:
-        """Raise InputError if the file is gone or is not as it was found."""
+        """Raise InputError if the file is missing or has changed."""
         try:
             self._compare(self.path.stat())
         except OSError as error:
@@ -123,7 +123,7 @@ class SourceFile:
 
 
 def unreadable(path: Path, error: OSError) -> InputError:
-    """The InputError that tells why a file cannot be read."""
+    """The InputError with the reason why a file cannot be read."""
     reason = error.strerror or " ".join(str(error).split())
     return InputError(f"{path}: cannot be read ({reason}); restore the file or its permissions")
 
@@ -175,7 +175,7 @@ def _matches(pattern: str, description: Path, place: str) -> set[str]:
     folder = description.parent
     parts = PurePosixPath(pattern).parts
     try:
-        # Not glob.glob, whose '**' follows links to folders, in circles too.
+        # Not glob.glob, whose '**' follows links to folders, even cyclic ones.
         paths = [path for path in folder.glob(pattern) if not path.is_dir()] if parts else []
     except (ValueError, OSError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
@@ -210,7 +210,7 @@ def _source(
         raise InputError(f"{path}: not a regular file; remove it or narrow {key}")
     if facts.st_size == 0:
         raise InputError(f"{path}: empty (0 bytes); copy it again, or remove it")
-    # By device and inode, so that a link under another name is the same frame too.
+    # By device and inode, so that links under another name count as the same frame.
     other = seen.setdefault((facts.st_dev, facts.st_ino), (name, key))
     if other != (name, key):
         raise InputError(

@@ -1,4 +1,4 @@
-"""How every stage of a run works: what it needs is there, then lock, key, build and products."""
+"""Common steps of every stage: check requirements, lock, key, build and products."""
 
 import gc
 import shutil
@@ -19,7 +19,7 @@ from pixcal.storage.place import Local, Place
 
 
 def require(run: Path, name: str) -> Manifest:
-    """Manifest of a stage that must have been run; InputError if not, or in another format."""
+    """Manifest of a required stage; InputError if it was not run, or has another format."""
     if not run.is_dir():
         raise InputError(f"{run}: no such run directory; make one with 'pixcal ingest'")
     stage, folder = STAGES[name], run / name
@@ -50,7 +50,7 @@ def read_acquisition(run: Local) -> Acquisition:
 
 
 def without_fringes(run: Path) -> bool:
-    """Whether the acquisition that was ingested has detector frames alone."""
+    """Whether the ingested acquisition has only detector frames."""
     try:
         return not read_json(run / "ingest" / "acquisition.json")["frames"]["fringes"]
     except (DamagedError, LookupError):
@@ -59,11 +59,11 @@ def without_fringes(run: Path) -> bool:
 
 @contextmanager
 def working(run: Path, *needed: str) -> Iterator[dict[str, str]]:
-    """Hold a run in which some stages must have been run; gives the keys of their artefacts."""
+    """Hold a run with required stages; gives the keys of their artefacts."""
     for name in needed:
         require(run, name)
     with lock(run):
-        # Again: another process may have replaced them until then.
+        # Read again, since another process may have replaced them meanwhile.
         yield {name: require(run, name).key for name in needed}
 
 
@@ -81,18 +81,18 @@ def make(
 ) -> Manifest:
     """Make the artefact of a stage, unless it is up to date, in a run that the caller holds.
 
-    config, inputs : options that the result depends on; keys of what it is made from
+    config, inputs : options that affect the result; keys of its inputs
     body : writes it, into the folder of a `Build`
-    cubes : as of `pixcal.storage.artefact.build`
-    keep : whether an artefact that is up to date can stay as it is
-    publish, published : writes products beside `ArtefactKind.products`; whether they are there
+    cubes : as in `pixcal.storage.artefact.build`
+    keep : whether an artefact that is up to date can be kept
+    publish, published : writes products besides `ArtefactKind.products`; whether they exist
     """
     key = artefact_key(stage.name, stage.format, config, dict(inputs))
     ready = up_to_date(run, stage.name, key)
     stays = ready is not None and keep(ready)
     if ready is None or not stays:
         with build(run, stage.name, stage.format, config, dict(inputs), cubes=cubes) as made:
-            # Objects that exist by now stay: the garbage collector skips them.
+            # Exclude existing objects, which are permanent, from garbage collection.
             gc.freeze()
             try:
                 body(made)
@@ -107,7 +107,7 @@ def make(
 
 
 def _copy_products(run: Path, stage: ArtefactKind) -> None:
-    """Copy files of an artefact to ``RUN/products``; others there that match the pattern go."""
+    """Copy files of an artefact to ``RUN/products``; remove others that match the pattern."""
     pattern = stage.products
     folder, products = run / stage.name, run / "products"
     products.mkdir(exist_ok=True)

@@ -48,7 +48,7 @@ def column(table: Table, name: str, path: Path, option: str) -> F64:
 
 
 def write_table(table: Table, path: Path, *, overwrite: bool) -> None:
-    """Write a table in the format that the file's name ends in."""
+    """Write a table in the format given by the file's extension."""
     if path.exists() and not overwrite:
         raise InputError(f"{path}: exists; choose another --out, or add --overwrite")
     kinds = {".csv": "ascii.csv", ".ecsv": "ascii.ecsv", ".fits": "fits", ".vot": "votable"}
@@ -58,7 +58,7 @@ def write_table(table: Table, path: Path, *, overwrite: bool) -> None:
 
 
 def distortion(correction: F32) -> WCS:
-    """A WCS whose step from detector to image adds a correction (2, y, x) to x and y, px."""
+    """A WCS whose detector-to-image step adds a correction (2, y, x) to x and y, px."""
     _, ny, nx = correction.shape
     wcs = WCS(naxis=2)
     wcs.pixel_shape = (nx, ny)
@@ -72,7 +72,7 @@ def distortion(correction: F32) -> WCS:
 
 
 def write_distortion(wcs: WCS, path: Path, history: str) -> None:
-    """Write a WCS with its tables as a FITS file; one that is there is replaced."""
+    """Write a WCS with its tables as a FITS file; replaces an existing file."""
     hdus = wcs.to_fits(relax=True)
     hdus[0].header["CREATOR"] = (f"pixcal {__version__}", "program that wrote this file")
     hdus[0].header.add_history(history)

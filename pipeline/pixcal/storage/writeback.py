@@ -1,7 +1,7 @@
-"""Files on their way to the disk while others are still being made.
+"""Flush files to disk while others are still being written.
 
-The kernel keeps what was written for half a minute, and whoever completes an artefact would wait
-for all of it at once.
+The kernel holds written data for half a minute, so completing an artefact would wait for all of it
+at once.
 """
 
 import os
@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from queue import SimpleQueue
 
-LARGE = 1 << 18  # bytes of a file from which it is worth a request of its own
+LARGE = 1 << 18  # least bytes of a file for a separate request
 
 
 class _Writeback:
@@ -47,26 +47,26 @@ class _Writeback:
 
 @cache
 def _writeback() -> _Writeback:
-    """Of this process."""
+    """The writeback thread of this process."""
     return _Writeback()
 
 
-# A process that is forked has no such thread.
+# A forked process does not inherit the thread.
 os.register_at_fork(after_in_child=_writeback.cache_clear)
 
 
 def begin(file: Path) -> None:
-    """Start to flush a file to the disk; returns at once."""
+    """Start to flush a file to disk; returns at once."""
     _writeback().begin(file)
 
 
 def wait() -> None:
-    """Wait for all files that were begun; OSError if one of them could not be written."""
+    """Wait for all flushes; OSError if a file could not be written."""
     _writeback().wait()
 
 
 def flush_file(path: str | Path) -> None:
-    """See to it that a file, or the names in a folder, are on the disk; one that is gone is not."""
+    """Flush a file, or the entries of a folder, to disk; ignores a missing one."""
     with suppress(FileNotFoundError):
         handle = os.open(path, os.O_RDONLY)
         try:
