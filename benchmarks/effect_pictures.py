@@ -41,7 +41,7 @@ class Maps:
 
 
 def fitted(folder: Path, on: dict[str, Any], detector: dict[str, Any] | None = None) -> Maps:
-    """Maps of the bench with some effects."""
+    """Fitted maps of the bench with given effects."""
     bench = yaml.safe_load((ROOT / "configs" / "effects.yaml").read_text(encoding="utf-8"))
     bench["effects"] = on
     bench["detector"] |= detector or {}

@@ -63,7 +63,7 @@ def examine(case: Case) -> dict[str, Any]:
 
 
 def deviation(name: str, true: float, estimate: float, error: float) -> float:
-    """Of a parameter, over its error; of a variance that is nothing, not of its root."""
+    """Deviation of a parameter over its error; if a variance is zero, of it, not of its root."""
     if true or not any(word in name for word in ROOTS):
         return (estimate - true) / error
     # The error is the longer side of the root of the variance's interval.

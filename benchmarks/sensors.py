@@ -48,7 +48,7 @@ def examine(
 
 
 def mark(run: Path, truth: dict[str, Any]) -> dict[str, Any]:
-    """What a run found, beside the truth."""
+    """Results of a run next to the truth."""
     opened = pixcal.open_run(run)
     figures = opened.reduction["figures_of_merit"]
 
@@ -56,7 +56,7 @@ def mark(run: Path, truth: dict[str, Any]) -> dict[str, Any]:
         found = figures.get(name, {}).get("value")
         return float("nan") if found is None else float(found)
 
-    # The read noise that was drawn is that of single pixels.
+    # The drawn read noise is that of single pixels.
     shared = sum(figures.get(f"{line}_noise", {}).get("value", 0.0) ** 2 for line in LINES)
     noise = np.sqrt(max(value("read_noise") ** 2 - shared, 0.0))
 

@@ -1,4 +1,4 @@
-"""A simulated fringe set's truth: how far a map is from it, and how near it could be."""
+"""Truth of a simulated fringe set: the error of a map, and its Cramér-Rao bound."""
 
 import json
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ PLANE = 3
 
 @dataclass(frozen=True)
 class Truth:
-    """What the simulator knows of the offsets along a set's fringe axis."""
+    """True offsets along a set's fringe axis."""
 
     delta: F64  # (y, x) offsets along the fringe axis, px
     vector: tuple[float, float]  # true fringe vector (kx, ky), rad/px
@@ -59,13 +59,13 @@ class Truth:
         return cls((kx * delta_x + ky * delta_y) / k, (kx, ky), bound)
 
     def offsets(self, phase: F64) -> F64:
-        """Offsets along the fringe axis, px, of a map of phases in rad (y, x), modulo a turn."""
+        """Offsets along the fringe axis, px, from a map of phases (y, x), rad, modulo 2π."""
         y, x = np.indices(phase.shape)
         rest = np.exp(1j * (phase - self.vector[0] * x - self.vector[1] * y))
         return np.asarray(np.angle(rest / np.nanmean(rest)) / np.hypot(*self.vector))
 
     def error(self, offsets: F64, modes: int | None = None) -> float:
-        """Error of a map, px rms, less what the modes explain of it.
+        """Error of a map, px rms, with modes removed.
 
         Parameters
         ----------

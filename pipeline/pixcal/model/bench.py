@@ -289,7 +289,7 @@ class SimulatedFrames:
         return datetime.fromisoformat(self.start).replace(tzinfo=None)
 
 
-# Here, not where they are used: a diagnosis asks for them thousands of times.
+# Computed once, because a diagnosis uses them thousands of times.
 _OPTICS_OF_SETS = {f.name for f in fields(SimulatedOptics)} & {f.name for f in fields(SimulatedSet)}
 
 

@@ -1,4 +1,4 @@
-"""Which code this is: that of a result, of an unfinished build, of another process."""
+"""Identity of the code of a result, an unfinished build or another process."""
 
 import hashlib
 from functools import cache

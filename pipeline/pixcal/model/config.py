@@ -112,7 +112,7 @@ def _section(cls: type[T], data: Any, place: _Place) -> T:
     try:
         return cls(**values)
     except InputError as error:
-        # Most begin with the key of the value that does not go with the others.
+        # Most messages begin with the key of the inconsistent value.
         line = lines.get(re.split(r"[:\[]", str(error))[0], place.line)
         raise dataclasses.replace(place, line=line).wrong(str(error)) from error
 

@@ -6,7 +6,7 @@ from matplotlib.colors import ListedColormap, to_rgb
 
 from pixcal.model.arrays import F64
 
-LEVELS = 81  # steps of a colour scale: with all others they fit the 256 colours of a small PNG
+LEVELS = 81  # steps of a colour scale: all scales together fit the 256 colours of a small PNG
 
 # where there is no value
 MASKED = "#9b9b9b"

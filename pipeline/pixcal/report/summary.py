@@ -1,7 +1,7 @@
 """Reduce maps of any size to the contents of a figure, in one pass over bands of rows.
 
-A map of 46 Mpix does not fit on a page: it is shown as means of n × n pixels. Profiles, counts and
-spectra use all pixels.
+A map of 46 Mpix does not fit on a page: it is shown as means of n × n pixels. Profiles and counts
+use all pixels; spectra use windows spread over the map.
 """
 
 from collections.abc import Iterator

@@ -27,10 +27,10 @@ from pixcal.stages.crests.windows import (
     solve_windows,
 )
 
-MAX_SIGMA = 0.2  # windows whose phase is known worse (rad) hold no fringes to speak of
-MIN_COVERAGE = 0.5  # share of a window's pixels that must be there and good
+MAX_SIGMA = 0.2  # phase error (rad) above which a window counts as without fringes
+MIN_COVERAGE = 0.5  # least share of a window's pixels that exist and are good
 MIN_POINTS = 12  # fewest windows with fringes: as many again as the geometry has parameters
-# a vector farther from the nominal one, as a share of it, is not the fringes' but the beam's
+# relative distance from the nominal vector above which a vector is the beam's, not the fringes'
 MAX_AWAY = 0.5
 SEED_PIXELS = 256  # side of the patch where the fringe vector is first sought
 # passes over the first frame: curvature left by the second moves points by some 1e-6 rad
@@ -136,7 +136,7 @@ def find_crests(
             continue
         phi[n] = np.angle((precision * np.exp(1j * phase)).sum())
         residual = _wrapped(phase - phi[n])
-        # A whole radian from the carrier is no fringe that the polynomial could follow.
+        # More than a radian from the carrier is beyond the reach of the polynomial.
         precision[np.abs(residual) > 1] = 0
         total += precision * residual
         weight += precision
@@ -206,7 +206,7 @@ def _highest_degree(windows: Windows, number: int) -> int:
 
 
 def _brightened(windows: Windows, light: F64, sigma: F64, carrier: CrestCarrier) -> F64:
-    """Logarithm of the illumination: what it was times the light of the windows with fringes."""
+    """Logarithm of the previous illumination times the light of the windows with fringes."""
     use = np.isfinite(sigma) & (light > 0)
     y, x = carrier.scaled(*(c[use] for c in windows.centres))
     basis, powers = _design(y, x, _highest_degree(windows, len(y)))

@@ -118,7 +118,7 @@ def _trace(
     k = seed_vector(*read_patch(source, frames[0], y, x), nominal)
     _, rows, columns = source.signal.chunks
     strips = [(at, at + rows) for at in range(0, source.shape[0], rows)]
-    # A chunk, a strip of one frame with its mask; the sums, those on their way, their solution.
+    # A chunk, a strip of one frame with its mask; the sums, sums in transit, their solution.
     task = 2 * int(np.prod(source.signal.chunks)) + 16 * rows * (source.shape[1] + columns)
     held = 4 * 8 * N_SUMS * int(np.prod(Windows.lay(source.shape, k, config.segment).shape))
     runtime = within_memory(f"the crests of {name}", task, held + FIGURE_BYTES, runtime)
@@ -126,7 +126,7 @@ def _trace(
     def accumulate(frame: int, windows: Windows, carrier: CrestCarrier) -> F64:
         task = partial(_strip_task, source, frames[frame], windows, carrier)
         sums = np.zeros((*windows.shape, N_SUMS))
-        # In the order of the strips, whoever was first: the same sums to the last bit.
+        # Added in the order of the strips, so that sums are equal to the last bit.
         for (i, j), part in run_tasks(task, strips, runtime, label=f"crests {name}"):
             sums[i : i + part.shape[0], j : j + part.shape[1]] += part
         return sums
@@ -156,7 +156,7 @@ def _write_arrays(folder: Path, paths: CrestPaths, fit: CrestFit) -> dict[str, N
     distances = distance * (1 + MAP_REACH * steps)
     lengths = length * (1 + MAP_REACH * steps)
     best, cost = valley(paths, fit, distances)
-    # As wide as the valley wanders, and wide enough to see its walls.
+    # Wide enough for the drift of the valley and for its walls.
     ratios = middle + max(2 * float(np.max(np.abs(best - middle))), 1e-5 * middle) * steps
     held = cost_map(paths, fit, distances, lengths, ratio=False, refit=False)
     refitted = cost_map(paths, fit, distances, ratios, ratio=True, refit=True)

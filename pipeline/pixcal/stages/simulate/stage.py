@@ -49,7 +49,7 @@ from pixcal.storage.manifest import (
 )
 
 STAGE, TRUTH = STAGES["simulate"], STAGES["simulate-truth"]
-FRAMES_PER_TASK = 128  # the maps of some rows are made once for so many frames
+FRAMES_PER_TASK = 128  # frames for which the maps of a block of rows are computed once
 
 # peak of a task for each pixel of its rows: maps, phases in float64, one frame (measured)
 _BYTES_PER_PIXEL = 160
@@ -98,7 +98,7 @@ def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
     own = {f"effect {file.name}": file_digest(file) for file in config.own}
     key = artefact_key(STAGE.name, STAGE.format, to_plain(plan), own)
     before = there.up_to_date(key)
-    # Both are looked at, so that nothing else is in the way of either.
+    # Check both, so that other files at either place are refused.
     if apart.up_to_date(key) and before:
         return before
     with lock(there.aside), there.building() as made, apart.building() as truth_made:
