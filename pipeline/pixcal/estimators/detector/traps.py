@@ -21,7 +21,7 @@ from pixcal.model.arrays import F32, F64
 
 BANDS = (0.0, 0.125, 0.25, 0.5)  # where bands of the level begin, over the full scale
 STEP = 0.03  # relative step of a parameter for its derivative
-SLOW = (2, 1)  # powers of the time, and harmonics of the phase, that the contrast is free to have
+SLOW = (2, 2)  # powers of the time, and harmonics of the phase, that the contrast is free to have
 UNKNOWN = 6  # frames after a gap, whose past is not known
 CONVERGED = 1.0  # fall in chi-square that a step must bring
 # factors of a step that are tried: the samples that fill the traps change with the step
@@ -188,7 +188,7 @@ class _Set:
         self._to_contrast = np.stack([-1 / b, c / amplitude**2, s / amplitude**2], axis=1)
         time, phase = np.linspace(-1, 1, len(b)), np.arctan2(s, c)
         slow = [time**n for n in range(SLOW[0] + 1)]
-        for n in range(1, SLOW[1] + 2):
+        for n in range(1, SLOW[1] + 1):
             slow += [np.cos(n * phase), np.sin(n * phase)]
         self._slow = np.linalg.svd(np.stack(slow).T, full_matrices=False)[0]
         self._contrast = self._without_slow(np.log(amplitude / b))
