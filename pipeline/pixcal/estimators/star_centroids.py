@@ -1,14 +1,14 @@
 """Centroids of stars by a PSF fit, the effect of wrong pixel positions, and its correction.
 
-A pixel whose response lies at (x + dx, y + dy) receives of a star at (a, b), with N electrons on a
-background of B in each pixel,
+From a star at (a, b), with N electrons on a background of B in each pixel, a pixel whose response
+lies at (x + dx, y + dy) receives
 
     S = N P(x + dx - a, y + dy - b) + B
 
 (P: `pixcal.kernels.psf`). a, b, N and B are fitted by Fisher scoring with weights 1 / (S + r²).
-Where the fit takes pixels to lie elsewhere, the centroid is wrong, to first order by a weighted sum
-of the pixels' errors about their mean, each with the weight P_x² / S. A map of offsets corrects
-centroids on a perfect grid by the same sum (docs/explanation/centroid-errors.md).
+If the fit assumes wrong pixel positions, the centroid is wrong, to first order by a weighted sum of
+the pixels' errors about their mean, with weights P_x² / S. A map of offsets corrects centroids on a
+perfect grid by the same sum (docs/explanation/centroid-errors.md).
 """
 
 import math
@@ -24,16 +24,16 @@ from pixcal.kernels.normal_matrix import root_diagonal
 from pixcal.kernels.psf import MARGIN, Psf
 from pixcal.model.arrays import F32, F64, Mask
 
-# least variance of a pixel, as a share of the star's electrons: dark rings weigh no more
+# least variance of a pixel, as a share of the star's electrons, to limit the weight of dark rings
 TINY = 1e-9
 MAX_STEPS = 50
-PRECISION = 1e-9  # a fit has ended when its last step is shorter, px
-SINGULAR = 1e-12  # least eigenvalue of a normal matrix of unit diagonal that is solved
-# share of a star's weights on pixels without an offset beyond which it is not corrected
+PRECISION = 1e-9  # step below which a fit has converged, px
+SINGULAR = 1e-12  # least eigenvalue of a regular normal matrix of unit diagonal
+# largest share of a star's weights on pixels without an offset for which it is corrected
 MAX_UNKNOWN = 0.1
 _SIGMA_OF_FWHM = 1 / math.sqrt(8 * math.log(2))
 _KNOTS = 24
-_FAINT = 1e12  # variance of a pixel beside which that of the star's own light does not count, e-²
+_FAINT = 1e12  # variance of a pixel that makes the star's shot noise negligible, e-²
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,10 @@ class Star:
     """A star as it is observed and fitted."""
 
     psf: Psf
-    half: int  # the window has 2 half + 1 pixels a side, the middle one nearest to the star
+    half: int  # the window's side is 2 half + 1 pixels; the star is nearest to the central one
     electrons: float  # photo-electrons of the star, N
     background: float = 0.0  # of each pixel, e-, B
-    read_variance: float = 0.0  # of each pixel, all read-outs together, e-², r²
+    read_variance: float = 0.0  # of each pixel, summed over all read-outs, e-², r²
 
     @property
     def side(self) -> int:
@@ -52,19 +52,19 @@ class Star:
         return 2 * self.half + 1
 
     def expected(self, place: F64, offsets: F64) -> F64:
-        """Mean electrons (n, side, side) of stars at places (n, 2), px from the middle.
+        """Mean electrons (n, side, side) of stars at places (n, 2), px from the window's centre.
 
         ``offsets``: (n, 2, side, side) of the pixels, px.
         """
         return np.asarray(self.electrons * self._at(place, offsets)[0] + self.background)
 
     def fit(self, data: F64, offsets: F64, good: Mask) -> F64:
-        """Fit each star from the middle of its window: a, b (px), N, B (e-), (n, 4).
+        """Fit each star, starting at the centre of its window: a, b (px), N, B (e-), (n, 4).
 
-        Of electrons and pixels to use (n, side, side), and of where the fit takes the pixels to
-        lie, (dx, dy) (n, 2, side, side), px. NaN where the fit does not end.
+        ``data`` and ``good``: electrons, and pixels to use (n, side, side). ``offsets``: assumed
+        (dx, dy) of the pixels (n, 2, side, side), px. NaN where the fit does not converge.
         """
-        # What pixels that are not used hold may be anything.
+        # Excluded pixels may have any value.
         data, offsets = np.where(good, data, 0.0), np.where(good[:, None], offsets, 0.0)
         found = np.full((len(data), 4), np.nan)
         theta = np.tile([0.0, 0.0, self.electrons, self.background], (len(data), 1))
@@ -77,7 +77,7 @@ class Star:
             rest = (data[left] - mean).reshape(len(left), -1, 1)
             step, told = _solved(weighted @ slopes.swapaxes(1, 2), (weighted @ rest)[:, :, 0])
             length = np.hypot(step[:, 0], step[:, 1])
-            # No further than half a pixel at once: the shape is not linear beyond.
+            # Steps of at most half a pixel, beyond which the PSF is not linear.
             own = own + np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None] * step
             inside = told & (np.hypot(own[:, 0], own[:, 1]) < self.side / 2)
             done = inside & (length < PRECISION)
@@ -88,12 +88,12 @@ class Star:
         return found
 
     def information(self, place: F64) -> F64:
-        """Fisher's information of a, b, N and B: (4, 4)."""
+        """Fisher information of a, b, N and B: (4, 4)."""
         jacobian, weight, _ = self._of_pixels(place, None)
         return np.asarray(np.einsum("iyx,jyx,yx->ij", jacobian, jacobian, weight))
 
     def bound(self, place: F64 | None = None) -> F64:
-        """Cramér-Rao bound of the centroid (x, y), px, N and B fitted; else rms over a pixel."""
+        """Cramér-Rao bound of the centroid (x, y), px, N and B free; None: rms over a pixel."""
         if place is not None:
             return np.asarray(np.sqrt(np.diag(np.linalg.inv(self.information(place)))[:2]))
         places = np.indices((4, 4)).reshape(2, -1).T / 4 - 0.375
@@ -102,8 +102,8 @@ class Star:
     def weights(self, place: F64, good: Mask | None = None) -> F64:
         """Error of the centroid (x, y) per displacement of each pixel (2, 2, side, side).
 
-        For a star at ``place`` (x, y), px from the middle of its pixel, fitted with all or the good
-        pixels, which the fit takes to be in place.
+        For a star at ``place`` (x, y), px from the centre of its pixel, fitted with all or the good
+        pixels, assumed to lie on a perfect grid.
         """
         jacobian, weight, slopes = self._of_pixels(place, good)
         covariance = np.linalg.inv(np.einsum("iyx,jyx,yx->ij", jacobian, jacobian, weight))
@@ -112,13 +112,13 @@ class Star:
         )
 
     def _of_pixels(self, place: F64, good: Mask | None) -> tuple[F64, F64, F64]:
-        """Of one star: derivatives by a, b, N, B; weights; derivatives by the pixels' places."""
+        """For one star: derivatives by a, b, N, B; weights; derivatives by pixel position."""
         theta = np.array([[*place, self.electrons, self.background]])
         jacobian, weight, _, slopes = (part[0] for part in self._linear(theta))
         return jacobian, weight if good is None else weight * good, slopes
 
     def _linear(self, theta: F64, offsets: F64 | None = None) -> tuple[F64, F64, F64, F64]:
-        """About a, b, N, B (n, 4): derivatives by them, weights, mean, derivatives by the place."""
+        """At a, b, N, B (n, 4): derivatives by them, weights, mean, derivatives by position."""
         value, along_x, along_y = self._at(theta[:, :2], offsets)
         electrons, background = theta[:, 2:, None, None].swapaxes(0, 1)
         slopes = electrons[:, None] * np.stack([along_x, along_y], axis=1)
@@ -128,7 +128,7 @@ class Star:
         return np.concatenate([-slopes, more], axis=1), weight, mean, slopes
 
     def _at(self, place: F64, offsets: F64 | None) -> F64:
-        """Share of the light (3, n, side, side) that pixels receive, and its derivatives."""
+        """Share of the star's light that pixels receive, and its derivatives (3, n, side, side)."""
         y, x = np.mgrid[-self.half : self.half + 1, -self.half : self.half + 1]
         a, b = place.T[:, :, None, None]
         dx, dy = (0.0, 0.0) if offsets is None else offsets.swapaxes(0, 1)
@@ -136,7 +136,7 @@ class Star:
 
 
 def _solved(normal: F64, right: F64) -> tuple[F64, Mask]:
-    """Solutions (n, m) of normal equations, and which there are; the others are zero."""
+    """Solutions (n, m) of normal equations, zero if singular; mask of the regular ones."""
     scale = root_diagonal(normal)
     unit = normal / (scale[:, :, None] * scale[:, None, :])
     told = np.linalg.eigvalsh(unit)[:, 0] > SINGULAR
@@ -146,10 +146,10 @@ def _solved(normal: F64, right: F64) -> tuple[F64, Mask]:
 
 
 def gaussian_star(fwhm: float, electrons: float | None, read_noise: float) -> Star:
-    """A Gaussian star of a full width at half maximum, px, averaged over square pixels.
+    """A Gaussian star of given full width at half maximum, px, averaged over square pixels.
 
-    Its ``electrons`` set the weights of its fit by photon noise; None where all pixels of the fit
-    count alike. ``read_noise`` in e-.
+    Its ``electrons`` set the fit's weights by photon noise; None gives all pixels equal weight.
+    ``read_noise`` in e-.
     """
     sigma = fwhm * _SIGMA_OF_FWHM
     half = max(2, math.ceil(4 * sigma))
@@ -167,12 +167,11 @@ def gaussian_star(fwhm: float, electrons: float | None, read_noise: float) -> St
 
 @dataclass(frozen=True)
 class Corrected:
-    """Places of stars."""
+    """Corrected positions of stars."""
 
-    # (n, 2) (x, y), px, the first pixel's centre being 0; NaN where too little is known of the
-    # pixels
+    # (n, 2) (x, y), px, 0 at the first pixel's centre; NaN where too many pixels lack an offset
     place: F64
-    error: F64  # (n, 2) what the errors of the map leave in it, px, 1 sigma
+    error: F64  # (n, 2) its error due to the errors of the map, px, 1 sigma
 
 
 def correct_centroids(
@@ -186,7 +185,7 @@ def correct_centroids(
     corrected, error = np.full((2, *place.shape), np.nan)
     around = np.arange(-star.half, star.half + 1)
     inside = np.isfinite(place).all(axis=1)
-    # Far from the detector, and beyond what integers hold.
+    # Exclude places far from the detector, which could overflow integers.
     inside &= (np.abs(np.nan_to_num(place)) < 2 * max(ny, nx)).all(axis=1)
     for n in np.flatnonzero(inside):
         middle = np.rint(place[n]).astype(int)
@@ -205,7 +204,7 @@ def correct_centroids(
 
 
 def correction_map(offsets: NDArray[np.floating], star: Star | None) -> F32:
-    """Correction (2, y, x) of a star's, or a pixel's, centroid; offsets (2, y, x), px, NaN as 0."""
+    """Correction (2, y, x) of a star's (None: a pixel's) centroid, px; NaN offsets count as 0."""
     known = np.nan_to_num(offsets.astype(np.float32))
     if star is None:
         return known

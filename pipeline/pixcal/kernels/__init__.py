@@ -1,7 +1,7 @@
 """Pure array mathematics: no files, no configuration, no scheduling.
 
-Numba keeps compiled kernels beside the code or with the user, and refuses to import a kernel where
-neither can be written: they are then kept as long as the process lives.
+Numba caches compiled kernels next to the code or in the user's cache, and refuses to import a
+kernel if neither is writable: the cache then lasts as long as the process.
 """
 
 import atexit
@@ -14,13 +14,13 @@ import numba
 
 
 def _probe() -> None:
-    """Never called: only where it would be kept matters."""
+    """Never called: only the place of its cache matters."""
 
 
 try:
     numba.njit(cache=True)(_probe)
 except RuntimeError:
-    # Of this process alone: what others could write there would be run.
+    # Private to this process, because code that others could write there would be run.
     numba.config.CACHE_DIR = tempfile.mkdtemp(prefix="pixcal-")
     atexit.register(shutil.rmtree, numba.config.CACHE_DIR, ignore_errors=True)
 
@@ -29,7 +29,7 @@ Decorator = Callable[[Callable[..., Any]], Any]
 
 
 def kernel(**options: Any) -> Decorator:
-    """Compile a function, and keep it; other threads run while it does."""
+    """Compile a function, and cache it; it releases the interpreter lock."""
     decorate: Decorator = numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True, **options)
     return decorate
 
@@ -37,8 +37,8 @@ def kernel(**options: Any) -> Decorator:
 def inner(**options: Any) -> Decorator:
     """Compile a function that only kernels call, as a part of them.
 
-    It is neither cached nor callable from Python by itself; compiling large kernels takes a tenth
-    less time so.
+    It is neither cached separately nor callable from Python, which saves a tenth of the compiling
+    time of large kernels.
     """
     decorate: Decorator = numba.njit(
         nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F64
 
-# series whose running sums are held at the same time: they stay in the processor's cache
+# series whose running sums are kept at the same time, to fit the processor's cache
 PIXELS_AT_ONCE = 128
 
 
 def averaging_lengths(n_batches: int) -> tuple[int, ...]:
-    """Octaves and what lies between (1, 2, 3, 4, 6, 8, 12, …), up to a third of the batches."""
+    """Powers of two and steps between (1, 2, 3, 4, 6, 8, 12, …), up to a third of the batches."""
     octaves = [1 << n for n in range(n_batches.bit_length())]
     lengths = sorted({*octaves, *(3 * m for m in octaves)})
     return tuple(m for m in lengths if m <= n_batches // 3)
@@ -25,8 +25,8 @@ def allan_deviation(series: NDArray[np.floating], lengths: Sequence[int]) -> F64
 
     .. math:: \sigma^2(m) = \tfrac12 \langle (\bar y_{k+m} - \bar y_k)^2 \rangle_k
 
-    with :math:`\bar y_k` the mean of ``m`` batches from ``k`` on. A missing batch takes away every
-    mean that it is part of; what it leaves is never joined over the gap.
+    with :math:`\bar y_k` the mean of ``m`` batches from ``k`` on. Means with a missing batch are
+    left out; batches on both sides of a gap are never joined.
 
     Parameters
     ----------
@@ -35,10 +35,10 @@ def allan_deviation(series: NDArray[np.floating], lengths: Sequence[int]) -> F64
 
     Returns
     -------
-    (length, pixel) float64; NaN where no two means are left
+    (length, pixel) float64; NaN where there is no pair of means
     """
     out = np.empty((len(lengths), series.shape[1]))
-    # Not in compiled code: numpy's functions take longer to compile than loops.
+    # Outside compiled code, because numpy's functions take longer to compile than loops.
     running, sums = np.zeros((2, len(series) + 1, PIXELS_AT_ONCE)), np.empty((2, PIXELS_AT_ONCE))
     given = np.ascontiguousarray(series), np.array(lengths, dtype=np.int64)
     _deviations(*given, *running, *sums, out)
@@ -79,10 +79,10 @@ def _add_difference(total, missing, k, m, squares, count):  # type: ignore[no-un
 
 
 def disjoint_differences(series: NDArray[np.floating], m: int, most: int) -> F64:
-    """Differences (difference, pixel) of neighbouring means of ``m`` batches that share no batch.
+    """Differences (difference, pixel) of successive means of ``m`` batches; no batch is used twice.
 
-    In white noise they are independent in time, so that their products measure what pixels share.
-    Of a series as in `allan_deviation`; at most ``most`` of them, spread over it.
+    In white noise they are independent in time, so that their products measure the correlation of
+    pixels. At most ``most`` differences, spread over a series as in `allan_deviation`.
     """
     pairs = len(series) // (2 * m)
     chosen = np.unique(np.linspace(0, pairs - 1, min(pairs, most)).round().astype(np.int64))

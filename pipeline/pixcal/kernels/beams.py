@@ -1,13 +1,13 @@
-"""Light as a sum of coherent beams, and what pixels collect of it.
+"""Light as a sum of coherent beams, and the part that pixels collect.
 
-At place r and in frame t, beam j of amplitude a_j, static phase theta_j and phase phi_j of its
-fibre adds to the field; light S interferes with nothing:
+The intensity at place r in frame t, from beams j of amplitude a_j, static phase theta_j and fibre
+phase phi_j, and incoherent light S, is
 
     I(r, t) = sum_j a_j² + 2 sum_{j<k} gamma_jk a_j a_k cos(theta_j - theta_k + phi_j - phi_k) + S
 
-One fibre is modulated. What beams of one fibre make together stands still and belongs to the mean
-light; what beams of both make follows the modulator (Born & Wolf, Principles of Optics, sections
-7.2 and 10.3).
+One fibre is modulated. Interference of beams of the same fibre is static and belongs to the mean
+light; interference of beams of both fibres follows the modulator (Born & Wolf, Principles of
+Optics, sections 7.2 and 10.3).
 """
 
 from collections.abc import Sequence
@@ -26,10 +26,10 @@ MODULATED, FIXED = "modulated", "fixed"  # the fibres
 class Beam:
     """A coherent beam on rows of the window."""
 
-    amplitude: F64  # (y, x) its square is what a pixel of unit response collects of it alone, e-
-    phase: F64 | float  # (y, x) rad, at the places of the pixels
+    amplitude: F64  # (y, x) its square: light that a pixel of unit response collects from it, e-
+    phase: F64 | float  # (y, x) rad, at the positions of the pixels
     fibre: str = FIXED
-    crossed: bool = False  # in polarisation with the other fibre: they do not interfere
+    crossed: bool = False  # polarised orthogonally to the other fibre, so they do not interfere
 
     @cached_property
     def field(self) -> C128:
@@ -37,18 +37,18 @@ class Beam:
         return np.asarray(self.amplitude * np.exp(1j * self.phase))
 
     def delayed(self, phase: F64) -> Self:
-        """The same beam by a longer way: phase (y, x) added, rad."""
+        """The same beam over a longer path: phase (y, x) added, rad."""
         return replace(self, phase=self.phase + phase)
 
     def reflected(self, share: float, phase: F64, *, crossed: bool = False) -> Self:
-        """A ghost of it: ``share`` of its amplitude, at a phase (y, x) from it, rad."""
+        """A ghost of the beam: ``share`` of its amplitude, phase (y, x) added, rad."""
         ghost = replace(self, amplitude=share * self.amplitude, crossed=self.crossed or crossed)
         return ghost.delayed(phase)
 
 
 @dataclass(frozen=True)
 class LightMaps:
-    """What pixels collect of the fringes on rows of the window, for `synthesis.illuminate`; e-."""
+    """Fringes that pixels collect on rows of the window, for `synthesis.illuminate`; e-."""
 
     iota: F32
     alpha_sin: F32
@@ -70,12 +70,12 @@ class Light:
     """All light of a recording on rows of the window, before the pixels."""
 
     beams: tuple[Beam, ...]
-    coherence: F64 | float = 1.0  # (y, x) of the fibres with each other
+    coherence: F64 | float = 1.0  # (y, x) mutual coherence of the fibres
     incoherent: F64 | float = 0.0  # (y, x) e-
 
     @classmethod
     def of_fringes(cls, iota: F64, phasor: C128) -> Self:
-        """Two equal beams that make these maps (y, x): mean light, and amplitude and phase."""
+        """Two equal beams that give these maps (y, x): mean light, complex fringe amplitude."""
         each = np.sqrt(np.maximum(iota, 0) / 2)
         size = np.abs(phasor)
         coherence = np.divide(size, iota, out=np.zeros_like(size), where=iota > 0)
@@ -83,7 +83,7 @@ class Light:
 
     @cached_property
     def power(self) -> F64:
-        """Light (y, x) of the beams, each by itself, e-."""
+        """Sum (y, x) of the beams without interference, e-."""
         return np.asarray(sum(beam.amplitude**2 for beam in self.beams))
 
     @cached_property
@@ -99,21 +99,21 @@ class Light:
         return np.asarray(2 * self.coherence * one * np.conj(other))
 
     def collected(self, response: F32) -> LightMaps:
-        """What pixels of a response (y, x) collect."""
+        """Light that pixels of given response (y, x) collect."""
         return LightMaps.of(response * self.mean, response * self.phasor)
 
     def masked(self, transmission: F64) -> Self:
-        """Behind a mask (y, x)."""
+        """The light behind a mask of given transmission (y, x)."""
         beams = (replace(b, amplitude=b.amplitude * np.sqrt(transmission)) for b in self.beams)
         dimmed = self.incoherent * transmission
         return replace(self, beams=tuple(beams), incoherent=dimmed)
 
     def with_beams(self, more: Sequence[Beam]) -> Self:
-        """With more beams."""
+        """The light with further beams."""
         return replace(self, beams=(*self.beams, *more))
 
     def with_incoherent(self, more: F64) -> Self:
-        """With more light (y, x), e-, that interferes with nothing."""
+        """The light with further incoherent light (y, x), e-."""
         return replace(self, incoherent=self.incoherent + more)
 
     def _field(self, fibre: str, *, crossed: bool = True) -> C128:
@@ -122,10 +122,10 @@ class Light:
 
 
 def with_margin(light: LightMaps, margin: int) -> LightMaps:
-    """The light with a margin of pixels like those at the edge, in which the fringes go on.
+    """The light with a margin of pixels like those at the edge, in which the fringes continue.
 
-    By the step of the phase along each row, and from row to row at the edge: a piece of the window
-    has the same margin as the whole where both end.
+    The phase continues by its step along each row, and from row to row at the edge, so a part of
+    the window has the same margin as the whole at common edges.
     """
     z = light.alpha_cos + 1j * light.alpha_sin
     beyond = np.arange(1, margin + 1)

@@ -1,16 +1,16 @@
-"""Compiled sums of the bilinear fringe model: one file, whose changes Numba's cache notices.
+"""Compiled sums of the bilinear fringe model, in one file so that Numba's cache notices changes.
 
-The model (paper, equation 2; physics note, section 2) is linear in the pixel's parameters when the
-frame's are known, and the other way round::
+The model (paper, equation 2; physics note, section 2) is linear in the pixel's parameters if the
+frame's are known, and vice versa::
 
     I[t, p] = theta[p] . g[t]     theta = (iota, alpha sin psi, alpha cos psi)
                                   g     = (B, A cos phi, A sin phi)
 
-A frame whose fringe vector moved by dk turns its phase by ``dk . r``. Samples are stored codes
-``electrons = scale * code + offset``; a sample's variance is ``shot * model + read``: it comes from
+A change dk of a frame's fringe vector changes its phase by ``dk . r``. Samples are stored codes
+``electrons = scale * code + offset``; a sample's variance is ``shot * model + read``, from
 the model, never from the noisy sample (physics note, section 3).
 
-Sums are taken of the residual to a start model, so that float32 keeps its digits for the noise.
+Sums are of the residual from a start model, so that float32 is precise enough.
 """
 
 from typing import Any
@@ -22,8 +22,8 @@ from pixcal.model.arrays import F32, F64, I64
 
 # sums kept for each pixel: 6 normal, 3 right-hand, weighted square of the residual, samples
 N_SUMS = 11
-GAP, GOES_ON = -1, -2  # no batch, see `sweep_batches`
-# determinant over the product of the diagonal: without three phases it is zero up to rounding
+GAP, GOES_ON = -1, -2  # no batch; see `sweep_batches`
+# least determinant over the product of the diagonal; without three phases it is zero but rounding
 SINGULAR = 1e-9
 FAST = {"reassoc", "contract", "nsz", "arcp", "afn"}
 
@@ -36,8 +36,8 @@ def _sweep_row(
     n00: Any, n01: Any, n02: Any, n11: Any, n12: Any, n22: Any,
     b0: Any, b1: Any, b2: Any, rr: Any,
 ) -> None:  # fmt: skip
-    # One array a sum and few others: with them LLVM proves that none overlap and vectorises over i;
-    # with a few more it gives up (6 times slower).
+    # One array per sum and few others: LLVM then proves that none overlap and vectorises over i;
+    # with a few more arrays it does not (6 times slower).
     one, zero, half = np.float32(1), np.float32(0), np.float32(0.5)
     for t in range(codes.shape[0]):
         a0, c1, c2 = g[t, 0], g[t, 1], g[t, 2]
@@ -72,7 +72,7 @@ def _sweep_still_row(
     n00: Any, n01: Any, n02: Any, n11: Any, n12: Any, n22: Any,
     b0: Any, b1: Any, b2: Any, rr: Any,
 ) -> None:  # fmt: skip
-    # The same without a turn of the phase within the tile: half the operations.
+    # The same for a constant fringe vector: half the operations.
     one, zero = np.float32(1), np.float32(0)
     for t in range(codes.shape[0]):
         a0, a1, a2 = g[t, 0], g[t, 1], g[t, 2]
@@ -104,14 +104,14 @@ def _count_row(codes: Any, row: int, fill: int, count: Any) -> None:
 
 @inner()
 def _pour(part: Any, total: Any) -> None:
-    """Add sums to others, and begin again."""
+    """Add sums to others, and reset them."""
     for k in range(part.shape[0]):
         for i in range(part.shape[1]):
             total[k, i] += part[k, i]
             part[k, i] = 0
 
 
-GROUP = 1024  # pixels summed at a time: what is kept of them stays in the first cache
+GROUP = 1024  # pixels summed at a time, so that their data stay in the first-level cache
 
 
 @kernel()
@@ -134,8 +134,8 @@ def frame_sums(
 
     Parameters
     ----------
-    codes : (t, p) stored samples of p pixels; of other types it would be compiled again
-    g, dk : (t, 3), (t, 2) float32, current frame parameters; sums are of the residual to them
+    codes : (t, p) float32 stored samples of p pixels; another type would be compiled again
+    g, dk : (t, 3), (t, 2) float32, current frame parameters, which define the residuals
     y, x : (p,) pixel coordinates relative to the point where ``g`` holds, px
     theta, read, shot : (3, p), (p,), (p,) float32, as in `sweep_batches`
     normal : (t, 15) added to: upper triangle, by row, for (g0, g1, g2, dkx, dky)
@@ -165,7 +165,7 @@ def frame_sums(
             add_right(h0, h1, h2, turn, wr, ys, xs, right[t])
 
 
-# Loops of their own: one with all of this needs more registers than there are, and takes thrice as
+# Separate loops: a single one would need more registers than there are, and take three times as
 # long.
 
 
@@ -176,7 +176,7 @@ def _turn_pixels(t1: Any, t2: Any, kx: float, ky: float, y: Any, x: Any, h1: Any
     fifth, tenth = np.float32(1 / 120), np.float32(1 / 720)
     eighth, turn_length = np.float32(0.125), np.float32(2 * np.pi)
     for i in range(x.size):
-        # cos and sin of any u by halving it three times: calls would not vectorise.
+        # cos and sin of any u by halving it three times, as calls are not vectorised.
         u = kx * x[i] + ky * y[i]
         u = (u - turn_length * np.rint(u / turn_length)) * eighth
         v = u * u
@@ -206,7 +206,7 @@ def _weigh_pixels(
 
 @inner(fastmath=FAST, error_model="numpy")
 def add_normal(h0: Any, h1: Any, h2: Any, turn: Any, w: Any, y: Any, x: Any, normal: Any) -> None:
-    """Add pixels to the normal matrix (15 numbers) of g and dk; as in `frame_sums`, by pixel.
+    """Add pixels to the normal matrix (15 numbers) of g and dk; see `frame_sums`.
 
     ``turn`` is the derivative of the model with respect to the phase, ``w`` the weight.
     """
@@ -259,9 +259,9 @@ def add_right(
 def solve_pixels(sums: F64) -> tuple[F64, F64, F64]:
     """Solve the pixels' 3 x 3 systems.
 
-    Of sums (10 or more, ...) as in `sweep_batches`: the correction to the start model (3, ...), NaN
-    where it is not determined; the upper triangle (6, ...) of the covariance of theta; and the
-    weighted square (...) of the residual that remains.
+    ``sums``: (10 or more, ...) as in `sweep_batches`. Returns the correction to the start model (3,
+    ...), NaN where undetermined; the upper triangle (6, ...) of the covariance of theta; and the
+    weighted square (...) of the remaining residual.
     """
     ten = np.asarray(sums[:10], float)
     out = np.empty(ten.shape)
@@ -289,7 +289,7 @@ def _solve(sums: F64, out: F64) -> None:
 
 @inner(inline="always")
 def _adjugate(a: float, b: float, c: float, d: float, e: float, f: float) -> Any:
-    """Upper triangle of a pixel's inverse normal matrix times the determinant, and that."""
+    """Upper triangle of a pixel's inverse normal matrix times its determinant; the determinant."""
     i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
     i11, i12, i22 = a * f - c * c, b * c - a * e, a * d - b * b
     return i00, i01, i02, i11, i12, i22, a * i00 + b * i01 + c * i02
@@ -300,7 +300,7 @@ def _fringe(
     n00: float, n01: float, n02: float, n11: float, n12: float, n22: float,
     b0: float, b1: float, b2: float, m1: float, m2: float,
 ) -> Any:  # fmt: skip
-    """Fringe of a pixel across and along that of the model, and the variance of its phase."""
+    """Fringe phasor of a pixel across and along the model's, and the variance of its phase."""
     _, i01, i02, i11, i12, i22, det = _adjugate(n00, n01, n02, n11, n12, n22)
     inverse = 1.0 / det if det > SINGULAR * n00 * n11 * n22 else np.nan
     s = m1 + (i01 * b0 + i11 * b1 + i12 * b2) * inverse
@@ -315,13 +315,13 @@ def _close_pixels(
     n00: Any, n01: Any, n02: Any, n11: Any, n12: Any, n22: Any, b0: Any, b1: Any, b2: Any,
     m1: Any, m2: Any, turn: Any, sigma: Any,
 ) -> None:  # fmt: skip
-    # One array a sum, as in `_sweep_row`.
+    # One array per sum, as in `_sweep_row`.
     far = False
     for i in range(turn.size):
         across, along, variance = _fringe(
             n00[i], n01[i], n02[i], n11[i], n12[i], n22[i], b0[i], b1[i], b2[i], m1[i], m2[i]
         )
-        # The arc tangent's series: good to 2e-8 rad up to a quarter.
+        # Series of the arc tangent, accurate to 2e-8 rad for arguments up to 1/4.
         q = across / along
         z = q * q
         turn[i] = q * (1 - z * (1 / 3 - z * (1 / 5 - z * (1 / 7 - z / 9))))
@@ -357,28 +357,28 @@ def sweep_batches(
 ) -> None:
     """Add a block of frames to the sums of batches, and those of full batches to the run's.
 
-    Row by row, so that the sums of a row stay in the first cache whatever the number of batches.
-    The sums are: normal 00, 01, 02, 11, 12, 22; right-hand 0 to 2 (of the residual to the start
+    Row by row, so that a row's sums stay in the first-level cache for any number of batches. The
+    sums are: normal 00, 01, 02, 11, 12, 22; right-hand 0 to 2 (of the residual from the start
     model), its weighted square; number of samples.
 
     Parameters
     ----------
-    codes : (t, y, x) unsigned int stored samples, of which ``fill`` has no weight
+    codes : (t, y, x) unsigned int stored samples; ``fill`` has no weight
     scale, offset : electrons of a code
     g : (t, 3) float32 frame parameters at the tile's centre
     dk : (t, 2) float32 change of the fringe vector (x, y), rad/px; used to second order
     y0, x0 : the tile's first pixel relative to its centre, px
     theta : (3, y, x) float32 start model, e-
     read, shot : (y, x) float32 variance of a sample: ``shot * model + read``, e-²
-    stops : (n,) frames of the block at which its sums are cut; the last is their number. At most
-        some 100 from one to the next, so that sums in float32 keep their precision
-    closes : (n,) batch that ends there; `GAP` where frames of none do, `GOES_ON` where none does
-    part, total : (y, N_SUMS, x) sums of the batch at hand, and of all that have ended; added to
+    stops : (n,) frames of the block at which its sums are cut; the last is their number. Steps
+        are at most some 100 frames, so that sums in float32 keep their precision
+    closes : (n,) batch that ends there; `GAP` at the end of a gap, `GOES_ON` if nothing ends
+    part, total : (y, N_SUMS, x) sums of the current batch, and of all that have ended; added to
     turn, sigma : (batch, y, x) written: phase of a batch relative to the start model and its error,
-        rad; NaN where it does not give all three unknowns
+        rad; NaN where it does not determine all three unknowns
     """
     s, o, f, left = np.float32(scale), np.float32(offset), np.float32(fill), np.float32(x0)
-    # Loops, where numpy's functions would do: those take longer to compile.
+    # Loops instead of numpy's functions, which take longer to compile.
     moving = False
     for t in range(dk.shape[0]):
         moving |= dk[t, 0] != 0 or dk[t, 1] != 0

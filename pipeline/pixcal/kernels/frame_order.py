@@ -1,4 +1,4 @@
-"""Frames by their numbers in a recording: which follow one another, and where there are gaps."""
+"""Order of frames in a recording by their numbers: consecutive frames, and gaps."""
 
 import numpy as np
 
@@ -14,21 +14,20 @@ def runs(numbers: Indices) -> list[tuple[int, int]]:
 
 
 def follows(numbers: Indices, steps: int = 1) -> Mask:
-    """Whether the frame so many steps before in an array was taken so many frames before (t,).
+    """Whether the frame ``steps`` places before in an array was taken ``steps`` frames before (t,).
 
-    ``numbers``: (t,) of the frames, ascending. ``steps``: negative: whether the frame so many steps
-    after was taken so many frames after.
+    ``numbers``: (t,) of the frames, ascending. Negative ``steps``: the same for frames after.
     """
     return np.asarray(numbers - np.roll(numbers, steps) == steps)
 
 
 def with_neighbours(numbers: Indices) -> Indices:
-    """Places of the frames whose last and next frames are in the array too."""
+    """Places of the frames whose previous and next frames are also in the array."""
     return np.flatnonzero(follows(numbers, 1) & follows(numbers, -1))
 
 
 def since_gap(numbers: Indices, steps: int) -> Mask:
-    """Frames (t,) with fewer than so many between them and the last gap, or the beginning."""
+    """Frames (t,) with fewer than ``steps`` frames between them and the last gap or the start."""
     begins = np.flatnonzero(~follows(numbers))
     place = np.arange(len(numbers))
     return np.asarray(place - begins[np.searchsorted(begins, place, "right") - 1] < steps)

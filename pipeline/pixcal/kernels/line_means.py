@@ -1,20 +1,20 @@
-"""Noise less what the pixels of a row, or of a column, have in common."""
+"""Subtract the common noise of each row and each column."""
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from pixcal.model.arrays import F32, Mask
 
-REACH = 5  # pixels over which neighbours stay uncorrelated
+REACH = 5  # distance up to which pixels stay uncorrelated, px
 
 
 def without_line_means(noise: F32, used: Mask) -> F32:
-    """Noise (t, y, x) less the means of its rows and of its columns; zero where not used.
+    """Noise (t, y, x) minus the means of its rows and of its columns; zero where not used.
 
-    A plain mean of n pixels would leave each two anticorrelated by 1 / n. Here pixels within
-    `REACH` of a pixel count half in the mean that is taken off it: white noise keeps its variance,
-    and near pixels stay uncorrelated, to second order in 1 / n. ``noise``: (t, y, x). ``used``: (y,
-    x) pixels of which means are taken.
+    Subtraction of a plain mean of n pixels would correlate each pair by -1 / n. Here pixels within
+    `REACH` of a pixel have half weight in its mean: white noise keeps its variance, and near pixels
+    stay uncorrelated, to second order in 1 / n. ``noise``: (t, y, x). ``used``: (y, x) pixels of
+    the means.
     """
     weight = used.astype(np.float32)
     found = noise * weight
@@ -26,7 +26,7 @@ def without_line_means(noise: F32, used: Mask) -> F32:
 
 
 def _half_near(values: F32, axis: int) -> F32:
-    """Sum along an axis, of which near values count half."""
+    """Sum along an axis around each place, with half weight for near values."""
     size = 2 * REACH + 1
     near = uniform_filter1d(values, size, axis=axis, mode="constant") * np.float32(size / 2)
     return np.asarray(values.sum(axis=axis, keepdims=True) - near)

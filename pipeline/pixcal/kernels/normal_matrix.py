@@ -1,4 +1,4 @@
-"""Inverses of normal matrices whose parameters have any units and may be undetermined."""
+"""Inverses of normal matrices, whose parameters may have any units and be undetermined."""
 
 import math
 from typing import Any
@@ -19,15 +19,15 @@ def symmetric(packed: NDArray[Any]) -> F64:
 
 
 def root_diagonal(normal: NDArray[Any]) -> F64:
-    """Square root (..., n) of the diagonals of matrices (..., n, n); 1 where it is not positive."""
+    """Square roots (..., n) of the diagonals of matrices (..., n, n); 1 where not positive."""
     size = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), 0.0))
     return np.where(size > 0, size, 1.0)
 
 
 def inverse_normal(normal: NDArray[Any], rcond: float = 1e-9) -> F64:
-    """Inverse (..., n, n) of symmetric matrices; zero along what they do not determine.
+    """Inverse (..., n, n) of symmetric matrices; zero along undetermined directions.
 
-    Eigenvalues below a share ``rcond`` of the largest, at unit diagonal, count as zero.
+    With the diagonal scaled to 1, eigenvalues below ``rcond`` times the largest count as zero.
     """
     scale = root_diagonal(normal)
     both = scale[..., :, None] * scale[..., None, :]

@@ -1,11 +1,11 @@
-"""Standard normals of pixels: each a function of a key, its frame and its place.
+"""Standard normals of pixels, each a function of a key, its frame and its place.
 
 Philox4x32-10 (Salmon et al., SC'11) turns a counter of four words and a key of two into four random
 words; two of them make a pair of normals (Box and Muller 1958). The counter is the place and the
-frame, so nothing depends on how the work is cut or who does it, and there is no state to set up.
+frame, so results do not depend on how work is divided, and there is no state to initialise.
 
-Measured on one core (AMD EPYC, Zen 5), 128 x 128 pixels: 2 ns a normal. Logarithm, sine and cosine
-are those of Cephes in single precision, written out so that the compiler makes vectors of them.
+Measured on one core (AMD EPYC, Zen 5), 128 x 128 pixels: 2 ns per normal. Logarithm, sine and
+cosine are those of Cephes in single precision, written out so that the compiler vectorises them.
 """
 
 import math
@@ -40,10 +40,10 @@ _TURN = np.float32(2 * math.pi / 2**32)
 
 
 def pixel_normals(key: Key, frame: int, rows: tuple[int, int], columns: int) -> F32:
-    """Two independent arrays (2, y, x) of standard normals for some rows of the window.
+    """Two independent arrays (2, y, x) of standard normals for rows of the window.
 
-    Other keys give other numbers. ``rows``: the first and the one after the last; a row has the
-    same numbers whatever the others are. ``columns``: width of the window.
+    Other keys give other numbers. ``rows``: the first and the one after the last; the numbers of a
+    row do not depend on this range. ``columns``: width of the window.
     """
     first, last = rows[0] // 2, -(-rows[1] // 2)
     pairs = np.empty((2, last - first, 2, columns), np.float32)
@@ -75,7 +75,7 @@ def philox(
 def _fill(
     key: np.uint32, other: np.uint32, frame: np.uint32, first: int, words: U32, pairs: F32
 ) -> None:
-    """Fill (2, pair of rows, 2, x) from a pair of rows on: one counter for each pair and column.
+    """Fill (2, pair of rows, 2, x) from pair ``first`` on: one counter for each pair and column.
 
     ``words`` (4, x) is scratch.
     """
@@ -87,7 +87,7 @@ def _fill(
 
 @inner()
 def _draw(row: np.uint32, frame: np.uint32, key: np.uint32, other: np.uint32, words: U32) -> None:
-    """Words (4, x) of a pair of rows; in a loop of its own, of which the compiler makes vectors."""
+    """Words (4, x) of a pair of rows, in a separate loop so that the compiler vectorises it."""
     for x in range(words.shape[1]):
         a, b, c, d = philox(np.uint32(x), row, frame, np.uint32(0), key, other)
         words[0, x], words[1, x], words[2, x], words[3, x] = a, b, c, d
@@ -95,7 +95,7 @@ def _draw(row: np.uint32, frame: np.uint32, key: np.uint32, other: np.uint32, wo
 
 @inner()
 def _box_muller(radius: U32, angle: U32, one: F32, other: F32) -> None:
-    """Pairs of normals (x,) from pairs of words; none is beyond 6.8."""
+    """Pairs of normals (x,) from pairs of words, within ±6.8."""
     for x in range(len(radius)):
         uniform = (np.float32(radius[x]) + np.float32(0.5)) * np.float32(2.0**-32)
         size = math.sqrt(np.float32(-2) * _log(uniform))

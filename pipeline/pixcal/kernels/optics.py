@@ -1,8 +1,8 @@
 """Optical path difference of two fibres on a detector, exact and paraxial.
 
 Positions are ``r = (x p, y p, 0)``: pixel coordinates x (column) and y (row), offsets included,
-times the pitch p. The origin is pixel (0, 0) of whatever grid x and y count; the geometry is given
-from the same origin, in millimetres. With fibre A at minus half the baseline and fibre B at plus
+times the pitch p. The origin is pixel (0, 0) of the grid of x and y; the geometry has the same
+origin, in millimetres. With fibre A at minus half the baseline and fibre B at plus
 half of it about their centre, the phase is ``psi = 2 pi / lambda (|r - s_A| - |r - s_B|)``, which
 grows along the baseline: its paraxial gradient is ``K = 2 pi / lambda p b / D`` rad/px.
 """
@@ -22,8 +22,8 @@ PARAMETERS = ("centre_x", "centre_y", "distance", "baseline_x", "baseline_y", "b
 class Geometry:
     """Two fibre tips in front of a detector; lengths in mm.
 
-    Centre, separation and distance are the parameters, not the two points, because those are
-    what the data tell apart (physics note, section 4).
+    The parameters are centre, separation and distance rather than the two points, because the data
+    can distinguish them (physics note, section 4).
     """
 
     wavelength: float  # wavelength, pitch: laser wavelength and pixel pitch
@@ -54,14 +54,14 @@ class Geometry:
 
 
 def phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> F64:
-    """Exact fringe phase psi, rad, good to 1e-9 rad, at pixel coordinates.
+    """Exact fringe phase psi, rad, accurate to 1e-9 rad, at pixel coordinates.
 
-    The difference of the two paths (paper, eq. 3) loses seven digits when taken as written; this
-    is ``(s_A - s_B)·(s_A + s_B - 2 r) / (|r - s_A| + |r - s_B|)`` (physics note, section 1).
+    The plain difference of the two paths (paper, eq. 3) loses seven digits; computed is
+    ``(s_A - s_B)·(s_A + s_B - 2 r) / (|r - s_A| + |r - s_B|)`` (physics note, section 1).
     """
     cx, cy, d, bx, by, bz = geometry.vector()
     qx, qy = np.asarray(x, float) * geometry.pitch - cx, np.asarray(y, float) * geometry.pitch - cy
-    # With x a row and y a column only their sides are computed.
+    # If x is a row and y a column, these terms are computed on the sides only.
     paths: F64 = np.sqrt((qx + 0.5 * bx) ** 2 + (qy + 0.5 * by) ** 2 + (0.5 * bz - d) ** 2)
     paths += np.sqrt((qx - 0.5 * bx) ** 2 + (qy - 0.5 * by) ** 2 + (-0.5 * bz - d) ** 2)
     result: F64 = geometry.wavenumber * 2.0 * (bx * qx + by * qy - bz * d) / paths
@@ -76,7 +76,7 @@ def paraxial_vector(geometry: Geometry) -> tuple[float, float]:
 
 def paraxial_phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> F64:
     """Phase of straight fringes (paper, eq. 4), zero at the foot of the fibres' centre."""
-    # As `phase`; the tilt of the baseline is left out, as in the paper.
+    # As `phase`, but without the tilt of the baseline, as in the paper.
     kx, ky = paraxial_vector(geometry)
     xs, ys = np.asarray(x, float), np.asarray(y, float)
     result: F64 = kx * (xs - geometry.centre_x / geometry.pitch) + ky * (
@@ -86,7 +86,7 @@ def paraxial_phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> F64:
 
 
 def interfringe(k: tuple[float, float]) -> float:
-    """Period (px) of fringes of a vector (kx, ky), rad/px."""
+    """Period (px) of fringes of vector (kx, ky), rad/px."""
     return float(2 * np.pi / np.hypot(*k))
 
 
@@ -129,8 +129,8 @@ class _Paths:
 
 
 def gaussian_beam(x: ArrayLike, y: ArrayLike, centre: tuple[float, float], radius: float) -> F64:
-    """Intensity of a Gaussian beam (1/e² at its radius) at x, y over its peak's, all in px."""
-    # A product of two exponentials: with x a row and y a column only their sides are computed.
+    """Intensity of a Gaussian beam (1/e² radius) at x, y, relative to its peak; all in px."""
+    # A product: if x is a row and y a column, exponentials are computed on the sides only.
     across = np.exp(-2 * ((np.asarray(x, float) - centre[0]) / radius) ** 2)
     along = np.exp(-2 * ((np.asarray(y, float) - centre[1]) / radius) ** 2)
     result: F64 = along * across

@@ -7,11 +7,11 @@ import numpy as np
 from pixcal.kernels import kernel
 from pixcal.model.arrays import F64
 
-SPAN = 4  # periods of flicker noise up to so many lengths of the line are there
+SPAN = 4  # longest period of flicker noise, over the length of the line
 
 
 def flicker(rng: np.random.Generator, count: int) -> F64:
-    """One line of flicker noise (count,), of unit variance in every octave, without its mean."""
+    """One line of flicker noise (count,) of unit variance per octave, minus its mean."""
     period = _period(count)
     variance = _variance(period)
     drawn = rng.standard_normal((2, len(variance)))
@@ -24,7 +24,7 @@ def flicker_power(count: int) -> F64:
     """Mean square of the orthonormal Fourier modes (count // 2 + 1) of `flicker`; exact."""
     period = _period(count)
     covariance = np.fft.irfft(period / 2 * _variance(period), period)[:count]
-    # Of pairs of samples at each distance, those before and behind falling on the same mode.
+    # Pairs of samples at each distance; both directions contribute to the same mode.
     pairs = covariance * (1 - np.arange(count) / count)
     pairs[1:] += pairs[:0:-1]
     power = np.fft.rfft(pairs).real
@@ -44,12 +44,12 @@ def _variance(period: int) -> F64:
     return variance
 
 
-# longest time of `brownian`, s (half a year), and its halvings (to 16 ms)
+# longest time of `brownian`, s (half a year), and the number of its halvings (to 16 ms)
 HORIZON, LEVELS = 2.0**24, 30
 
 
 def damped_walk(normals: F64, keep: float) -> F64:
-    """First-order autoregression of unit variance: a random walk that is drawn back to zero.
+    """First-order autoregression of unit variance: a random walk with a restoring force to zero.
 
     From independent standard normals (t,); ``keep`` is the correlation of neighbours, 0 to below 1.
     """
@@ -60,7 +60,7 @@ def damped_walk(normals: F64, keep: float) -> F64:
     return walk
 
 
-# Not scipy.signal's filter: it takes most of a second to import, and longer for such short lines.
+# Not scipy.signal's filter, which is slow to import (most of a second) and on such short lines.
 @kernel()
 def _walk(normals: F64, keep: float, step: float, walk: F64) -> None:
     at = (1 - step) * normals[0]
@@ -70,17 +70,17 @@ def _walk(normals: F64, keep: float, step: float, walk: F64) -> None:
 
 
 def swing(time_s: F64, hz: float, phase: float, exptime_s: float = 0.0) -> F64:
-    """Sine of some ``phase`` (rad) at time 0: its mean over exposures from each time (t,), s."""
+    """Mean of a sine over exposures starting at times (t,), s; ``phase`` (rad) at time 0."""
     middle = 2 * np.pi * hz * (time_s + exptime_s / 2) + phase
     return np.asarray(np.sinc(hz * exptime_s) * np.sin(middle))
 
 
 def brownian(time: float, normal: Callable[[int, int], float]) -> float:
-    """Random walk of unit variance a unit of time, at one time from 0 to `HORIZON`.
+    """Random walk of unit variance per unit of time, at one time from 0 to `HORIZON`.
 
-    Lévy's construction by ever finer hats, so that any time can be asked for by itself; straight
-    between multiples of ``HORIZON / 2**LEVELS``. ``normal`` gives the standard normal of a level
-    and a place in it, the same whenever it is asked for.
+    Lévy's construction from ever finer hat functions, so that any time can be computed separately;
+    linear between multiples of ``HORIZON / 2**LEVELS``. ``normal`` gives the standard normal of a
+    level and a place in it, the same at every call.
     """
     at = min(max(time / HORIZON, 0.0), 1.0)
     value = at * normal(0, 0)
@@ -92,10 +92,10 @@ def brownian(time: float, normal: Callable[[int, int], float]) -> float:
     return float(np.sqrt(HORIZON) * value)
 
 
-RAMP = 0.8  # mean of exp(i step) from which phases are a ramp; of random phases it is near zero
+RAMP = 0.8  # least mean of exp(i step) of a ramp; for random phases it is near zero
 
 
 def ramp_step(phase: F64) -> float:
-    """Step (rad) of phases (t,) that rise by equal steps; zero where they do not."""
+    """Step (rad) of phases (t,) in equal steps; zero if they are not a ramp."""
     mean = np.exp(1j * np.diff(phase)).mean() if len(phase) > 1 else 0.0
     return float(np.angle(mean)) if abs(mean) > RAMP else 0.0

@@ -1,15 +1,15 @@
-"""Light of a star in square pixels: the diffraction pattern of a telescope, and the fit of it.
+"""Light of a star in square pixels, from the diffraction pattern of a telescope.
 
-A circular aperture of diameter D, a share of it obscured from the centre, gives (Born & Wolf,
-Principles of Optics, 8.6.2) the Airy pattern, per unit of collected light and per square pixel
+A circular aperture of diameter D with a central obscuration gives (Born & Wolf, Principles of
+Optics, 8.6.2) the Airy pattern, per unit of collected light and per square pixel
 
     I(r) = pi (1 - e^2) / (4 q^2) [(J(z) - e^2 J(e z)) / (1 - e^2)]^2    J(z) = 2 J1(z) / z
 
 with z = pi r / q, r in pixels, e the diameter of the obscuration over D, and q = lambda f / (D p)
-the pixels (pitch p) in lambda / D. A pixel responds evenly over its square, so what it receives is
-that pattern averaged over the square: a function of where its centre lies from the star. It holds
-no frequency above 1/q cycles per pixel, q = 2 being Nyquist's limit (paper, section 2), and is kept
-as a cubic B-spline, fine enough that the spline does not show (`KNOTS`).
+the number of pixels (pitch p) per lambda / D. A pixel of uniform response receives the average of
+that pattern over its square, a function of the distance of its centre from the star. This function
+has no frequency above 1/q cycles per pixel, q = 2 being Nyquist's limit (paper, section 2), and is
+stored as a cubic B-spline with negligible error (`KNOTS`).
 """
 
 import math
@@ -24,18 +24,18 @@ from scipy.special import j1
 from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F64
 
-# knots of the spline in lambda / D: the table is good to 1e-6 of its peak (see the tests)
+# knots of the spline per lambda / D: the table is accurate to 1e-6 of its peak (see the tests)
 KNOTS = 24
-# what the table goes beyond the window, px: a star off the middle, pixels off the grid
+# margin of the table around the window, px, for decentred stars and pixel offsets
 MARGIN = 2.0
 
 
 @dataclass(frozen=True)
 class Psf:
-    """Share of a star's light that a pixel receives, against its centre's place from the star."""
+    """Share of a star's light that a pixel receives, as a function of its place from the star."""
 
-    coefficients: F64  # (n, n) of the cubic B-spline, (y, x); the middle one is at the star
-    step: float  # from knot to knot, px
+    coefficients: F64  # (n, n) of the cubic B-spline, (y, x); the central one is at the star
+    step: float  # distance of knots, px
 
     @property
     def reach(self) -> float:
@@ -44,13 +44,13 @@ class Psf:
 
     @property
     def peak(self) -> float:
-        """Share of the pixel that the star is in the middle of."""
+        """Share of a pixel whose centre is at the star."""
         return float(self.at(0.0, 0.0)[0])
 
     def at(self, x: ArrayLike, y: ArrayLike) -> F64:
         """Share of the light and its derivatives along x and y: (3, ...) of 1, 1/px, 1/px.
 
-        At the centre of a pixel minus the star (px); beyond `reach` it is that at the edge.
+        ``x``, ``y``: centre of the pixel minus the star (px); beyond `reach`, values at the edge.
         """
         xs, ys = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
         found = _shares(self.coefficients, self.step, xs.ravel(), ys.ravel())
@@ -60,13 +60,13 @@ class Psf:
 def diffraction_psf(sampling: float, obscuration: float, half: int) -> Psf:
     """The pattern of a telescope, averaged over square pixels, up to ``half`` px from the star.
 
-    ``sampling`` is q, pixels in lambda / D; ``obscuration`` the diameter of the central obscuration
-    over that of the aperture, 0 to below 1.
+    ``sampling`` is q, pixels per lambda / D; ``obscuration`` the diameter of the central
+    obscuration over that of the aperture, 0 to below 1.
     """
     step = sampling / KNOTS
     side = math.ceil((half + MARGIN) / step) + 3
     at = step * np.arange(side)
-    # Gauss and Legendre's nodes over a pixel: exact for what has so few waves in it.
+    # Gauss-Legendre nodes over a pixel: accurate, as it holds few periods of the pattern.
     nodes, weights = np.polynomial.legendre.leggauss(8 + math.ceil(2 / sampling))
     quadrant = np.zeros((side, side))
     for node_y, weight_y in zip(nodes / 2, weights / 2, strict=True):
@@ -79,7 +79,7 @@ def diffraction_psf(sampling: float, obscuration: float, half: int) -> Psf:
 
 
 def intensity(radius: F64, sampling: float, obscuration: float) -> F64:
-    """The pattern itself at radii (...) px, of unit total, 1/px²; as `diffraction_psf`."""
+    """The pattern at radii (...) px, of unit total, 1/px²; see `diffraction_psf`."""
     z = np.pi * radius / sampling
     open_area = 1 - obscuration**2
     amplitude = (_jinc(z) - obscuration**2 * _jinc(obscuration * z)) / open_area
@@ -94,7 +94,7 @@ def _jinc(z: F64) -> F64:
 
 @inner(inline="always")
 def _spline(t: float) -> tuple[Any, Any]:
-    """Weights of the four knots around a place, t beyond the second, and their derivatives."""
+    """Weights of four knots around a place at t beyond the second, and their derivatives."""
     s = 1.0 - t
     weights = s**3 / 6, (3 * t * t * (t - 2) + 4) / 6, (3 * s * s * (s - 2) + 4) / 6, t**3 / 6
     return weights, (-s * s / 2, t * (1.5 * t - 2), -s * (1.5 * s - 2), t * t / 2)

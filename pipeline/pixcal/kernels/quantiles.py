@@ -6,17 +6,17 @@ import numpy as np
 
 from pixcal.model.arrays import F32, F64
 
-_DIGIT = 16  # bits that are counted at a time
+_DIGIT = 16  # bits of a number sorted per pass
 
 
 def quantiles_of_parts(
     parts: Callable[[], Iterable[F32]], levels: Sequence[float] | F64
 ) -> tuple[F64, int]:
-    """Quantiles of positive finite numbers in parts (n,), as `numpy.quantile` of all at once.
+    """Quantiles of positive finite numbers given in parts (n,), equal to `numpy.quantile` of all.
 
-    Returns them, empty if there are no numbers, and how many there are; ``parts`` is called twice.
+    Returns them (empty without numbers) and the count of numbers; ``parts`` is called twice.
     """
-    # The bits of positive floats, as integers, are in the order of their values.
+    # The bits of positive floats, read as integers, have the order of their values.
     counts = np.zeros(1 << _DIGIT, np.int64)
     for part in parts():
         counts += np.bincount(part.view(np.uint32) >> _DIGIT, minlength=len(counts))

@@ -1,8 +1,8 @@
-"""Electrons in two bytes a sample: which step, what it costs, and the conversion of raw frames.
+"""Store electrons in two bytes per sample: choice of the step, and conversion of raw frames.
 
 ``electrons = scale * code + offset``; rounding to a step adds ``scale² / 12`` to a sample's
-variance. It is small where the step is well below the read noise, and photon noise, which grows
-with the level, makes it smaller still.
+variance. This is negligible if the step is well below the read noise, the more so with photon
+noise, which grows with the level.
 """
 
 import math
@@ -27,16 +27,16 @@ class Scale:
 
     @property
     def variance(self) -> float:
-        """What rounding adds to the variance of a sample (e-²)."""
+        """Variance that rounding adds to a sample (e-²)."""
         return self.step**2 / 12
 
 
 def choose_scale(low: float, high: float, smallest_variance: float, share: float) -> Scale:
     """Coarsest step that covers a range (e-) and adds less than a share of the variance (e-²)."""
-    # Steps are powers of two where one will do, so that integers stay what they were, and offsets
-    # whole steps. Where the range needs a coarser step than the noise allows, the range wins.
+    # Steps are powers of two if possible, so that integers stay exact, and offsets are whole steps.
+    # If the range needs a coarser step than the noise allows, the range has priority.
     span = max(high - low, 1e-6)
-    # Two codes in reserve: the offset is rounded down, the ends are rounded.
+    # Two codes in reserve, because the offset is rounded down and the ends are rounded.
     needed = span / (FILL - 3)
     allowed = math.sqrt(12 * share * smallest_variance)
     step = 2.0 ** math.floor(math.log2(allowed)) if allowed > 0 else 0.0
@@ -94,16 +94,16 @@ def encode(
     lost: Any,
     x0: int = 0,
 ) -> int:
-    """Convert raw frames of a tile to codes: ``raw * slope + start - dark * exptime``, cut off.
+    """Convert raw frames of a tile to codes: ``raw * slope + start - dark * exptime``, truncated.
 
-    Fastest where the frames fit the cache.
+    Fastest if the frames fit the cache.
 
     Returns the sum of the codes that have weight.
 
     Parameters
     ----------
-    raw : (t, y, at least x0 + x) samples, ADU; the tile's columns begin at ``x0``: a copy of them
-        would take as long as this
+    raw : (t, y, at least x0 + x) samples, ADU; the tile's columns begin at ``x0`` (a copy of them
+        would double the time)
     slope, start, dark : (y, x) float32 from `coefficients`
     exptime : (t,) float32 exposure times, s
     saturation : level (ADU, float32) at or above which samples get `FILL`, as do those out of range
@@ -126,7 +126,7 @@ def encode(
 def coefficients(
     scale: Scale, gain: float, bias: F32, dark_rate: F32, flat: F32
 ) -> tuple[F32, F32, F32]:
-    """What `encode` needs, so that the codes mean ``(gain (raw - bias) - dark t) / flat``, rounded.
+    """Coefficients of `encode` for codes ``(gain (raw - bias) - dark t) / flat``, rounded.
 
     From ``gain`` (e-/ADU), ``bias`` (ADU), ``dark_rate`` (e-/s) and relative ``flat``, all (y, x):
     slope (codes/ADU), start (codes) and dark (codes/s).
@@ -151,7 +151,7 @@ def _extremes_of_row(raw: Any, saturation: float, lowest: Any, highest: Any) -> 
 def extremes(raw: Any, saturation: float, lowest: Any, highest: Any, x0: int = 0) -> None:
     """Widen the range of each pixel's samples below saturation by those of more frames.
 
-    Of frames as in `encode`; ``lowest`` and ``highest`` (y, x) float32 begin with +inf and -inf.
+    ``raw``: as in `encode`. ``lowest``, ``highest``: (y, x) float32, initially +inf and -inf.
     """
     for y in range(raw.shape[1]):
         for t in range(raw.shape[0]):

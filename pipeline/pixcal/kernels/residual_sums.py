@@ -1,4 +1,4 @@
-"""Products of neighbouring residuals, summed for a line of their covariance over the level."""
+"""Sums of products of neighbouring residuals, to fit their covariance linearly in the level."""
 
 from typing import Any
 
@@ -23,9 +23,9 @@ def residual_sums(
 ) -> F64:
     """Sums (step, 7) for ``product = a shot + b read`` of residuals, by steps between pixels.
 
-    ``shot`` and ``read`` are means of the two pixels' variances; all is divided by the root of the
-    product of their variances, so that every product has the same weight. Summed are the number,
-    the normal matrix (11, 12, 22), the right-hand side (1, 2) and the squared products.
+    ``shot`` and ``read`` are means of the two pixels' variances; all terms are divided by the root
+    of the product of their variances, so that every product has the same weight. The sums are: the
+    number, the normal matrix (11, 12, 22), the right-hand side (1, 2), the squared products.
 
     Parameters
     ----------
@@ -33,21 +33,21 @@ def residual_sums(
     shot_factor, read : (y, x) variance of a sample: ``shot_factor * model + read``, e-²
     good : (y, x) bool
     of_time, of_pixels : (t, k), (k, y, x); their product over the variance is the share of a
-        sample's variance that its pixel's own fit took up
-    taken : (step,) covariance that the frames' fits took off, as a share of the variance
+        sample's variance that the fit of its pixel absorbed
+    taken : (step,) covariance that the frames' fits removed, as a share of the variance
     steps : (step, 2) rows (not negative) and columns
     limit : standard deviations beyond which a residual has no weight
     """
     sums = np.zeros((len(steps), 7))
     arrays = (shot_factor, read, of_time, of_pixels, taken)
     factor, still, *fitted = (np.ascontiguousarray(a, np.float32) for a in arrays)
-    # Not in compiled code: that takes longer to compile.
+    # Outside compiled code, where it would take longer to compile.
     frame, line = np.empty((3, *good.shape), np.float32), np.empty(good.shape[1], np.float32)
     _sum(rest, model, factor, still, good, *fitted, steps, np.float32(limit), line, *frame, sums)
     return sums
 
 
-# Sums of a row in any order; all that NaN decides is left as it is.
+# Row sums may be reordered; comparisons with NaN keep their meaning.
 @kernel(fastmath={"reassoc", "contract"})
 def _sum(
     rest: Any, model: Any, factor: Any, read: Any, good: Any, of_time: Any, of_pixels: Any,
@@ -67,7 +67,7 @@ def _sum(
                 charge = charge * factor[y, x] if charge > 0 else np.float32(0)
                 weight = np.float32(1) / (charge + read[y, x])
                 value = np.float32(rest[t, y, x]) * np.sqrt(weight)
-                used = good[y, x] & (abs(value) <= limit)  # false of NaN
+                used = good[y, x] & (abs(value) <= limit)  # false for NaN
                 left = np.sqrt(np.float32(1) - fitted[x] * weight)
                 signal[y, x] = charge
                 root[y, x] = np.sqrt(weight) if used else np.float32(0)
@@ -76,7 +76,7 @@ def _sum(
             dy, dx = steps[n, 0], steps[n, 1]
             low, high = max(0, -dx), nx - max(0, dx)
             for y in range(ny - dy):
-                # Views, whose indices are never negative: only then are loops vectorised.
+                # Views without negative indices: only then are loops vectorised.
                 root1, root2 = root[y, low:high], root[y + dy, low + dx : high + dx]
                 size1, size2 = size[y, low:high], size[y + dy, low + dx : high + dx]
                 signal1, signal2 = signal[y, low:high], signal[y + dy, low + dx : high + dx]

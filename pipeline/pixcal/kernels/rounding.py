@@ -1,10 +1,10 @@
-"""What a converter's rounding does to noise and to mean levels, and how to take it out again.
+"""Effect of a converter's rounding on noise and on mean levels, and its correction.
 
-A sample is a normal number rounded to whole steps. Where the noise spans a step or more, rounding
-adds 1/12 of a square step to the variance and leaves the mean (Sheppard's correction). Below that
-both depend on where the level lies between two codes (Widrow and Kollar 2008, Quantization Noise,
-Cambridge University Press, chapter 4): from the probability of each code they are computed exactly.
-All in units of the step.
+A sample is a normal variate rounded to whole steps. If the noise is a step or more, rounding adds
+1/12 of a square step to the variance and preserves the mean (Sheppard's correction). For smaller
+noise, both depend on the place of the level between two codes (Widrow and Kollar 2008, Quantization
+Noise, Cambridge University Press, chapter 4) and are computed exactly from the probability of each
+code. Units are steps.
 """
 
 import numpy as np
@@ -14,19 +14,19 @@ from scipy.special import ndtr
 from pixcal.model.arrays import F64
 
 SHEPPARD = 1 / 12  # variance that rounding adds to noise of a step or more
-UNTOLD = 0.35  # noise below which levels that are all alike do not tell it
-SMOOTH = 1.0  # noise from which mean and variance no longer depend on the level, to 1e-7
+UNTOLD = 0.35  # noise below which equal levels do not determine it
+SMOOTH = 1.0  # noise above which mean and variance do not depend on the level, to 1e-7
 _FRACTIONS = 256
 _REACH = 9.0
 _HARMONICS = 8
 _MIN_SIGMA = 1e-3
-_EVERYWHERE = 0.5  # scatter of the levels from which they lie evenly between codes
+_EVERYWHERE = 0.5  # scatter of the levels above which they are uniform between codes
 _MIN_KNOWN = 0.05
 _SLOPE_STEP = 1e-3
 
 
 def rounded_moments(level: F64, sigma: float) -> tuple[F64, F64]:
-    """Mean and variance (n,) of normals of some levels (n,) and a noise, once rounded."""
+    """Mean and variance (n,) of rounded normals of given levels (n,) and noise."""
     whole = np.rint(level)
     if sigma >= SMOOTH:
         return level, np.full(level.shape, sigma**2 + SHEPPARD)
@@ -40,7 +40,7 @@ def rounded_moments(level: F64, sigma: float) -> tuple[F64, F64]:
 
 
 def level_before_rounding(mean: F64, sigma: float) -> F64:
-    """Levels whose rounded samples have some means, with this noise before rounding."""
+    """Levels whose rounded samples have given means, for a given noise before rounding."""
     if sigma >= SMOOTH:
         return mean
     level = np.linspace(-0.5, 0.5, _FRACTIONS + 1)
@@ -52,12 +52,12 @@ def level_before_rounding(mean: F64, sigma: float) -> F64:
 def noise_before_rounding(
     variance: float, error: float, means: F64, frames: float
 ) -> tuple[float, float] | None:
-    """Noise that has some variance, on average over pixels, once it is rounded; and its error.
+    """Noise before rounding, from the mean variance of pixels after it; and its error.
 
-    None where the samples do not tell: noise far below a step, in pixels whose levels all lie at
-    about the same distance from the next change of code. ``variance, error``: of a sample, on
-    average over the pixels, and its standard error. ``means``: (n,) mean samples of pixels like
-    these, over so many ``frames``.
+    None where it is undetermined: noise far below a step, in pixels whose levels all have about the
+    same distance from the next change of code. ``variance, error``: variance of a sample, averaged
+    over pixels, and its standard error. ``means``: (n,) mean samples of such pixels over a number
+    of ``frames``.
     """
     if variance > SMOOTH**2 + SHEPPARD:
         sigma = float(np.sqrt(variance - SHEPPARD))
@@ -78,19 +78,19 @@ def noise_before_rounding(
         return None
     sigma = float(brentq(lambda s: expected(s) - variance, low, high, xtol=1e-6))
     slope = (expected(sigma + _SLOPE_STEP) - expected(sigma)) / _SLOPE_STEP
-    # Of so many pixels more or fewer lie near a change of code.
+    # The number of pixels near a change of code varies by chance.
     chance = np.var(rounded_moments(level, sigma)[1]) / len(means) if everywhere else 0.0
     return (sigma, float(np.hypot(error, np.sqrt(chance))) / slope) if slope > 0 else None
 
 
 def _clipped_variance(values: F64) -> float:
-    """Without those beyond three standard deviations."""
+    """Variance without values beyond three standard deviations."""
     off = values - np.median(values)
     return float(np.var(off[np.abs(off) <= 3 * np.std(off)]))
 
 
 def _harmonics(means: F64, noise: float) -> F64:
-    """Mean cosines of one to some turns a step of the levels, freed of the noise of the means."""
+    """Mean cosines of the levels at harmonics of a step, corrected for the noise of the means."""
     order = np.arange(1, _HARMONICS + 1)
     turns = np.cos(2 * np.pi * order[:, None] * means).mean(axis=1)
     kept = np.exp(-2 * np.pi**2 * order**2 * noise)

@@ -1,4 +1,4 @@
-"""What a bench looks like: its detector, its light and its frames, as arrays for `synthesis`."""
+"""Detector, light and frames of a bench, as arrays for `synthesis`."""
 
 import zlib
 from collections.abc import Callable, Iterator
@@ -15,7 +15,7 @@ from pixcal.model.arrays import F32, F64, U8
 from pixcal.model.bench import Bench, SimulatedDetector
 from pixcal.model.flags import PixelFlag
 
-# Rows and columns of the chip that share a generator. Another number would be another chip.
+# Rows and columns of the chip that share a generator. Other numbers would give another chip.
 TILE = (64, 256)
 Rows = tuple[int, int]
 Piece = tuple[slice, slice]
@@ -23,7 +23,7 @@ Piece = tuple[slice, slice]
 
 @dataclass(frozen=True)
 class DetectorMaps:
-    """The truth of the pixels of some rows of the window, each of shape (y, x)."""
+    """True maps of the pixels on rows of the window, each of shape (y, x)."""
 
     delta_x: F32  # offset along x, px
     delta_y: F32  # offset along y, px
@@ -35,7 +35,7 @@ class DetectorMaps:
     mask: U8  # `PixelFlag.HOT` and `PixelFlag.DEAD`
 
     def on(self, rows: Rows) -> "DetectorMaps":
-        """The maps of some of the rows (first, one after the last)."""
+        """The maps on a range of the rows (first, one after the last)."""
         return DetectorMaps(*(getattr(self, field.name)[slice(*rows)] for field in fields(self)))
 
 
@@ -59,10 +59,10 @@ def chip_map(
     effect: str,
     draw: Callable[[np.random.Generator], NDArray[Any]],
 ) -> F32:
-    """What an effect does to each pixel, (y, x), on rows of the window (first, one after).
+    """Map (y, x) of an effect's random values on rows of the window (first, one after the last).
 
-    ``effect`` names its random numbers; ``draw`` makes the values of a tile of the chip, of shape
-    `TILE`, from a generator: the same chip has the same values in every window.
+    ``effect`` identifies the random numbers; ``draw`` makes the values of a tile of the chip, of
+    shape `TILE`, from a generator, so that a chip has the same values in every window.
     """
     out = np.empty((rows[1] - rows[0], detector.shape[1]), np.float32)
     name = zlib.crc32(effect.encode())
@@ -72,7 +72,7 @@ def chip_map(
 
 
 def _tiles(detector: SimulatedDetector, rows: Rows) -> Iterator[tuple[int, int, Piece, Piece]]:
-    """Tiles of the chip under rows of the window: number, and the same pixels in tile and rows."""
+    """Tiles of the chip under rows of the window: number, common pixels in tile and in rows."""
     (row, column), width = detector.origin, detector.shape[1]
     y0, y1, x0, x1 = row + rows[0], row + rows[1], column, column + width
     for ty in range(y0 // TILE[0], -(-y1 // TILE[0])):
@@ -88,7 +88,7 @@ def _shift(part: slice, by: int) -> slice:
 
 
 def _chip_tile(d: SimulatedDetector, ty: int, tx: int) -> DetectorMaps:
-    """Maps of one tile of the chip, drawn whole so that every window sees the same pixels."""
+    """Maps of one whole tile of the chip, so that every window has the same pixels."""
 
     def normal(stream: Stream, rms: float) -> F32:
         values = np.empty(TILE, np.float32)
@@ -118,10 +118,10 @@ def _chip_tile(d: SimulatedDetector, ty: int, tx: int) -> DetectorMaps:
 
 
 def _stitches(d: SimulatedDetector, ty: int, tx: int) -> tuple[F32, F32]:
-    """Offsets (dx, dy) in px of the stitching blocks under a tile of the chip."""
+    """Offsets (dx, dy), px, of the stitching blocks in a tile of the chip."""
     y = np.arange(ty * TILE[0], (ty + 1) * TILE[0]) // d.stitch_px[0]
     x = np.arange(tx * TILE[1], (tx + 1) * TILE[1]) // d.stitch_px[1]
-    # One row of blocks has one generator; drawing along it gives every tile the same numbers.
+    # Each row of blocks has one generator, drawn along the row, so that tiles agree.
     drawn = {
         int(block): generator(d.seed, Stream.STITCH, int(block)).standard_normal((x[-1] + 1, 2))
         for block in np.unique(y)
@@ -148,7 +148,7 @@ def geometry(bench: Bench, number: int) -> optics.Geometry:
 
 
 def fibre_light(bench: Bench, number: int, rows: Rows) -> tuple[F64, F64]:
-    """Gaussian beams A and B alone (y, x), at centres of a perfect grid, over the peak of A."""
+    """Separate Gaussian beams A and B (y, x), on a perfect grid, relative to the peak of A."""
     g, o = geometry(bench, number), bench.optics_of(number)
     x = np.arange(bench.detector.shape[1])
     y = np.arange(*rows)[:, None]
@@ -163,7 +163,7 @@ def fibre_light(bench: Bench, number: int, rows: Rows) -> tuple[F64, F64]:
 
 
 def electrons_per_unit(bench: Bench, number: int) -> float:
-    """Electrons for one unit of `fibre_light`: makes the brightest fringe of the window peak_e."""
+    """Electrons per unit of `fibre_light`, so that the window's brightest fringe has peak_e."""
     ny, visibility = bench.detector.shape[0], bench.optics_of(number).visibility
     brightest = 0.0
     for row in range(0, ny, BLOCK_ROWS):
@@ -176,9 +176,9 @@ def electrons_per_unit(bench: Bench, number: int) -> float:
 def fringe_light(
     bench: Bench, number: int, rows: Rows, maps: DetectorMaps, electrons: float
 ) -> Light:
-    """The two fibres' beams at the pixels' true places, with straight fringes.
+    """The two fibres' beams at the pixels' true positions, with straight fringes.
 
-    On rows of the window with their maps; ``electrons`` is from `electrons_per_unit`.
+    ``maps`` are those of ``rows``; ``electrons`` is from `electrons_per_unit`.
     """
     a, b = (np.sqrt(electrons * light) for light in fibre_light(bench, number, rows))
     x = np.arange(bench.detector.shape[1]) + maps.delta_x.astype(np.float64)
@@ -190,7 +190,7 @@ def fringe_light(
 
 @dataclass(frozen=True)
 class FrameStates:
-    """What changes from frame to frame of a fringe set; arrays over its frames."""
+    """States of a fringe set's frames; arrays over the frames."""
 
     phi: F64  # phase, rad
     level: F64  # B, mean 1
@@ -201,9 +201,9 @@ class FrameStates:
     def turns(
         self, frame: int, shape: tuple[int, int], rows: Rows, margin: int = 0
     ) -> tuple[F32, F32]:
-        """Phase of a frame along columns and rows, as `synthesis.illuminate` takes it.
+        """Phase of a frame along columns and rows, for `synthesis.illuminate`.
 
-        With as many more pixels at either end as the ``margin`` has.
+        ``margin``: number of further pixels at either end.
         """
         x = np.arange(-margin, shape[1] + margin) - (shape[1] - 1) / 2
         y = np.arange(rows[0] - margin, rows[1] + margin) - (shape[0] - 1) / 2
@@ -211,7 +211,7 @@ class FrameStates:
 
 
 def frame_states(bench: Bench, number: int) -> FrameStates:
-    """Draw the phases of a set's frames; more frames leave the first ones as they are."""
+    """Draw the phases of a set's frames; a larger number keeps those of the first frames."""
     scan = bench.frames.fringes[number]
     if scan.phase_law == "ramp":
         phi = np.mod(scan.phase_step_rad * np.arange(scan.count), 2 * np.pi)

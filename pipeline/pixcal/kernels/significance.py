@@ -1,4 +1,4 @@
-"""How far from chance: probabilities and chi-squares in standard deviations of a normal."""
+"""Significance: probabilities and chi-squares in standard deviations of a normal."""
 
 import math
 
@@ -8,7 +8,7 @@ from scipy.special import chdtrc, gammainc, gammaln, log_ndtr, ndtri_exp, xlogy
 
 from pixcal.model.arrays import F64
 
-# standard deviations from which an estimate or a part of its law is taken for real
+# standard deviations above which an estimate or a part of its law is significant
 SIGNIFICANT = 4.0
 _LARGE = 1000.0
 
@@ -18,8 +18,8 @@ def root_with_error(
 ) -> tuple[F64, F64]:
     """Standard deviations, and the longer side of their one-sigma intervals.
 
-    ``variance``: as measured, below zero where little is there. ``error``: of it; downwards
-    ``below``, if that differs.
+    ``variance``: as measured, possibly negative. ``error``: its upper error; ``below``: its lower
+    error, if different.
     """
     there = np.maximum(variance, 0.0)
     root = np.sqrt(there)
@@ -30,7 +30,7 @@ def root_with_error(
 def sigmas_of_chi2(value: float, dof: int) -> float:
     """Standard deviations of a normal that are as rare as a chi-square this large.
 
-    Under chance the result is a standard normal; of a small chi-square it is negative.
+    By chance alone the result is a standard normal; it is negative for a small chi-square.
     """
     if value > _LARGE:
         # The logarithm of so small a probability underflows; this is its leading order.
@@ -39,10 +39,10 @@ def sigmas_of_chi2(value: float, dof: int) -> float:
 
 
 def sigmas_of_count(count: int, expected: float) -> float:
-    """Standard deviations of a normal that are as rare as more events than these.
+    """Standard deviations of a normal that are as rare as more than ``count`` Poisson events.
 
-    Of a Poisson distribution with an expected number above zero. Half of the chance of just as many
-    counts as more: so that none, where none are expected, is no deviation at all.
+    ``expected`` is positive. Half of the probability of exactly ``count`` is included, so that no
+    events where almost none are expected are no deviation.
     """
     log_equal = float(xlogy(count, expected) - gammaln(count + 1) - expected)
     log_chance = log_equal + math.log(0.5)
@@ -53,14 +53,14 @@ def sigmas_of_count(count: int, expected: float) -> float:
 
 
 def sigmas_of_best(*sigmas: float) -> float:
-    """Standard deviations that the largest of several independent standard normals is worth."""
+    """Significance (standard deviations) of the largest of independent standard normals."""
     return sigmas_of_largest(max(sigmas), len(sigmas))
 
 
 def sigmas_of_largest(largest: float, count: int) -> float:
-    """The same, given the largest of ``count`` of them."""
+    """As `sigmas_of_best`, given the largest of ``count`` normals."""
     chance = float(log_ndtr(-max(largest, -8.0)))
-    # One minus the chance that none of them is as large.
+    # One minus the probability that none is as large.
     none = count * math.log1p(-math.exp(chance))
     log_any = math.log(-math.expm1(none)) if none < -1e-12 else chance + math.log(count)
     return -float(ndtri_exp(min(log_any, -1e-300)))

@@ -1,13 +1,13 @@
-"""From light to samples, compiled; and random numbers keyed by what they are for.
+"""Compiled simulation of samples from light, and random numbers keyed by purpose.
 
 A frame is made in separate steps, each over arrays (y, x) of the rows at hand, so that an effect
 can act between any two: `illuminate` (light and pixel response: mean electrons), `collect`
 (charge: dark current, shot noise, full well), `amplify` (gain, bias, read noise), `convert`
 (codes).
 
-Random numbers are keyed by (purpose, place): noise of pixels by `pixcal.kernels.normals`, all else
-by a `numpy.random.Generator` (PCG64) each, such as maps of the chip for each tile of it. So nothing
-depends on how the work is cut or who does it.
+Random numbers are keyed by (purpose, place): noise of pixels comes from `pixcal.kernels.normals`,
+all else from a separate `numpy.random.Generator` (PCG64), for example one per tile of the chip for
+its maps. Results thus do not depend on how the work is divided.
 """
 
 import math
@@ -31,7 +31,7 @@ EXACT_BELOW = 16.0
 
 
 class Stream(IntEnum):
-    """What random numbers are for; a number is never reused."""
+    """Purposes of random numbers; a number is never reused."""
 
     DELTA_X = 1
     DELTA_Y = 2
@@ -46,7 +46,7 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, *key: int) -> np.random.Generator:
-    """The random generator of one purpose and place; the same whoever asks, in whatever order."""
+    """The random generator of one purpose and place, independent of the order of calls."""
     return np.random.Generator(np.random.PCG64(_Seed.of(seed, int(stream), *key)))
 
 
@@ -62,13 +62,13 @@ def walk_normals(seed: int, effect: str, first: int, *last: int) -> Callable[[in
 
 
 def pixel_key(seed: int, stream: Stream, *key: int) -> Key:
-    """The same for normals of pixels (`pixcal.kernels.normals`)."""
+    """Key of one purpose and place for normals of pixels (`pixcal.kernels.normals`)."""
     word = int(_Seed.of(seed, int(stream), *key).words[0])
     return word >> 32, word & 0xFFFFFFFF
 
 
 class _Seed(np.random.SeedSequence):
-    """Seed of a generator. Mixing it takes as long as some thousand normals: it is kept."""
+    """Seed of a generator, cached because mixing it takes as long as a thousand normals."""
 
     def __init__(self, seed: int, *key: int) -> None:
         super().__init__(seed, spawn_key=key)
@@ -80,12 +80,12 @@ class _Seed(np.random.SeedSequence):
         return cls(seed, *key)
 
     def generate_state(self, n_words: int, dtype: Any = np.uint32) -> Any:
-        """The words that PCG64 asks for, always four of 64 bits."""
+        """The words that PCG64 requests, always four of 64 bits."""
         return self.words
 
 
 def fill_normal(rng: np.random.Generator, out: F32) -> None:
-    """Fill a 2-D array with standard normals: those of ``rng.standard_normal``, rounded."""
+    """Fill a 2-D array with ``rng.standard_normal``, rounded to float32."""
     out[...] = rng.standard_normal(out.shape)
 
 
@@ -106,8 +106,8 @@ def illuminate(
     ----------
     iota, alpha_sin, alpha_cos : (y, x) float32 mean; alpha times sin psi and cos psi, e-
     level, amplitude : B and A of the frame
-    column_turn, row_turn : (2, x), (2, y) float32, cos and sin of the frame's phase: phi and what
-        grows along y in the rows, what grows along x in the columns
+    column_turn, row_turn : (2, x), (2, y) float32, cos and sin of the frame's phase: phi and the
+        part that varies along y in the rows, the part that varies along x in the columns
     out : (y, x) float32 electrons, written
     """
     b, a = np.float32(level), np.float32(amplitude)
@@ -126,10 +126,10 @@ def collect(light: F32, dark: F32, normal: F32, shot: bool, full_well: float, ou
     The Poisson variate is the quantile of its distribution at the probability of a standard normal
     w, so that the same random numbers serve every level. From `EXACT_BELOW` up the quantile is
     Giles' expansion in 1/sqrt(mean) to second order (ACM TOMS 42(1), 6, 2016, function Q_N2),
-    rounded down: there its distribution function is within 2e-5 of the exact one, mean, variance
-    and skewness within 1e-8, 1.1e-4 and 2e-4 of theirs (computed at mean 16, falling fast above it;
-    the tests repeat it). Below, it is exact. ``light`` and ``dark`` are mean electrons, ``normal``
-    standard normals; without ``shot`` the charge is its mean.
+    rounded down: its distribution function is within 2e-5 of the exact one, and its mean, variance
+    and skewness within 1e-8, 1.1e-4 and 2e-4 (at mean 16, with a fast fall above it; the tests
+    repeat this). Below, it is exact. ``light`` and ``dark`` are mean electrons, ``normal`` standard
+    normals; without ``shot`` the charge is its mean.
     """
     well, least = np.float32(full_well), np.float32(EXACT_BELOW)
     if not shot:
@@ -164,11 +164,11 @@ def _poisson_expansion(mean: np.float32, w: np.float32) -> np.float32:
 def poisson_quantile(mean: float, w: float) -> int:
     """Smallest n whose Poisson distribution function reaches that of a standard normal at ``w``.
 
-    By summing, so for means below `EXACT_BELOW`; zero for means of zero or less.
+    A sum, hence for means below `EXACT_BELOW`; zero for means of zero or less.
     """
     if mean <= 0:
         return 0
-    # Of the two tails the smaller is exact: the sum stops where the rest of it is the upper tail.
+    # The upper tail is accurate for large ``w``: stop where the remaining probability reaches it.
     upper = 0.5 * math.erfc(w / math.sqrt(2.0))
     term = math.exp(-mean)
     rest = 1.0 - term
@@ -201,7 +201,7 @@ def convert(adu: F32, step: int, top: int, out: U16) -> None:
 
 
 def turns(angles: NDArray[Any]) -> F32:
-    """cos and sin of angles (rad) as `illuminate` takes them, shape (2, n)."""
+    """cos and sin of angles (rad) for `illuminate`, shape (2, n)."""
     found = np.empty((2, len(angles)), np.float32)
     np.cos(angles, out=found[0])
     np.sin(angles, out=found[1])

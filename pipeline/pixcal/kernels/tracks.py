@@ -1,7 +1,7 @@
-"""Charge that a particle leaves along its straight way through the sensitive layer.
+"""Charge that a particle deposits along its straight track through the sensitive layer.
 
-The charge is laid down evenly along the track and spreads on its way to the pixels' gates, which
-blurs the track by a Gaussian.
+The charge is uniform along the track and diffuses on its way to the pixels' gates, which blurs the
+track by a Gaussian.
 """
 
 import math
@@ -12,21 +12,21 @@ import numpy as np
 from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F32, F64
 
-STEPS_PER_PX = 4  # points of a track that stand for a pixel of its length
-GRAZING = 0.02  # least cosine to the layer's normal: no track is longer than 50 times the depth
+STEPS_PER_PX = 4  # points of a track per pixel of its length
+GRAZING = 0.02  # least cosine to the layer's normal, so tracks are at most 50 depths long
 _RANGE = 4.0
 
 
 @kernel()
 def add_tracks(charge: F32, tracks: F64, sigma: float, first_row: int) -> None:
-    """Add the charge of tracks to a frame (y, x), e-; what falls beside it is lost.
+    """Add the charge of tracks to a frame (y, x), e-; charge outside it is lost.
 
     Parameters
     ----------
     charge : (y, x) e-, changed in place
-    tracks : (n, 5) row and column where a track begins, its length along each (px), its charge (e-)
+    tracks : (n, 5) row and column of a track's start, its length along each (px), its charge (e-)
     sigma : width of the blur, px
-    first_row : of the frame, among those that the tracks are counted in
+    first_row : row of the frame's first row, in the coordinates of the tracks
     """
     reach = math.ceil(_RANGE * sigma)
     along_y, along_x = np.empty(2 * reach + 2), np.empty(2 * reach + 2)
@@ -45,7 +45,7 @@ def add_tracks(charge: F32, tracks: F64, sigma: float, first_row: int) -> None:
 
 @inner()
 def _shares(shares: Any, away: float, sigma: float) -> None:
-    """Shares of a Gaussian in successive pixels, the first of them ``away`` from its centre."""
+    """Shares of a Gaussian in successive pixels, the first at ``away`` from its centre."""
     below = math.erf((away - 0.5) / (math.sqrt(2.0) * sigma))
     for n in range(len(shares)):
         upto = math.erf((away + n + 0.5) / (math.sqrt(2.0) * sigma))
@@ -62,21 +62,21 @@ def draw_tracks(
     electrons_per_px: float,
     straggling: float,
 ) -> F64:
-    """Tracks (count, 5), as in `add_tracks`, of particles that arrive evenly from a half space.
+    """Tracks (count, 5), as in `add_tracks`, of an isotropic flux of particles from a half space.
 
     Parameters
     ----------
-    area_px, margin_px : rows and columns that tracks begin in, and how far beside them
+    area_px, margin_px : rows and columns where tracks begin, and the margin around them
     depth_px : of the sensitive layer
-    electrons_per_px : most probable charge for a length as long as a pixel is wide
+    electrons_per_px : most probable charge per pixel width of track length
     straggling : relative width of the distribution of charge (Moyal's form of Landau's)
     """
-    # A flux that is even in direction meets a plane with the cosine of the angle.
+    # An isotropic flux through a plane is proportional to the cosine of the angle.
     cosine = np.sqrt(rng.random(count))
     length = depth_px / np.maximum(cosine, GRAZING)
     across = np.sqrt(np.maximum(length**2 - depth_px**2, 0))
     turn = 2 * np.pi * rng.random(count)
-    # Minus the logarithm of the square of a normal has Moyal's distribution, apart from its zero.
+    # Minus the logarithm of a squared normal has Moyal's distribution, apart from its origin.
     moyal = -np.log(np.maximum(rng.standard_normal(count) ** 2, 1e-300))
     charge = electrons_per_px * length * np.maximum(1 + straggling * moyal, 0)
     y, x = (rng.random(count) * (size + 2 * margin_px) - margin_px - 0.5 for size in area_px)

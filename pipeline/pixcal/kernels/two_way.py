@@ -1,7 +1,7 @@
-"""What is left of a table of frames by pixels where each frame and each pixel is free.
+"""Residuals of a table of frames by pixels after a fit of every frame and every pixel.
 
-A frame is free to have some functions of place, a pixel some functions of time. The table is
-projected, with its weights, onto what frames leave and onto what pixels leave, in turns.
+For each frame, functions of place are free; for each pixel, functions of time. The weighted table
+is projected alternately onto the residuals of the frames and of the pixels.
 """
 
 from typing import Any
@@ -11,24 +11,24 @@ import numpy as np
 from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F32
 
-_PIXELS = 2048  # of a frame that are worked on together: they stay in the cache
+_PIXELS = 2048  # pixels of a frame processed together, to stay in the cache
 
 
 def left_over(
     table: F32, weight: F32, of_place: F32, covariance: F32, of_time: F32, inverse: F32, turns: int
 ) -> F32:
-    """What the freedom leaves of a table (t, n); zero where a sample has no weight.
+    """Residuals of a table (t, n) after the fit; zero where a sample has no weight.
 
     Parameters
     ----------
     table, weight : (t, n) the weight is one over the variance, or zero
-    of_place, covariance : (j, n), (t, j, j) functions that frames are free to have, and the
-        covariance of each frame's share of them
-    of_time, inverse : (k, t), (k, k, n) functions that pixels are free to have, and each pixel's
-        inverse normal matrix
+    of_place, covariance : (j, n), (t, j, j) free functions of each frame, and the covariance of
+        their coefficients in each frame
+    of_time, inverse : (k, t), (k, k, n) free functions of each pixel, and each pixel's inverse
+        normal matrix
     """
     rest = np.where(weight > 0, table, np.float32(0))
-    # Not in compiled code: that takes longer to compile.
+    # Outside compiled code, where it would take longer to compile.
     sums, share = np.zeros((2, len(of_time), rest.shape[1]), np.float32)
     dots, size = np.empty((2, len(of_place)), np.float32)
     given = rest, weight, of_place, covariance, of_time, inverse, turns

@@ -1,7 +1,7 @@
-"""Components of a series' variance: white noise and random walks.
+"""Variance components of a series: white noise and random walks.
 
-In walk modes white noise and a walk are independent from mode to mode. Each mode is a normal vector
-of covariance ``sum_i size_i part_i`` about ``known @ beta``. The sizes are those of restricted
+Walk modes of white noise and of a random walk are independent. Each mode is a normal vector of
+covariance ``sum_i size_i part_i`` about ``known @ beta``. The sizes are estimated by restricted
 maximum likelihood (Patterson & Thompson 1971, Biometrika 58, 545), by Fisher scoring, and near the
 end with the average information (Gilmour, Thompson & Cullis 1995, Biometrics 51, 1440).
 """
@@ -21,11 +21,11 @@ from pixcal.kernels.significance import root_with_error
 from pixcal.model.arrays import F64, Mask
 
 MAX_STEPS = 60
-CONVERGED = 1e-5  # growth of the log-likelihood at which scoring ends
-_DOUBLINGS = 60  # of an error in search of the upper limit of a size
-HALVINGS = 12  # of a step that does not make the data likelier
-FAR = 1e3  # growth by the signals' first step above which they are fitted before the noise
-NEAR = 2.0  # growth below which steps use the average information
+CONVERGED = 1e-5  # gain in log-likelihood at which scoring ends
+_DOUBLINGS = 60  # of an error, in the search for the upper limit of a size
+HALVINGS = 12  # of a step that does not raise the likelihood
+FAR = 1e3  # gain by the signals' first step above which they are fitted before the noise
+NEAR = 2.0  # gain below which steps use the average information
 SHORTEST = 0.1  # least step in time, over the median one
 
 
@@ -41,17 +41,17 @@ class Modes:
     """Walk modes of one or more series of ``c`` channels, and the parts of their covariance."""
 
     values: F64  # (n, c)
-    known: F64  # (n, c, p) shapes that are fitted, each by a coefficient
+    known: F64  # (n, c, p) fitted shapes, each with a coefficient
     parts: F64  # (m, n, c, c) covariance of each mode for unit sizes
-    # start, least: (m,) sizes to begin with and lowest ones; below zero, so that what is not
-    # there may come out either side of nothing
+    # start, least: (m,) initial and lowest sizes; the latter below zero, so that an absent part
+    # may have an estimate of either sign
     start: F64
     least: F64
-    share: float = 1.0  # of the modes that are independent: the likelihood counts no more
+    share: float = 1.0  # share of independent modes, a factor of the log-likelihood
 
     @property
     def flat(self) -> F64:
-        """``parts`` as (m, n c c), for sums over all else."""
+        """``parts`` as (m, n c c), for sums over modes and channels."""
         return self.parts.reshape(len(self.parts), -1)
 
     @cached_property
@@ -62,27 +62,27 @@ class Modes:
 
 @dataclass(frozen=True)
 class Components:
-    """Sizes found, and how well."""
+    """Estimated sizes and their likelihood."""
 
     size: F64  # (m,)
-    free: Mask  # (m,) sizes that were not held
+    free: Mask  # (m,) sizes that were free
     beta: F64  # beta, beta_covariance: (p,), (p, p) coefficients of the known shapes
     beta_covariance: F64
-    likelihood: float  # logarithm, restricted; comparable where the known shapes are the same
-    profile: float  # logarithm, not restricted; comparable whatever the known shapes
-    modes: Modes  # that it is of
+    likelihood: float  # restricted log-likelihood; comparable for the same known shapes only
+    profile: float  # unrestricted log-likelihood; comparable for all known shapes
+    modes: Modes  # the data
 
     @cached_property
     def covariance(self) -> F64:
-        """Covariance (m, m) of ``size``; zero for those that were held."""
+        """Covariance (m, m) of ``size``; zero for fixed sizes."""
         found = np.zeros((len(self.size),) * 2)
         inside = np.ix_(self.free, self.free)
         found[inside] = inverse_normal(_State(self.modes, self.size).information()[inside])
         return found
 
     def above(self, part: int) -> float:
-        """1-sigma error of a size, upwards: where the likelihood has fallen by exp(-1/2)."""
-        # A walk shows in few modes: a small one found in them may well be a large one.
+        """Upper 1-sigma error of a size, at which the likelihood has fallen by exp(-1/2)."""
+        # A walk dominates few modes, so its true size may be far above the estimate.
         sizes = self.size.copy()
         sizes[part] = value = max(float(sizes[part]), 0.0)
         top = _State(self.modes, sizes).likelihood
@@ -101,13 +101,13 @@ class Components:
         return width * float(brentq(lambda share: left(share * width), 0.0, 1.0, xtol=1e-3))
 
     def root(self, part: int) -> tuple[float, float]:
-        """Standard deviation of a part, and its error by `above`."""
+        """Standard deviation of a part, and its error from `above`."""
         below = float(np.sqrt(self.covariance[part, part]))
         root, error = root_with_error(self.size[part], self.above(part), below)
         return float(root), float(error)
 
     def shape_covariance(self, uncertain: Sequence[int]) -> F64:
-        """Covariance (p, p) of ``beta``: by simulation, a third at the limits of the sizes."""
+        """Covariance (p, p) of ``beta``, a third of it at the sizes' upper limits (simulated)."""
         sizes = np.maximum(self.size, 0.0)
         for part in uncertain:
             sizes[part] += self.above(part)
@@ -120,11 +120,11 @@ def estimate_components(
     start: Components | None = None,
     steps: int = MAX_STEPS,
 ) -> Components:
-    """Sizes of the parts by restricted maximum likelihood; ``absent`` ones are held at zero."""
+    """Sizes of the parts by restricted maximum likelihood; ``absent`` ones are fixed at zero."""
     free = np.ones(len(modes.parts), bool)
     free[list(absent)] = False
     state = _begin(modes, free, start)
-    # Far from the maximum a step of all sizes gives to the noise what is a signal.
+    # Far from the maximum, a step of all sizes attributes signal to noise.
     signals = free & (modes.start == 0)
     state, gained = _climbed(state, signals, 1) if steps and signals.any() else (state, 0.0)
     if gained > FAR:
@@ -136,7 +136,7 @@ def estimate_components(
 
 
 def _climbed(state: "_State", free: Mask, steps: int) -> tuple["_State", float]:
-    """After so many steps of some sizes, or where none helps; and how much likelier the last is."""
+    """State after at most ``steps`` steps of the free sizes, and the gain of the last step."""
     modes, gain = state.modes, np.inf
     for _ in range(steps):
         score = state.score()
@@ -166,12 +166,12 @@ def _begin(modes: Modes, free: Mask, start: Components | None) -> "_State":
         try:
             return _State(modes, np.where(free, np.maximum(start.size, modes.least), 0.0))
         except np.linalg.LinAlgError:
-            pass  # Sizes below zero elsewhere may be too low here: from the beginning.
+            pass  # Negative sizes of another fit may be too low here: use the default start.
     return _State(modes, np.where(free, modes.start, 0.0))
 
 
 class _State:
-    """Likelihood of the modes at given sizes, and its slope; LinAlgError if not positive."""
+    """Likelihood at given sizes, and its slope; LinAlgError if a covariance is not positive."""
 
     def __init__(self, modes: Modes, size: F64) -> None:
         self.modes, self.size = modes, size
@@ -190,14 +190,14 @@ class _State:
     def score(self) -> F64:
         """Slope of the log-likelihood (m,)."""
         seen = self.pull[:, :, None] * self.pull[:, None, :]
-        # What the fit of the known shapes takes away of the scatter.
+        # Scatter that the fit of the known shapes removes.
         lost = (self.weighted @ self.spread) @ self.weighted.swapaxes(1, 2)
         more = self.modes.flat @ (seen - self.weight + lost).ravel()
         return np.asarray(self.modes.share * more / 2)
 
     def average_information(self) -> F64:
-        """Mean (m, m) of Fisher's information and of the curvature of the log-likelihood."""
-        # Channel by channel: einsum is slow over axes this short.
+        """Mean (m, m) of the Fisher information and the curvature of the log-likelihood."""
+        # Channel by channel, because einsum is slow for such short axes.
         parts, each = self.modes.by_channel, range(len(self.modes.by_channel))
         pull, weight = self.pull.T, self.weight.transpose(1, 2, 0)
         pulled = [sum(parts[a, b] * pull[b] for b in each) for a in each]
@@ -207,7 +207,7 @@ class _State:
         return np.asarray(self.modes.share * (fisher - known @ self.spread @ known.T) / 2)
 
     def information(self) -> F64:
-        """Fisher's information of the sizes (m, m)."""
+        """Fisher information of the sizes (m, m)."""
         return np.asarray(self.modes.share * trace_products(self.weight, self.modes.by_channel) / 2)
 
 
@@ -230,7 +230,7 @@ def _swept(covariance: F64) -> tuple[F64, float]:
 
 
 def _log_determinant(matrix: F64) -> float:
-    """Logarithm of the determinant, without what `inverse_normal` leaves out."""
+    """Logarithm of the determinant, without eigenvalues that `inverse_normal` leaves out."""
     scale = root_diagonal(matrix)
     values = np.linalg.eigvalsh(matrix / np.outer(scale, scale))
     kept = values > 1e-9 * values.max(initial=0.0)
@@ -238,12 +238,12 @@ def _log_determinant(matrix: F64) -> float:
 
 
 def signed_sigmas(growth: float, size: float) -> float:
-    """Standard deviations by which a part is there, by the growth of the log-likelihood."""
+    """Signed significance (standard deviations) of a part from its gain in log-likelihood."""
     return float(np.copysign(np.sqrt(max(2 * growth, 0.0)), size))
 
 
 def log_chance(growth: float, pairs: int = 1) -> float:
-    """Logarithm of the chance of such a growth of log-likelihood by ``2 * pairs`` parameters."""
+    """Log probability that ``2 * pairs`` parameters bring such a log-likelihood gain by chance."""
     # Tail of chi-square with an even number of degrees of freedom: a finite sum.
     x = max(growth, 0.0)
     terms = np.cumprod(np.concatenate([[1.0], x / np.arange(1, pairs)]))
@@ -251,16 +251,16 @@ def log_chance(growth: float, pairs: int = 1) -> float:
 
 
 def joint_log_chance(full: Components, less: Components, sizes: F64) -> float:
-    """Logarithm of the chance of two absent parts of these sizes (2,) coming out as they did."""
+    """Log probability that two absent parts have estimates as large as ``sizes`` (2,) by chance."""
     growth = full.likelihood - less.likelihood
-    # One time in four both come out below nothing.
+    # Both estimates are negative in one case of four.
     if np.any(sizes > 0):
         return float(np.log(0.75)) + log_chance(growth)
     return float(np.log1p(-0.25 * np.exp(-max(growth, 0.0))))
 
 
 def log_chance_of_any(log_chances: Sequence[float]) -> float:
-    """Logarithm of the chance that the rarest of several independent findings is as rare."""
+    """Log probability that the rarest of several independent findings is as rare by chance."""
     rarest, number = min(*log_chances, 0.0), len(log_chances)
     if rarest < -30:
         return float(rarest + np.log(number))
@@ -268,7 +268,7 @@ def log_chance_of_any(log_chances: Sequence[float]) -> float:
 
 
 def sigmas(log_chance: float) -> float:
-    """Standard deviations of a normal variable beyond which lies a chance, by its logarithm."""
+    """Normal deviate (standard deviations) of a one-sided log probability."""
     return -float(ndtri_exp(min(log_chance, -1e-6)))
 
 
@@ -277,22 +277,22 @@ def sigmas(log_chance: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class WalkModes:
-    """Modes of series of t frames."""
+    """Walk modes of series of t frames."""
 
     vectors: F64  # (t - 1, t) orthonormal, slowest first
-    walk: F64  # (t - 1,) variance, s, of the modes of a random walk of unit variance a second
+    walk: F64  # (t - 1,) variance, s, of the modes of a random walk of unit variance per second
 
     def of(self, series: F64) -> F64:
         """Modes (t - 1, ...) of series (t, ...)."""
         return np.asarray(np.tensordot(self.vectors, series, 1))
 
     def series(self, modes: F64) -> F64:
-        """Series (t, ...), without mean, of some modes (t - 1, ...)."""
+        """Zero-mean series (t, ...) from modes (t - 1, ...)."""
         return np.asarray(np.tensordot(self.vectors.T, modes, 1))
 
 
 def walk_modes(time_s: F64) -> WalkModes:
-    """Modes of series at some times (t,), ascending, s."""
+    """Walk modes for ascending times (t,), s."""
     return _modes(np.ascontiguousarray(time_s, float).tobytes())
 
 
@@ -300,7 +300,7 @@ def walk_modes(time_s: F64) -> WalkModes:
 def _modes(times: bytes) -> WalkModes:
     steps = np.diff(np.frombuffer(times))
     usual = float(np.median(steps)) if len(steps) else 1.0
-    # The inverse of a walk's covariance without the mean: differences of neighbours, weighted.
+    # Inverse covariance of a walk without its mean: weighted differences of neighbours.
     weight = 1 / np.maximum(steps, SHORTEST * usual if usual > 0 else 1.0)
     diagonal = np.append(weight, 0.0) + np.append(0.0, weight)
     values, vectors = eigh_tridiagonal(diagonal, -weight)

@@ -1,4 +1,4 @@
-"""From projections on fringe axes to (delta_x, delta_y): weighted least squares at every pixel."""
+"""Weighted least squares of (delta_x, delta_y) from projections on fringe axes, per pixel."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from pixcal.model.arrays import F64
 
 
 def axes_span_plane(axes: Sequence[tuple[float, float]]) -> bool:
-    """Whether unit vectors (x, y) differ enough to give both components (by 10 degrees)."""
+    """Whether unit vectors (x, y) differ enough (10 degrees) to give both components."""
     a = np.asarray(axes, float)
     if len(a) < 2:
         return False
@@ -21,9 +21,9 @@ def combine_sets(
     """Solve ``delta[s] = axes[s] . (delta_x, delta_y)`` at every pixel, weighted by 1 / sigma².
 
     ``axes``: unit vector (x, y) of each set's fringe axis. ``delta, sigma``: (s, ...) projections
-    and errors, px; NaN does not count. Returns delta_x and delta_y (2, ...), px, NaN where sets
-    left do not give both; their errors; disagreement (...) for ``sets - 2`` degrees of freedom (0
-    with two).
+    and errors, px; NaN is ignored. Returns delta_x and delta_y (2, ...), px, NaN where the valid
+    sets do not determine both; their errors; chi-square (...) with ``sets - 2`` degrees of freedom
+    (0 with two).
     """
     a = np.asarray(axes, float).reshape(len(delta), 2, *([1] * (delta.ndim - 1)))
     good = np.isfinite(delta) & np.isfinite(sigma) & (sigma > 0)
@@ -33,7 +33,7 @@ def combine_sets(
     yy = (w * a[:, 1] ** 2).sum(0)
     rx, ry = (w * a[:, 0] * d).sum(0), (w * a[:, 1] * d).sum(0)
     det = xx * yy - xy * xy
-    # Whether they give both is a matter of the axes alone, however unequal the errors.
+    # Whether both are determined depends on the axes only, however unequal the errors.
     n, cc = good.sum(0), (good * a[:, 0] ** 2).sum(0)
     spread = cc * (n - cc) - (good * a[:, 0] * a[:, 1]).sum(0) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -47,7 +47,7 @@ def combine_sets(
 def combine_parallel(
     axes: Sequence[tuple[float, float]], delta: F64, sigma: F64
 ) -> tuple[F64, F64, F64]:
-    """As `combine_sets`, of sets along one axis; the sign of each set follows the first."""
+    """As `combine_sets`, for sets along one axis; the first set defines the sign."""
     a = np.asarray(axes, float)
     sign = np.sign(a @ a[0]).reshape(-1, *([1] * (delta.ndim - 1)))
     return weighted_mean(sign * delta, sigma)

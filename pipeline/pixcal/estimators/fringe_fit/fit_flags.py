@@ -1,4 +1,4 @@
-"""Which pixels of a fit are to be believed."""
+"""Flags of pixels whose fit is not reliable."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,13 +7,13 @@ from scipy.special import ndtr
 from pixcal.model.arrays import F32, U8
 from pixcal.model.flags import PixelFlag
 
-# largest error of a phase: beyond it errors are no longer Gaussian, and 6 sigma are seen (with 0.3
-# rad one pixel in 500 was further from the truth)
+# largest phase error: beyond it errors are not Gaussian, and deviations of 6 sigma occur (with 0.3
+# rad, in one pixel of 500)
 MAX_SIGMA_RAD = 0.2
-# light is never below zero: fringes that go there by more have the wrong bias, and the variance of
-# their samples is not known
+# light is never negative: fringes of a higher visibility have a wrong bias, and the variance of
+# their samples is unknown
 MAX_VISIBILITY = 1.05
-CHANCE = 6.0  # errors by which a visibility may be larger still by chance
+CHANCE = 6.0  # standard errors by which noise may exceed this limit
 
 
 def fit_flags(
@@ -31,18 +31,18 @@ def fit_flags(
 
     iota, alpha, sigma, chi2, count : (y, x) of the sweep: mean and amplitude (e-), error of
         the phase (rad), reduced chi-square, samples
-    noise : usual reduced chi-square: where the noise model is off by a factor, all pixels are
-    excess : relative scatter of reduced chi-squares beyond chance, which is no defect
-    chi2_limit : reduced chi-square, over ``noise``, above which a pixel does not fit
+    noise : usual reduced chi-square, which is not 1 if the noise model is off by a factor
+    excess : relative scatter of reduced chi-squares beyond chance, which is not a defect
+    chi2_limit : largest reduced chi-square, over ``noise``, of a good pixel
     """
     flags = mask.copy()
     flags[count == 0] |= np.uint8(PixelFlag.NO_DATA)
-    # Chance alone gives a scatter of sqrt(2 / n) to a reduced chi-square.
+    # A reduced chi-square scatters by sqrt(2 / n) by chance.
     scatter = 8 * np.sqrt(2 / np.maximum(count - 3, 1) + excess**2)
     with np.errstate(invalid="ignore"):
         good = np.isfinite(sigma) & (chi2 / noise < np.maximum(chi2_limit, 1 + scatter))
         good &= (iota > 0) & (sigma < MAX_SIGMA_RAD)
-        # Noise that makes an amplitude larger makes its error look smaller: the usual one tells.
+        # Noise that raises an amplitude lowers its phase error: use the median visibility.
         usual = np.nanmedian((alpha / iota)[good]) if good.any() else np.float32(1.0)
         good &= sigma * alpha < MAX_SIGMA_RAD * usual * iota
         good &= alpha < MAX_VISIBILITY * iota + CHANCE * sigma * alpha
@@ -56,7 +56,7 @@ def usual_chi2(values: NDArray[np.floating], freedom: int) -> float:
 
 
 def excess_scatter(values: NDArray[np.floating], freedom: int) -> float:
-    """Relative scatter of reduced chi-squares beyond noise, by one deviation above the median."""
+    """Relative scatter of reduced chi-squares beyond noise, from their 84 % and 50 % quantiles."""
     if not len(values):
         return 0.0
     usual, high = np.quantile(values, ndtr([0.0, 1.0]))
@@ -65,6 +65,6 @@ def excess_scatter(values: NDArray[np.floating], freedom: int) -> float:
 
 
 def _noise_chi2(sigmas: float, freedom: int) -> float:
-    """Reduced chi-square of pure noise, standard deviations above its median (Wilson, Hilferty)."""
+    """Reduced chi-square of pure noise, ``sigmas`` above its median (Wilson, Hilferty)."""
     part = 2 / (9 * max(freedom, 1))
     return float((1 - part + sigmas * np.sqrt(part)) ** 3)

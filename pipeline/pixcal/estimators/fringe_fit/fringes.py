@@ -1,4 +1,4 @@
-"""What a set's fringes look like: frame parameters, the local fringe vector, smooth phasors."""
+"""Fringes of a set: frame parameters, the local fringe vector, smooth phasors."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -14,28 +14,28 @@ from pixcal.model.arrays import C128, F32, F64, Mask
 from pixcal.model.errors import InputError
 
 Phases = TypeVar("Phases", F32, F64)
-MIN_FRINGES = 1.5  # fewest fringes across a window for a peak to be looked for
-# fewest fringes for maps with honest errors: with 1.3 to 1.8 the gauge takes true offsets for
-# fringes, and errors were 2 to 4 times what SIGMA says (measured on 80 x 80 px)
+MIN_FRINGES = 1.5  # fewest fringes across a window for the search of a peak
+# fewest fringes for maps with correct errors: with 1.3 to 1.8 the gauge mistakes true offsets for
+# fringes, and errors were 2 to 4 times SIGMA (measured on 80 x 80 px)
 HONEST_FRINGES = 1.95
-# shortest period along x and y: below 2 px fringes look like wider ones of another direction, and
-# nominal vectors are good to some 10 %
+# shortest period along x and y: below 2 px fringes are aliased to wider ones of another direction,
+# and nominal vectors are accurate to some 10 %
 SHORTEST_PX = 2.2
 # least cosine between the fringes' axis and the nominal one: the nominal vector gives the sign
 MOST_TURNED = 0.5
 RESOLVED = 1e-7  # last step to the peak of the spectrum, rad/px
-MOST_STEPS = 20  # a few are enough from the highest bin
-# pixels that a smooth phasor is fitted to, about: ten terms are then known to 4 % of the noise of
-# one pixel
+MOST_STEPS = 20  # a few suffice from the highest bin
+# approximate number of pixels to which a smooth phasor is fitted: ten terms then have 4 % of the
+# noise of one pixel
 MOST_PIXELS = 6000
 
 
 @dataclass(frozen=True)
 class FrameParameters:
-    """What changes from frame to frame."""
+    """Parameters of each frame."""
 
     g: F64  # (t, 3) (B, A cos phi, A sin phi) at the reference point
-    dk: F64  # (t, 2) change of the fringe vector along x and y (rad/px); all zero when it is held
+    dk: F64  # (t, 2) change of the fringe vector along x and y (rad/px); all zero if fixed
     reference: tuple[float, float]  # point (y, x) where `g` holds, in pixels
 
     @cached_property
@@ -44,7 +44,7 @@ class FrameParameters:
         return bool(np.any(self.dk != 0))
 
     def at(self, y: float, x: float) -> F64:
-        """Frame parameters (t, 3) at another point: the phase turned by dk times the distance."""
+        """Frame parameters (t, 3) at another point: the phase changes by dk times the distance."""
         if not self.moving:
             return self.g
         turn = self.dk[:, 0] * (x - self.reference[1]) + self.dk[:, 1] * (y - self.reference[0])
@@ -92,7 +92,7 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
     window = np.hanning(shape[0] + 2)[1:-1, None] * np.hanning(shape[1] + 2)[None, 1:-1]
     weight = window * good
     y, x = grid(shape)
-    # A plane is taken off each map: what is left of the illumination must not win.
+    # Each map minus a plane, lest a gradient of the illumination be the highest peak.
     basis = np.stack(np.broadcast_arrays(1.0, x, y), axis=-1).reshape(-1, 3) * weight.reshape(-1, 1)
     flat = np.where(good, maps, 0.0).reshape(len(maps), -1) * weight.reshape(1, -1)
     coefficients = np.linalg.lstsq(basis, flat.T, rcond=None)[0]
@@ -118,7 +118,7 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
 
 def _peak(light: F64, nominal: tuple[float, float]) -> F64 | None:
     """Highest peak (kx, ky), rad/px, of the spectra of maps (n, y, x); None if none stands out."""
-    # Nominal positions are good to some 10 %: the peak there wins unless it is no peak at all.
+    # Nominal positions are accurate to some 10 %: a peak there has priority.
     shape = light.shape[1:]
     size = [2 * n for n in shape]
     power = (np.abs(np.fft.fft2(light, s=size)) ** 2).sum(axis=0)
@@ -127,7 +127,7 @@ def _peak(light: F64, nominal: tuple[float, float]) -> F64 | None:
     near = np.hypot(2 * np.pi * fx - nominal[0], 2 * np.pi * fy - nominal[1])
     reach = 0.25 * np.hypot(*nominal) + 2 * np.pi * 1.5 / min(shape)
     floor = np.median(power[allowed]) if allowed.any() else np.inf
-    # The foot of a peak beyond is none, nor are its side lobes.
+    # Neither the wing of a peak outside the region nor its side lobes are peaks.
     within = np.where(allowed, power, 0.0)
     crest = (power >= maximum_filter(within, 3, mode="wrap")) & (power > 0.1 * within.max())
     for region in (allowed & crest & (near < reach), allowed):
@@ -160,20 +160,20 @@ def _refined(light: F64, start: F64) -> F64:
 
 
 def powers(degree: int) -> list[tuple[int, int]]:
-    """Powers (of x, of y) of the terms of a polynomial."""
+    """Powers (of x, of y) of a polynomial's terms."""
     return [(n - j, j) for n in range(degree + 1) for j in range(n + 1)]
 
 
 def monomials(y: F64, x: F64, degree: int) -> F64:
-    """The terms (term, ...) at coordinates that broadcast."""
-    # Columns and rows are small: their powers cost nothing, the products all.
+    """The terms (term, ...) at coordinates, which broadcast."""
+    # Powers of single columns and rows take little time; the products take most.
     xs, ys = ([np.asarray(v**n) for n in range(degree + 1)] for v in (x, y))
     return np.stack([xs[i] * ys[j] for i, j in powers(degree)])
 
 
 @lru_cache(maxsize=8)
 def polynomial_basis(shape: tuple[int, ...], degree: int, step: int = 1) -> F64:
-    """Terms x^i y^j, i + j up to ``degree``, on ±1, of every ``step``-th pixel: (y * x, terms)."""
+    """Terms x^i y^j, i + j up to ``degree``, on ±1, at every ``step``-th pixel: (y * x, terms)."""
     y, x = grid(shape)
     terms = monomials(y / max(1.0, shape[0] / 2), x / max(1.0, shape[1] / 2), degree)
     return np.ascontiguousarray(terms.reshape(len(terms), -1)[:, ::step].T)
@@ -192,7 +192,7 @@ def smooth_phasor(
 ) -> SmoothPhasor:
     """Smooth version of a noisy phasor map alpha exp(i psi) / iota (y, x), from its good pixels.
 
-    A complex polynomial about the corrected fringe vector k (rad/px), outliers left out.
+    A complex polynomial times the wave of the corrected fringe vector k (rad/px), no outliers.
     """
     shape, (kx, ky) = phasor.shape, k
     turned = np.where(good, phasor, 0) * plane_wave(shape, (-kx, -ky))
@@ -202,12 +202,12 @@ def smooth_phasor(
         ky += float(np.angle(np.vdot(turned[:-1], turned[1:])))
     carrier = plane_wave(shape, (kx, ky))
     turned = (np.where(good, phasor, 0) * carrier.conj()).ravel()
-    # Real and imaginary part are two maps of the same real fit.
+    # Real and imaginary part are two right-hand sides of the same real fit.
     parts = np.ascontiguousarray(turned).view(float).reshape(-1, 2)
     use = good.ravel()
     while degree > 0 and min(shape) < 4 * (degree + 1):
         degree -= 1
-    # Some thousand pixels are enough, of all columns: the step and their number share no factor.
+    # A few thousand pixels suffice. A step coprime to the number of columns covers all columns.
     step = max(1, len(parts) // MOST_PIXELS)
     while gcd(step, shape[1]) > 1:
         step += 1
@@ -220,8 +220,8 @@ def smooth_phasor(
             every = polynomial_basis(shape, 0)
             fit = parts[use].mean(axis=0)[None] if n else np.zeros((1, 2))
             break
-        # Terms of low degree on ±1 are nearly orthogonal: normal equations keep their digits.
-        # A tile of which a few rows are good does not tell all of them: least squares, not solve.
+        # Terms of low degree on ±1 are nearly orthogonal, so normal equations stay accurate.
+        # A tile with few good rows does not determine all of them: least squares, not solve.
         inside = basis if n == use.size else basis * use[:, None]
         fit = np.linalg.lstsq(inside.T @ basis, inside.T @ parts, rcond=1e-10)[0]
         rest = ((parts - basis @ fit) ** 2).sum(axis=1)
@@ -233,7 +233,7 @@ def smooth_phasor(
 
 
 def plane_wave(shape: tuple[int, ...], k: tuple[float, float], phase: float = 0.0) -> C128:
-    """``exp(i (phase + k . r))`` over a tile (y, x), r from its centre: a product of two sides."""
+    """``exp(i (phase + k . r))`` over a tile (y, x), r from its centre; an outer product."""
     y, x = grid(shape)
     return np.asarray(np.exp(1j * (phase + k[1] * y)) * np.exp(1j * k[0] * x))
 

@@ -1,19 +1,19 @@
-"""Gauge freedom of free intensities, and how it is fixed.
+"""Fix the gauge freedom of free intensities.
 
 The data do not change when theta -> Q theta and g -> Q^-T g (physics note, section 2). Of Q's nine
-numbers, four turn up in the phase map, as fringes at the fringe frequency and twice it: with
-z = alpha exp(i psi), the change z' = z + b conj(z) + c iota moves the phase by
+numbers, four appear in the phase map, as fringes at the fringe frequency and twice it: with
+z = alpha exp(i psi), the change z' = z + b conj(z) + c iota shifts the phase by
 
     Im(b exp(-2 i psi)) + Im(c (iota / alpha) exp(-i psi))
 
-They are chosen so that the phase map holds none of these fringes.
+They are chosen so that the phase map contains none of these fringes.
 """
 
 import numpy as np
 
 from pixcal.model.arrays import C128, F64, Mask
 
-# modes of the phase map that a free intensity and amplitude in each frame leave open
+# modes of the phase map that free intensities and amplitudes of frames leave undetermined
 FRINGE_MODES = ("cos(psi)*iota/alpha", "sin(psi)*iota/alpha", "cos(2*psi)", "sin(2*psi)")
 
 
@@ -23,10 +23,10 @@ def fringe_modes(psi: F64, ratio: F64) -> list[F64]:
 
 
 def gauge_matrix(tiles: list[tuple[F64, Mask, C128]]) -> F64:
-    """Change Q (3, 3) of theta that takes the fringe-frequency modes out of the phase maps.
+    """Change Q (3, 3) of theta that removes the fringe-frequency modes from the phase maps.
 
-    The mended parameters are ``Q @ theta``, the frames ``g @ inv(Q)``. ``tiles``: theta (3, y, x),
-    good pixels, and the smooth phasor about which the modes are taken, of each tile.
+    The new parameters are ``Q @ theta``, the frames ``g @ inv(Q)``. ``tiles``: theta (3, y, x),
+    good pixels, and the smooth phasor that defines the modes, of each tile.
     """
     rows, rights, light_rows, light_rights = [], [], [], []
     for theta, good, smooth in tiles:
@@ -41,9 +41,9 @@ def gauge_matrix(tiles: list[tuple[F64, Mask, C128]]) -> F64:
         psi, ratio = np.angle(s), 1 / np.abs(s)
         modes = np.stack(fringe_modes(psi, ratio), axis=1)
         light = np.stack([np.cos(psi), np.sin(psi)], axis=1)
-        # Light is even but for some pixels, whose response is not known: they must not outvote all.
+        # Light is smooth. Clip it, lest a few pixels of unknown response dominate the fit.
         level = np.clip(iota[good] / np.median(iota[good]), 0.0, 2.0)
-        # Each tile has its own smooth phase and light: take them off before the tiles are joined.
+        # Each tile has its own smooth phase and light: remove them before joining the tiles.
         q, _ = np.linalg.qr(own)
         rows.append(modes - q @ (q.T @ modes))
         rights.append(rest - q @ (q.T @ rest))
@@ -56,7 +56,7 @@ def gauge_matrix(tiles: list[tuple[F64, Mask, C128]]) -> F64:
         np.linalg.lstsq(np.concatenate(design), np.concatenate(right), rcond=None)[0]
         for design, right in ((rows, rights), (light_rows, light_rights))
     )
-    # Im(c e^-i psi) = c_i cos - c_r sin and Im(b e^-2i psi) = b_i cos 2 - b_r sin 2, taken off z.
+    # Im(c e^-i psi) = c_i cos - c_r sin, Im(b e^-2i psi) = b_i cos 2 - b_r sin 2; to subtract.
     c, b = complex(-sin1, cos1), complex(-sin2, cos2)
     # theta = (iota, Im z, Re z); z -= b conj(z) + c iota.
     matrix[1] += [-c.imag, b.real, -b.imag]

@@ -22,15 +22,15 @@ from pixcal.estimators.fringe_fit.tile_sums import (
 from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
 from pixcal.model.arrays import F64
 
-TILES_AT_ONCE = 256  # tiles whose modes are held together
+TILES_AT_ONCE = 256  # tiles whose modes are in memory at the same time
 
 
 @dataclass(frozen=True)
 class ModeBasis:
-    """The modes of a set's phase map: those of the fringes' shape, then those of the gauge."""
+    """Modes of a set's phase map: modes of the fringes' shape, then of the gauge."""
 
     shape: FringeShape  # present shape of the fringes
-    carrier: Carrier  # that measured phases are relative to
+    carrier: Carrier  # reference of the measured phases
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -55,11 +55,11 @@ class ModeBasis:
         return modes, phase
 
     def sums(self, tiles: TileSums) -> tuple[F64, F64, float]:
-        """Normal matrix, right-hand sides (mode, 1 + batch), square, of phases less the shape's."""
+        """Normal matrix, right sides (mode, 1 + batch), square of phases minus the shape's."""
         size = len(self.names)
         normal, rights = np.zeros((size, size)), np.zeros((size, tiles.right.shape[2]))
         square = 0.0
-        # Some tiles at a time: their modes are many numbers.
+        # A limited number of tiles at a time, because their modes take much memory.
         for first in range(0, len(tiles.planes), TILES_AT_ONCE):
             part = slice(first, first + TILES_AT_ONCE)
             modes, phase = self._local(tiles.planes[part])
@@ -73,9 +73,9 @@ class ModeBasis:
         return normal, rights, square
 
     def removed(self, planes: list[TilePlane], coefficients: F64) -> F64:
-        """What to take off each tile's phases, in its local modes: (tile, local, 1 + batch).
+        """Phase to subtract from each tile, in its local modes: (tile, local, 1 + batch).
 
-        By coefficients (mode, 1 + batch): of the run relative to the shape, of batches to the run.
+        ``coefficients``: (mode, 1 + batch) of the run relative to the shape, of batches to the run.
         """
         removed = np.empty((len(planes), N_LOCAL, coefficients.shape[1]))
         for first in range(0, len(planes), TILES_AT_ONCE):
@@ -86,10 +86,9 @@ class ModeBasis:
         return removed
 
     def solve(self, normal: F64, right: F64, spread: float) -> F64:
-        """Coefficients (mode, n) of maps from their sums, with the shape's prior of the first map.
+        """Coefficients (mode, n) of maps from their sums, with the shape's prior for the first map.
 
-        ``spread``: variance of the map over that of its noise, since true offsets act as noise
-        here.
+        ``spread``: variance of the map over that of its noise, as true offsets act as noise here.
         """
         precision = self._precision(spread)
         offset = np.zeros(len(precision))
@@ -109,7 +108,7 @@ class ModeBasis:
 
 
 def solve_modes(normal: F64, right: F64) -> F64:
-    """Coefficients (mode, n); modes that the window cannot tell apart share what they explain."""
+    """Coefficients (mode, n) of minimum norm, for modes that are degenerate in the window."""
     scale = root_diagonal(normal)
     unit = normal / np.outer(scale, scale)
     return np.asarray(

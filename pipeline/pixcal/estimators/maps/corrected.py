@@ -1,9 +1,9 @@
-"""Offsets of a fit, after its three maps were corrected for an effect linear in the intensity.
+"""Offsets of a fit whose three maps were corrected for an effect linear in the intensity.
 
-The change of each pixel's phase is added to the fitted phases, and the modes that are degenerate
-with the bench are removed again, as the change contains them. Sums of pieces of the window add up,
-so a detector is corrected piece by piece: `phase_sums` of each, `solve_modes` of their sum, then
-`offsets` of each.
+The change of each pixel's phase is added to its fitted phase. As the change contains modes that are
+degenerate with the bench, these are removed again. The sums of parts of the window add up, so a
+detector is corrected part by part: `phase_sums` of each part, `solve_modes` of the total, then
+`offsets` of each part.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from pixcal.estimators.fringe_fit.modes import solve_modes
 from pixcal.model.arrays import F64
 
 PHASES = 64  # spread over a fringe
-MIN_SIGNAL = 1.0  # of a sample (e-), below which its shot noise is not taken
+MIN_SIGNAL = 1.0  # least signal (e-) for which shot noise is computed
 
 
 def phase_change(before: F64, after: F64) -> F64:
@@ -24,7 +24,7 @@ def phase_change(before: F64, after: F64) -> F64:
 
 
 def straight_modes(theta: F64, k: tuple[float, float]) -> F64:
-    """Modes (7, y, x) of straight fringes with free light: 1, x, y, fringes at k and 2 k."""
+    """Modes (7, y, x) of straight fringes with free intensities: 1, x, y, fringes at k and 2 k."""
     shape = theta.shape[1:]
     y, x = np.broadcast_arrays(*grid(shape))
     carrier = k[0] * x + k[1] * y
@@ -35,7 +35,7 @@ def straight_modes(theta: F64, k: tuple[float, float]) -> F64:
 
 
 def phase_sums(modes: F64, delta: F64, sigma: F64, change: F64, k: float) -> tuple[F64, F64]:
-    """Least-squares sums (mode, mode), (mode, 1) of a piece's phases after a change (y, x), rad.
+    """Least-squares sums (mode, mode), (mode, 1) of a part's phases after a change (y, x), rad.
 
     ``modes``: (mode, y, x) in offsets ``delta`` and errors, px, NaN masked; ``k``: rad/px.
     """
@@ -46,21 +46,21 @@ def phase_sums(modes: F64, delta: F64, sigma: F64, change: F64, k: float) -> tup
 
 
 def offsets(modes: F64, coefficients: F64, delta: F64, change: F64, k: float) -> F64:
-    """Offset (y, x) along the fringe axis after a change of the phase, px; modes taken off."""
+    """Offset (y, x) along the fringe axis, px, after a change of the phase and without modes."""
     return np.asarray(delta + (change - np.tensordot(coefficients[:, 0], modes, 1)) / k)
 
 
 def corrected_offsets(delta: F64, sigma: F64, change: F64, modes: F64, k: float) -> F64:
-    """Offsets (y, x) of a window in one piece after a change of the phase; as `offsets`."""
+    """Offsets (y, x) of a whole window after a change of the phase; see `offsets`."""
     coefficients = solve_modes(*phase_sums(modes, delta, sigma, change, k))
     return offsets(modes, coefficients, delta, change, k)
 
 
-# Change of maps where frames differ, in some pixels, from those of the fit
+# Change of the maps of pixels whose frame parameters differ from those of the fit
 
 
 def usual_fringe(theta: F64, count: int) -> tuple[F64, F64]:
-    """Phases (count,) over a fringe, and maps (3, count) of pixels of the usual light."""
+    """Phases (count,) over a fringe, and maps (3, count) at median mean and amplitude."""
     psi = np.linspace(0, 2 * np.pi, count, endpoint=False)
     mean, amplitude = np.median(theta[0]), np.median(np.hypot(theta[1], theta[2]))
     return psi, np.stack([np.full(count, mean), amplitude * np.sin(psi), amplitude * np.cos(psi)])
@@ -79,7 +79,7 @@ def imprint(theta: F64, g: F64, change: F64, read_noise_e: float) -> F64:
 
 
 def left_in_samples(theta: F64, g: F64, change: F64, read_noise_e: float) -> float:
-    """Mean square, over the samples' noise, of what maps do not absorb; as in `imprint`."""
+    """Mean square over the noise variance of changes that maps do not absorb; see `imprint`."""
     _, usual = usual_fringe(theta, PHASES)
     weight = _weight(g @ usual, read_noise_e)
     taken = _taken(g, change, weight)

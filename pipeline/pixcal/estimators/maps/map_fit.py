@@ -1,8 +1,8 @@
-"""Terms fitted to the maps of several fringe sets at once, with errors from the residuals.
+"""Fit terms to the maps of several fringe sets at once, with errors from the residuals.
 
-The noise of a map is the residual of the fit, true offsets included: its scatter gives the errors.
-Where residuals of neighbouring pixels are correlated, blocks of pixels give larger ones. Blocks of
-several sizes are tried, as the foundry's stitching moves whole fields of pixels together.
+The noise of a map is the residual of the fit, true offsets included; its scatter gives the errors.
+If residuals of neighbouring pixels are correlated, blocks of pixels give larger errors. Several
+block sizes are tried, because the foundry's stitching displaces whole fields of pixels.
 """
 
 from collections.abc import Sequence
@@ -20,23 +20,23 @@ from pixcal.kernels.robust import median, robust_sigma
 from pixcal.model.arrays import F64, Indices, Mask
 
 _CLIP = 5.0
-_MIN_VARIANCE = 1e-30  # variance of a map that its signals fit exactly
+_MIN_VARIANCE = 1e-30  # least variance, for a map that its signals fit exactly
 
 
 @dataclass(frozen=True)
 class MapPart:
-    """One map as input of a fit; over its good pixels."""
+    """Good pixels of one map as input of a fit."""
 
     signals: F64  # (pixel, n) change of the map by one unit of each parameter
     data: F64  # (pixel,)
     blocks: Indices  # (size, pixel) number of the block that a pixel lies in
-    dof: int  # pixels less the terms and the fields that were taken off
+    dof: int  # number of pixels minus that of removed terms and fields
 
     @classmethod
     def of(
         cls, signals: F64, data: F64, free: F64, good: Mask, field: Indices | None = None
     ) -> "MapPart":
-        """Data (y, x) and signals (n, y, x) without outliers, free terms and field means."""
+        """Data (y, x) and signals (n, y, x) minus outliers, free terms and field means."""
         at = np.flatnonzero(good)
         terms, values = _taken(free, at), data.ravel()[at]
         for _ in range(2):
@@ -64,13 +64,13 @@ def _left(columns: F64, free: F64, at: Indices, field: Indices | None) -> F64:
 
 
 def _taken(maps: F64, at: Indices) -> F64:
-    """Some pixels (n, pixel) of maps (n, y, x)."""
+    """Values (n, pixel) of maps (n, y, x) at given pixels."""
     return np.take(maps.reshape(len(maps), -1), at, axis=1)
 
 
 @dataclass(frozen=True)
 class MapFit:
-    """Parameters, their covariance, and chi-square with none of them less that with all."""
+    """Parameters, their covariance, and the fall in chi-square that they bring."""
 
     values: F64
     covariance: F64
@@ -113,7 +113,7 @@ def fitted_values(parts: Sequence[MapPart]) -> tuple[F64, F64, F64]:
 
 
 def phase_map(fringes: FringeEvidence) -> F64:
-    """Phase (y, x) of a set less its fringe vector's plane, about its mean, ±pi rad; NaN masked."""
+    """Phase (y, x) of a set minus its fringe vector's plane and its mean, ±pi rad; NaN: masked."""
     y, x = grid(fringes.good.shape)
     kx, ky = fringes.k
     phasor = (fringes.theta[2] + 1j * fringes.theta[1]) * np.exp(-1j * (kx * x + ky * y))
@@ -124,7 +124,7 @@ def phase_map(fringes: FringeEvidence) -> F64:
 
 
 def gauge_terms(fringes: FringeEvidence) -> F64:
-    """Fringe modes (4, y, x) that the fit leaves open in the maps of a set."""
+    """Fringe modes (4, y, x) that the fit of a set does not determine."""
     alpha = np.maximum(np.hypot(fringes.theta[1], fringes.theta[2]), 1e-9)
     psi = np.arctan2(fringes.theta[1], fringes.theta[2])
     return np.stack(fringe_modes(psi, fringes.theta[0] / alpha))
@@ -142,13 +142,13 @@ def without(columns: F64, free: F64) -> F64:
 
 
 def half_theta(fringes: FringeEvidence, half: int, good: Mask) -> F64:
-    """Maps (3, pixel) of a set on some pixels, from every other frame (half 0 or 1) alone."""
+    """Maps (3, pixel) of a set at good pixels, from every second frame only (half 0 or 1)."""
     rest = np.nan_to_num(fringes.residual[half::2][:, good])
     return np.asarray(fringes.theta[:, good] + np.linalg.pinv(fringes.g[half::2]) @ rest)
 
 
 def neighbour_products(one: F64, other: F64, good: Mask) -> F64:
-    """Products (3, y, x) of one map with another, and with it one and two pixels away."""
+    """Products (3, y, x) of a map with another, and with its neighbours one and two pixels away."""
     products = [one * other]
     for step in (1, 2):
         total, count = np.zeros(good.shape), np.zeros(good.shape)

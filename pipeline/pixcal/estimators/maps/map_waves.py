@@ -1,9 +1,9 @@
-"""Waves that several maps of a fit share: mean light, visibility and phase, set by set.
+"""Waves common to several maps of a fit: mean light, visibility and phase of each set.
 
 A weak third beam multiplies the mean light by ``1 + Re(s e)`` and the fringe's phasor by
 ``1 + f e + b / e``, with ``e = exp(i q·r)``. The logarithms of the maps then hold, to first order,
 ``Re(s e)`` (light over the flat), ``Re((f - s) e) + Re(b / e)`` (visibility) and
-``Im(f e) + Im(b / e)`` (phase). Nothing ties s, f and b here: that is for the laws of the effect.
+``Im(f e) + Im(b / e)`` (phase). Here s, f and b are independent; laws of the effect relate them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,16 +28,16 @@ from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import F64, Mask
 
-# periods in the window: no wave is looked for closer than that to what the fit leaves open
+# least distance, periods in the window, of a wave from modes that the fit does not determine
 NEAR = 1.5
-HARMONICS = 4  # of the fringes: a response that is not linear leaves waves there
-MOST = 3  # waves of one set
-SIGNIFICANT = 5.0  # standard deviations of a further wave
-APART = 30.0  # chi-square by which vectors of their own must fit the sets better than a common one
+HARMONICS = 4  # harmonics of the fringes, where a nonlinear response leaves waves
+MOST = 3  # largest number of waves of one set
+SIGNIFICANT = 5.0  # least significance of a further wave, standard deviations
+APART = 30.0  # least gain in chi-square of separate vectors of the sets over a common one
 _MIN_PIXELS = 200
 _CLIP = 6.0
 _ITERATIONS = 4
-_SMOOTH = 3  # degree of what beams and lamp do to the maps
+_SMOOTH = 3  # degree of the patterns of beams and lamp in the maps
 LIGHT = "the mean light"
 STATIC, FORWARD, BACKWARD = slice(0, 2), slice(2, 4), slice(4, 6)
 
@@ -48,10 +48,10 @@ class WaveFit:
 
     set: str
     q: tuple[float, float]  # along x and y, rad/px
-    static: complex  # static, forward, backward: s, f and b, counted from the middle of the part
+    static: complex  # static, forward, backward: s, f and b, relative to the window's centre
     forward: complex
     backward: complex
-    # (5,) float: of s, f, b (each of real and imaginary part) and of q
+    # (5,) float: of s, f, b (of the real and of the imaginary part), then of q
     errors: tuple[float, float, float, float, float]
 
 
@@ -60,17 +60,17 @@ class Waves:
     """Waves of all sets."""
 
     waves: tuple[WaveFit, ...]
-    in_flats: bool  # whether the flats have the static pattern, and not the light over the flat
-    # of the map that shows the strongest wave second best, or of the mean light if that shows
-    # it best; in standard deviations
+    in_flats: bool  # whether the static pattern is in the flats, not in the light over the flat
+    # standard deviations of the strongest wave in its second-best map, or in the mean light if
+    # that is the best
     significance: float
-    seen_in: tuple[str, ...]  # maps that show it
-    by_map: Mapping[str, float]  # standard deviations in each map
+    seen_in: tuple[str, ...]  # maps in which it is significant, or the two best
+    by_map: Mapping[str, float]  # its standard deviations in each map
 
 
 @dataclass(frozen=True)
 class _Map:
-    """A map (y, x), its free terms (n, y, x), and how the wave's six numbers show in it."""
+    """A map (y, x), its free terms (n, y, x), and its dependence on a wave's six numbers."""
 
     kind: str
     data: F64
@@ -89,7 +89,7 @@ class _Map:
         return out, float((left @ left) / max(len(left), 1)) or 1e-30
 
     def signals(self, q: F64) -> F64:
-        """What a unit of each of the six numbers does (6, y, x)."""
+        """Change (6, y, x) of the map by a unit of each of the six numbers."""
         y, x = grid(self.good.shape)
         e = np.exp(1j * (q[0] * x + q[1] * y))
         waves = [factor * wave for factor, wave in zip(self.row, (e, e, e.conj()), strict=True)]
@@ -100,10 +100,10 @@ Maps = Mapping[str, Sequence[_Map]]  # of each set, by its name
 
 
 def find_waves(evidence: Evidence, most: int = MOST) -> Waves | None:
-    """The strongest waves in the maps of all sets, so many of each; None without enough pixels.
+    """The strongest waves in all sets' maps, at most ``most`` per set; None without enough pixels.
 
-    The chance is that of the best of all waves told apart; those near harmonics of a set's fringes,
-    near no wave at all, and of repeating rows or columns are left out.
+    The significance counts all resolvable waves as trials. Waves near harmonics of a set's fringes,
+    near zero frequency, and of repeating rows or columns are left out.
     """
     sets = [f for f in evidence.fringes.values() if np.count_nonzero(f.good) > _MIN_PIXELS]
     if not sets:
@@ -111,7 +111,7 @@ def find_waves(evidence: Evidence, most: int = MOST) -> Waves | None:
     ways = {still: {f.name: _maps(f, evidence, still) for f in sets} for still in (False, True)}
     allowed = {f.name: _allowed(f) for f in sets}
     light, flats = (_gains(ways[still], allowed) for still in (False, True))
-    # A pattern of the light that flats share is in flats and visibility, not in light over flat.
+    # A pattern common to light and flats is in flats and visibility, not in light over flat.
     in_flats = all(own > other + APART for own, other in zip(flats, light, strict=True))
     best = _strongest(ways[in_flats], allowed, in_flats)
     waves = list(best.waves)
@@ -143,7 +143,7 @@ def _maps(fringes: FringeEvidence, evidence: Evidence, in_flats: bool) -> list[_
 
 
 def _gains(maps: Maps, allowed: Mapping[str, Mask]) -> tuple[float, float]:
-    """Chi-square of the wave that is strongest in light or flats, and in its second-best map."""
+    """Chi-square of the strongest wave in the light or flats, and in its second-best map."""
     q = _vector(_common({name: _power(own, allowed[name]) for name, own in maps.items()}))
     gains: dict[str, float] = {}
     for own in maps.values():
@@ -153,7 +153,7 @@ def _gains(maps: Maps, allowed: Mapping[str, Mask]) -> tuple[float, float]:
 
 
 def _strongest(maps: Maps, allowed: Mapping[str, Mask], in_flats: bool) -> Waves:
-    """The strongest wave of each set, of a vector common to all where that fits as well."""
+    """The strongest wave of each set, with a common vector if that fits as well."""
     power = {name: _power(own, allowed[name]) for name, own in maps.items()}
     apart = sum(float(p.max()) for p in power.values()) - float(_common(power).max())
     groups = [[name] for name in maps] if apart > APART and len(maps) > 1 else [list(maps)]
@@ -174,7 +174,7 @@ def _strongest(maps: Maps, allowed: Mapping[str, Mask], in_flats: bool) -> Waves
     first = _best_of(gains[order[0]], trials, dof)
     significance = float(min(first, by_map[order[1]]))
     if order[0] == LIGHT:
-        # Ghosts of both fibres alike move neither visibility nor phase.
+        # Equal ghosts of both fibres change neither visibility nor phase.
         significance = float(first)
     return Waves(
         tuple(waves), in_flats, significance,
@@ -183,7 +183,7 @@ def _strongest(maps: Maps, allowed: Mapping[str, Mask], in_flats: bool) -> Waves
 
 
 def _less(maps: Maps, waves: Sequence[WaveFit]) -> Maps:
-    """Maps without some waves."""
+    """Maps minus given waves."""
     remaining: dict[str, list[_Map]] = {}
     for name, own in maps.items():
         remaining[name] = []
@@ -208,13 +208,13 @@ def _power(maps: Sequence[_Map], allowed: Mask) -> F64:
 
 
 def _common(power: Mapping[str, F64]) -> F64:
-    """Chi-square of a wave of one vector in all of these sets, zero where one leaves it out."""
+    """Chi-square of a common wave in these sets, zero where it is excluded in one of them."""
     maps = np.stack(list(power.values()))
     return np.asarray(np.where((maps > 0).all(axis=0), maps.sum(axis=0), 0.0))
 
 
 def _allowed(f: FringeEvidence) -> Mask:
-    """Frequencies of a grid twice as fine as the window's where a wave of a set is looked for."""
+    """Frequencies of a grid twice as fine as the window's where waves of a set are sought."""
     shape = f.good.shape
     fy, fx = np.meshgrid(*(np.fft.fftfreq(2 * n) for n in shape), indexing="ij")
     allowed = ~_of_lines(fx, fy, shape) & ((fy > 0) | ((fy == 0) & (fx > 0)))
@@ -232,7 +232,7 @@ def _vector(power: F64) -> F64:
 
 
 def _of_lines(fx: F64, fy: F64, shape: tuple[int, ...]) -> Mask:
-    """Frequencies (cycles/px) of periodic rows or columns, which are electronics, not optics."""
+    """Whether frequencies (cycles/px) are of periodic rows or columns, due to electronics."""
     marked = np.zeros(fx.shape, bool)
     for across, along, n, m in ((fx, fy, shape[1], shape[0]), (fy, fx, shape[0], shape[1])):
         level = np.abs(across) * n < NEAR
@@ -245,7 +245,7 @@ def _of_lines(fx: F64, fy: F64, shape: tuple[int, ...]) -> Mask:
 def _fitted(
     maps: Sequence[tuple[str, _Map]], names: Sequence[str], start: F64
 ) -> tuple[list[WaveFit], F64]:
-    """Six numbers of every set and the common vector, by Gauss and Newton."""
+    """Six numbers of every set and the common vector, by the Gauss-Newton method."""
     q, size = start.copy(), 6 * len(names)
     six = np.zeros(size)
     limit = 2 * np.pi / np.array(maps[0][1].good.shape[::-1])
@@ -256,7 +256,7 @@ def _fitted(
             own = slice(6 * names.index(name), 6 * names.index(name) + 6)
             signals = np.zeros((size + 2, *m.good.shape))
             signals[own] = m.signals(q)
-            # d/dq of each of Re(row s e): the same with s turned by a quarter, times x or y.
+            # d/dq of Re(row s e) is the same with s rotated by 90 degrees, times x or y.
             turned = _quarter(six[own])
             slope = np.tensordot(turned, signals[own], 1)
             signals[size], signals[size + 1] = x * slope, y * slope
@@ -282,7 +282,7 @@ def _fitted(
 
 
 def _quarter(six: F64) -> F64:
-    """The numbers times i where they go with e, times -i where with 1 / e."""
+    """The numbers times i (those of e) or -i (those of 1 / e)."""
     s, f, b = (complex(*six[part]) for part in (STATIC, FORWARD, BACKWARD))
     return np.array([v for w in (1j * s, 1j * f, -1j * b) for v in (w.real, w.imag)])
 
@@ -296,7 +296,7 @@ def _plain_gain(m: _Map, q: F64) -> float:
 
 
 def _best_of(gain: float, trials: float, dof: int) -> float:
-    """Standard deviations as rare as the best chi-square of so many waves."""
+    """Significance (standard deviations) of the best chi-square of a number of waves."""
     log_rate = np.log(max(trials, 1.0)) + np.log(dof / 2) - gain / 2
     log_chance = log_rate if log_rate < -20 else np.log(-np.expm1(-np.exp(log_rate)))
     return -float(ndtri_exp(min(float(log_chance), -1e-300)))

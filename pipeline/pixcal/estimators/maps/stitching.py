@@ -17,22 +17,22 @@ from scipy.special import chdtrc
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64, Indices, Mask
 
-MIN_SIDE = 4  # pixels along a side of a field, at least,
-USUAL_SIDE = 12  # and on average: what has more lines is a pattern, not the foundry's stitching
-CHANCE = 1e-3  # of a line at any place of a map of white noise without steps
-_ROUNDS = 3  # in which lines are looked for again, each beside all others
-# share of a step's information, and pixels, by which its normal matrix is kept regular where smooth
-# terms take the step up, or no pixel is good
+MIN_SIDE = 4  # least side of a field, px
+USUAL_SIDE = 12  # least mean side, px: more lines than that are a pattern, not stitching
+CHANCE = 1e-3  # false-alarm rate of a line anywhere in a map of white noise without steps
+_ROUNDS = 3  # iterations in which each line is sought again given all others
+# share of a step's information, and number of pixels, that regularise its normal matrix where
+# smooth terms absorb the step, or no pixel is good
 _STEADY, _PIXELS = 1e-6, 1e-9
 
 Lines = tuple[tuple[int, ...], tuple[int, ...]]  # first row, and first column, of later fields
 
 
 def fields(maps: Sequence[F64], free: Sequence[F64]) -> Indices:
-    """Number (y, x) of the field in which each pixel lies; zeros where no steps show.
+    """Number (y, x) of the field in which each pixel lies; all zeros without significant steps.
 
-    ``maps``: (y, x) each, with white noise and steps along the same lines; NaN where there is none.
-    ``free``: (term, y, x) smooth patterns each map may have, the constant left out.
+    ``maps``: (y, x) each, with white noise and steps along the same lines; NaN where masked.
+    ``free``: (term, y, x) free smooth patterns of each map, without the constant.
     """
     shape = maps[0].shape
     lines: Lines = ((), ())
@@ -42,7 +42,7 @@ def fields(maps: Sequence[F64], free: Sequence[F64]) -> Indices:
             return _numbers(shape, ((), ()))
     for _ in range(_ROUNDS):
         before = lines
-        # A line that was found first may be needless, or off, once all are there.
+        # A line found early may be superfluous or displaced once all are found.
         for axis in (0, 1):
             for place in before[axis]:
                 others = _replaced(lines, axis, set(lines[axis]) - {place})
@@ -60,7 +60,7 @@ def _replaced(lines: Lines, axis: int, own: Iterable[int]) -> Lines:
 def _with_line(
     maps: Sequence[F64], free: Sequence[F64], lines: Lines, axes: Sequence[int]
 ) -> Lines:
-    """Lines, and the best one more along some axes, where it is not by chance."""
+    """Lines, and the best further one along given axes if it is significant."""
     field = _numbers(maps[0].shape, lines)
     fits = [FieldFit.of(values, terms, field) for values, terms in zip(maps, free, strict=True)]
     found = {axis: _best_line(fits, lines, axis) for axis in axes}
@@ -88,21 +88,21 @@ def _numbers(shape: tuple[int, ...], lines: Lines) -> Indices:
 
 @dataclass(frozen=True)
 class FieldFit:
-    """Terms fitted to a map beside an offset of each field."""
+    """Terms fitted to a map together with an offset of each field."""
 
-    values: F64  # (term,) their coefficients,
-    covariance: F64  # (term, term) for noise of 1 a pixel
-    # (1 + term, y, x) what is left of the map, and the terms within the fields; zero where masked
+    values: F64  # (term,) coefficients
+    covariance: F64  # (term, term) for a noise variance of 1 per pixel
+    # (1 + term, y, x) residual map, then the terms without field means; zero where masked
     columns: F64
     good: Mask
     steps: F64  # (y, x) offset of the field of each pixel; zero where all are masked
-    dof: int  # good pixels less all that was fitted
+    dof: int  # number of good pixels minus that of fitted parameters
 
     @classmethod
     def of(cls, values: F64, terms: F64, field: Indices) -> "FieldFit":
-        """Terms (term, y, x) in a map (y, x) with NaN; fields (y, x)."""
+        """Fit terms (term, y, x) to a map (y, x), NaN masked, with fields (y, x)."""
         good = np.isfinite(values)
-        # Over all pixels, zero where masked: picking the good ones takes longer than the rest.
+        # All pixels, zero where masked: selecting the good ones would take longer than the fit.
         used, number = good.ravel().astype(float), field.ravel()
         columns = np.concatenate([np.where(good, values, 0.0)[None], terms]).reshape(-1, good.size)
         columns[1:] *= used
@@ -122,22 +122,22 @@ class FieldFit:
 
     @property
     def variance(self) -> float:
-        """Of a pixel beside all that was fitted."""
+        """Residual variance of a pixel."""
         return float((self.columns[0] ** 2).sum()) / max(self.dof, 1)
 
     @property
     def rest(self) -> F64:
-        """What is left of the map (y, x); NaN where it was."""
+        """Residual map (y, x); NaN where masked."""
         return np.where(self.good, self.columns[0], np.nan)
 
     def turned(self) -> "FieldFit":
-        """Rows for columns."""
+        """The fit with rows and columns exchanged."""
         return replace(
             self, columns=self.columns.swapaxes(1, 2), good=self.good.T, steps=self.steps.T
         )
 
     def gains(self, begin: Indices, first: int, places: Indices, last: int) -> F64:
-        """Chi-square (place,) of a line, with a step in each row of fields, before some columns."""
+        """Chi-square (place,) of a line before each column, with a step in each row of fields."""
         inside = slice(first, last)
         sums = np.add.reduceat(self.columns[:, :, inside], begin, axis=1).cumsum(axis=2)
         count = np.add.reduceat(self.good[:, inside], begin, axis=0, dtype=float).cumsum(axis=1)
@@ -152,7 +152,7 @@ class FieldFit:
 
 
 def _best_line(fits: Sequence[FieldFit], lines: Lines, axis: int) -> tuple[float, float, int]:
-    """Logarithm of the chance of the best new line along an axis, less its gain, and its place."""
+    """Best new line along an axis: logarithm of its chance, minus its gain, its place."""
     begin = np.array([0, *lines[1 - axis]])
     turned = [one.turned() if axis == 0 else one for one in fits]
     end = turned[0].good.shape[1]
@@ -167,5 +167,5 @@ def _best_line(fits: Sequence[FieldFit], lines: Lines, axis: int) -> tuple[float
         return 0.0, 0.0, 0
     chance = float(chdtrc(len(begin) * len(fits), gains[place]))
     log_chance = math.log(chance) if chance > 0 else -math.inf
-    # Where the chance is too small for a number, the gain tells.
+    # Where the chance underflows, the gain decides.
     return log_chance + float(np.log(sum(turned[0].good.shape))), -float(gains[place]), place

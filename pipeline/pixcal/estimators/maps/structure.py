@@ -1,4 +1,4 @@
-"""Structure of a map: smooth surfaces, rows and columns that repeat, fringes, scales."""
+"""Structure of a map: smooth surfaces, repeating rows and columns, fringes, scales."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,24 +13,24 @@ from pixcal.kernels.robust import median_around, robust_sigma
 from pixcal.model.arrays import C128, F64, Indices, Mask
 
 DEGREE = 3  # of a smooth surface
-_BEYOND = 7  # degree up to which polynomials measure how red true offsets are
-PERIODS = (2, 3, 4, 5, 6, 8)  # of rows and columns: those of readout circuits
-AROUND = 5  # pixels along the side of a pixel's surroundings
+_BEYOND = 7  # highest degree of the polynomials that measure the redness of true offsets
+PERIODS = (2, 3, 4, 5, 6, 8)  # periods of rows and columns in readout circuits
+AROUND = 5  # side of a pixel's neighbourhood, px
 _CLIP = 6.0
-# redness from which a map is no white noise, and the same of the means of its rows or columns,
-# which cells average; within the fields of stitched white noise 1.0 to 1.3, and 0.6 to 1.1
+# redness above which a map is not white noise, and the same for means of its rows or columns, which
+# cells average; white noise with its stitched fields removed has 1.0 to 1.3, and 0.6 to 1.1
 _RED, _RED_LINES = 2.0, 1.4
 
 
 def clipped(values: F64) -> F64:
-    """A map about its median, values beyond six robust standard deviations left out (NaN)."""
+    """A map minus its median; values beyond six robust standard deviations become NaN."""
     rest = values - np.nanmedian(values)
     spread = robust_sigma(rest)
     return np.asarray(np.where(np.abs(rest) <= _CLIP * max(spread, 1e-300), rest, np.nan))
 
 
 def without_outliers(values: F64) -> F64:
-    """A map about its median, NaN where a pixel is 6 robust sigmas off those around it."""
+    """A map minus its median; pixels 6 robust sigmas from their neighbourhood become NaN."""
     rest = values - np.nanmedian(values)
     around = median_around(np.where(np.isfinite(rest), rest, 0.0), AROUND)
     return np.where(np.isfinite(clipped(rest - around)), rest, np.nan)
@@ -42,23 +42,23 @@ def legendre(shape: tuple[int, ...], degree: int) -> F64:
     y, x = (legvander(np.linspace(-1, 1, n), degree) for n in shape)
     orders = [(i, n - i) for n in range(degree + 1) for i in range(n + 1)]
     terms: F64 = np.stack([np.outer(y[:, i], x[:, j]) for i, j in orders])
-    terms.flags.writeable = False  # the same for all who ask
+    terms.flags.writeable = False  # the array is cached
     return terms
 
 
 def fit_terms(values: F64, terms: F64) -> F64:
-    """Least-squares coefficients (term,) of maps (term, y, x) in a map with NaN."""
+    """Least-squares coefficients (term,) of maps (term, y, x) in a map; NaN are masked."""
     good = np.isfinite(values)
-    # Zeros, not copies without the pixels that are left out: those take longer than all the rest.
+    # Zeros for masked pixels: copies without them would take longer than the fit.
     design = terms.reshape(len(terms), -1)
     inside = design if good.all() else np.where(good.ravel(), design, 0)
-    # Few terms of many pixels: the normal equations take a hundredth of the time of an SVD.
+    # With few terms and many pixels, normal equations take a hundredth of the time of an SVD.
     right = inside @ np.where(good, values, 0).ravel()
     return np.asarray(inverse_normal(inside @ inside.T, 1e-12) @ right)
 
 
 def smooth_surface(values: F64, good: Mask, degree: int = DEGREE) -> F64:
-    """Polynomial surface (y, x) through the good pixels of a map, outliers left out."""
+    """Polynomial surface (y, x) fitted to the good pixels of a map without outliers."""
     terms = legendre(values.shape, degree)
     used = np.where(good, values, np.nan)
     for _ in range(2):
@@ -68,20 +68,20 @@ def smooth_surface(values: F64, good: Mask, degree: int = DEGREE) -> F64:
 
 
 def flattened(values: F64, degree: int = DEGREE) -> F64:
-    """A map less its smooth surface, NaN as before."""
+    """A map minus its smooth surface; NaN stay."""
     terms = legendre(values.shape, degree)
     return np.asarray(values - np.tensordot(fit_terms(values, terms), terms, 1))
 
 
 def profile(values: F64, axis: int) -> F64:
-    """Mean along rows (axis 0: one value a row) or columns of a map with NaN; zero where empty."""
+    """Means of rows (axis 0) or columns of a map, NaN left out; zero where there is no value."""
     good = np.isfinite(values)
     count = good.sum(axis=1 - axis)
     return np.asarray(np.where(good, values, 0).sum(axis=1 - axis) / np.maximum(count, 1))
 
 
 def repeats(values: F64, axis: int) -> C128:
-    """Amplitudes of the profile along an axis at the periods of `PERIODS`, and their phases."""
+    """Complex amplitudes of the profile along an axis at the periods `PERIODS`."""
     along = profile(values, axis)
     place = np.arange(len(along))
     return np.array(
@@ -89,12 +89,12 @@ def repeats(values: F64, axis: int) -> C128:
     )
 
 
-# pixels along the sides of cells, whose means show how red a map is; and a quarter of the map
+# sides of the cells, px, whose means give the redness of a map, besides a quarter of the map
 CELLS = (8, 16)
 
 
 def redness(values: F64) -> float:
-    """Scatter of cell means of a map over that of white noise, the most of several sizes."""
+    """Variance of a map's cell means over that of white noise; highest over several cell sizes."""
     ny, nx = values.shape
     good = np.isfinite(values)
     filled = np.where(good, values, 0)
@@ -114,13 +114,13 @@ class OffsetModel:
     """A model of true offsets: the part of a map that is kept, and the scatter of the rest."""
 
     kept: F64  # (y, x) without curvature, repeating rows and columns, and fringes; px
-    # (term, y, x) removed terms: all that an effect of the bench or the readout could cause
+    # (term, y, x) removed terms: all patterns that an effect of bench or readout could cause
     terms: F64
-    # (term, term) root of the covariance of the coefficients of the terms, by chance, in offsets
-    # such as those that were kept
+    # (term, term) root of the covariance that the terms' coefficients have by chance in offsets
+    # like the kept ones
     scatter: F64
-    unknown: Mask  # (y, x) where there was no map,
-    rms: float  # and offsets are drawn with this rms, px
+    unknown: Mask  # (y, x) masked pixels
+    rms: float  # rms of the offsets drawn for masked pixels, px
 
     def drawn(self, rng: np.random.Generator) -> F64:
         """A map (y, x): the kept part, and a random draw of the removed terms; px."""
@@ -131,7 +131,7 @@ class OffsetModel:
 
 
 def _red_lines(values: F64) -> list[float]:
-    """Variance of the means of rows, and of columns, over that of white noise; NaN are masked."""
+    """Variances of row means and of column means over those of white noise; NaN are masked."""
     good = np.isfinite(values)
     variance = max(float(np.nanvar(values)), 1e-300)
     return [
@@ -142,7 +142,7 @@ def _red_lines(values: F64) -> list[float]:
 
 @lru_cache(maxsize=4)
 def bench_patterns(shape: tuple[int, ...]) -> F64:
-    """Effects of bench or readout on any map (term, y, x): curvature, then repeating lines."""
+    """Patterns of bench or readout in maps (term, y, x): curvature, then repeating lines."""
     lines = []
     for axis in (0, 1):
         place = np.expand_dims(np.arange(shape[axis]), 1 - axis)
@@ -150,14 +150,14 @@ def bench_patterns(shape: tuple[int, ...]) -> F64:
             turn = np.broadcast_to(2 * np.pi * place / period, shape)
             lines += [np.cos(turn)] if period == 2 else [np.cos(turn), np.sin(turn)]
     terms = np.concatenate([legendre(shape, DEGREE)[1:], np.stack(lines)])
-    terms.flags.writeable = False  # the same for all who ask
+    terms.flags.writeable = False  # the array is cached
     return terms
 
 
 def stitched_fields(maps: Sequence[F64], fringes: Sequence[F64]) -> Indices:
     """Fields (y, x) of the foundry's stitching in offsets or phases (y, x), NaN where masked.
 
-    Beside bench patterns and fringes (term, y, x); zeros where the rest is no white noise.
+    Bench patterns and fringes (term, y, x) are fitted too; all zeros if residuals are not white.
     """
     patterns = bench_patterns(maps[0].shape)
     bends = len(legendre(maps[0].shape, DEGREE)) - 1
@@ -175,9 +175,9 @@ def stitched_fields(maps: Sequence[F64], fringes: Sequence[F64]) -> Indices:
 
 
 def true_offsets(delta: F64, sigma: F64, psi: F64) -> OffsetModel:
-    """Part a map of offsets and errors (y, x), px, NaN where there is none; psi in rad.
+    """Split a map of offsets and errors (y, x), px, NaN where masked; psi in rad.
 
-    What is ``kept`` is shrunk by its share of noise; steps between stitched fields stay.
+    The ``kept`` part is shrunk by its share of noise; steps between stitched fields stay.
     """
     patterns = bench_patterns(delta.shape)
     fringes = np.stack([np.cos(psi), np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)])
@@ -197,7 +197,7 @@ def true_offsets(delta: F64, sigma: F64, psi: F64) -> OffsetModel:
 
 
 def _root(covariance: F64) -> F64:
-    """Lower triangle whose square is a covariance that may be singular."""
+    """Lower triangular root of a covariance that may be singular."""
     size = root_diagonal(covariance)
     correlation = covariance / np.outer(size, size) + 1e-9 * np.eye(len(size))
     known = np.diag(covariance) > 0
@@ -207,9 +207,9 @@ def _root(covariance: F64) -> F64:
 
 
 def _steps_at_large(rest: F64) -> F64:
-    """Power of smooth terms (term,) by steps in a map without them, over that of a white map."""
-    # A step (stitched blocks, halves of a mask) has a share in every polynomial, whose square falls
-    # as one over the square of the degree. The degrees from which nothing was taken tell its size.
+    """Power (term,) that steps have in removed smooth terms, over that of a white map."""
+    # A step (stitched blocks, halves of a mask) contributes to every polynomial a power that falls
+    # as one over the square of the degree. Degrees that were not removed give its size.
     degree = np.array([n for n in range(_BEYOND + 1) for _ in range(n + 1)])
     terms = legendre(rest.shape, _BEYOND)
     low, high = (degree > 0) & (degree <= DEGREE), degree > DEGREE
