@@ -38,11 +38,11 @@ from pixcal.simulation.shot import Shot
 from pixcal.simulation.track import Track, at
 
 HOUR_S = 3600.0
-STEADY = 3.0  # the same for a ramp and a walk; below, a walk explains the frames as well
-SETTLINGS = 8  # time constants tried, from some steps to the length of the run
-# fringes count where their mean offset is as well known as this, of a sample's read noise
+STEADY = 3.0  # least significance of a ramp over a walk, standard deviations
+SETTLINGS = 8  # number of trial time constants, from three frames to the length of the run
+# largest error of the mean offset of used fringes, over a sample's read noise
 WORTH = 0.3
-_KEY, _RUN = 1000, 2000  # first keys of the walks' random numbers: no recording has them
+_KEY, _RUN = 1000, 2000  # first keys of the walks' random numbers; no recording has them
 
 
 @dataclass(frozen=True)
@@ -97,12 +97,12 @@ class BiasDrift(Effect):
     )
 
     def trend(self, time_s: F64) -> F64:
-        """Offset (t,), e-, that is not random; of an acquisition's times."""
+        """Deterministic offset (t,), e-, at times of an acquisition."""
         fade = np.exp(-time_s / self.settle_s)
         return np.asarray(self.ramp_e_h * time_s / HOUR_S + self.settle_e * fade)
 
     def offset(self, time_s: float, seed: int, rng: np.random.Generator) -> float:
-        """Offset of a frame, e-: of the bench's seed, and of the frame's random numbers."""
+        """Offset of a frame, e-, from the bench's seed and the frame's random numbers."""
         offset = float(self.trend(np.array(time_s))) + self.jitter_rms * rng.standard_normal()
         if self.walk_e_h:
             normal = walk_normals(seed, self.name, _KEY)
@@ -120,7 +120,7 @@ class BiasDrift(Effect):
         return adu + np.float32(offset / shot.bench.detector.gain_e_per_adu)
 
     def _in_run(self, shot: Shot) -> float:
-        """Offset of a frame of fringes, e-: as measured, or by the laws where it was not."""
+        """Offset of a fringe frame, e-: as measured, otherwise by the laws."""
         time = float(shot.recording.times_s[shot.frame])
         name = shot.recording.set_name
         rng = shot.rng(self.name)
@@ -146,7 +146,7 @@ class BiasDrift(Effect):
         return replace(self, tracks=tuple(tracks), jitter_rms=jitter) if tracks else None
 
     def undo(self, maps: FringeMaps) -> FringeMaps | None:
-        """As in `Effect.undo`: the mean offset of a replayed run is no light."""
+        """As in `Effect.undo`: subtract the mean offset of a replayed run, which is not light."""
         others = [f"{kind} frames" for kind in KINDS]
         tracks = [track for track in self.tracks if track.value and track.set not in others]
         if not any(np.mean(track.value) for track in tracks):
@@ -165,7 +165,7 @@ class BiasDrift(Effect):
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
-        """As in `Effect.detect`; time constants of a settling are tried, and not refined."""
+        """As in `Effect.detect`, with a grid of settling time constants, not refined."""
         chances = []
         if every := _all_series(evidence):
             full, drift = _drift(every)
@@ -179,13 +179,13 @@ class BiasDrift(Effect):
 
     @classmethod
     def _in_runs(cls, evidence: Evidence) -> Estimate | None:
-        """A walk or ramp in each fringe set by itself, from B and A of its frames."""
+        """A separate walk or ramp in each fringe set, from B and A of its frames."""
         light = light_of(evidence)
         if light is None:
             return None
         at = LIGHT_PARTS.index("offset_walk")
         there, sloped, chance = _fits_of_runs(light)
-        # What both explain is attributed to the walk, which is more general.
+        # Variation that both explain is attributed to the walk, which is more general.
         rise = _rise(sloped, there)
         law, ramp, errors = "random walk, rms after an hour", 0.0, {}
         if np.sqrt(2 * rise) > STEADY:
@@ -205,17 +205,17 @@ class BiasDrift(Effect):
 
     @classmethod
     def _through(cls, evidence: Evidence) -> Estimate | None:
-        """What drifts through all frames, by one clock.
+        """Drift through all frames on a common time axis.
 
-        Bias frames hold down a change of the dark current. What a walk and a ramp explain alike in
-        few frames is given to the walk, for a ramp would go on for ever.
+        Bias frames separate it from a change of the dark current. Variation in few frames that both
+        a walk and a ramp explain is attributed to the walk, as a ramp would grow without limit.
         """
         every = _all_series(evidence)
         if not every:
             return None
         full, drift = _drift(every)
         level = estimate_components(offset_modes(every, [_ramp(s)[:, :0] for s in every]))
-        # The walk is refitted without the ramp: a ramp that is a walk then adds little.
+        # The walk is refitted without the ramp: if it is only a walk, the ramp then adds little.
         steady = float(np.sqrt(2 * _rise(full, level)))
         best, settling = _settling(every, full)
         found = best.found if best else full
@@ -269,12 +269,12 @@ def _ramp(series: OffsetSeries) -> F64:
 
 
 def _rise(full: Components, less: Components) -> float:
-    """Log-likelihood by which more known shapes fit better."""
+    """Gain in log-likelihood by further known shapes."""
     return max(full.profile - less.profile, 0.0)
 
 
 def _drift(every: Sequence[OffsetSeries]) -> tuple[Components, float]:
-    """Jitter and walk beside a ramp, and how likely the two are by chance."""
+    """Jitter and walk with a free ramp, and the log probability of the two by chance."""
     modes = offset_modes(every, [_ramp(s) for s in every])
     full, none = estimate_components(modes), estimate_components(modes, absent=(0, 1))
     return full, joint_log_chance(full, none, full.size[:2])
@@ -291,7 +291,7 @@ def _slope_chance(found: Components) -> float:
 
 
 def _fits_of_runs(light: FrameLight) -> tuple[Components, Components, float]:
-    """A walk in each fringe set, without and beside a ramp, and how likely the former by chance."""
+    """A walk in each fringe set, without and with a ramp; log chance of the former."""
     light = replace(light, dark=())
     at = LIGHT_PARTS.index("offset_walk")
     modes = light.modes(LIGHT_PARTS)
@@ -301,7 +301,7 @@ def _fits_of_runs(light: FrameLight) -> tuple[Components, Components, float]:
 
 
 def _settling_fits(every: Sequence[OffsetSeries]) -> tuple[ProfiledFit, F64]:
-    """Fits of a decay from the first frame on beside a ramp, and the time constants to try, s."""
+    """Fits of a decay from the first frame on with a free ramp; trial time constants, s."""
     step = min(s.step_s for s in every)
     length = max(s.time_s[-1] for s in every) - min(s.time_s[0] for s in every)
 
@@ -313,21 +313,21 @@ def _settling_fits(every: Sequence[OffsetSeries]) -> tuple[ProfiledFit, F64]:
 
 
 def _settling(every: Sequence[OffsetSeries], plain: Components) -> tuple[Profiled | None, float]:
-    """What decays from the first frame on, where that is sure; and how likely by chance."""
+    """Decay from the first frame on if significant; its log probability by chance."""
     best = best_shape(*_settling_fits(every), True, plain)
     chance = _settling_chance([best.found], plain)
     return best if sigmas(chance) > SIGNIFICANT else None, chance
 
 
 def _settling_chance(fits: Sequence[Components], plain: Components) -> float:
-    """How likely the best of the decays is by chance."""
-    # Every other of the time constants is as good as a trial of its own.
+    """Log probability of the best decay by chance."""
+    # Neighbouring time constants are correlated: half their number counts as trials.
     growth = max(_rise(found, plain) for found in fits)
     return log_chance_of_any([log_chance(growth)] * (SETTLINGS // 2))
 
 
 def _with_level(track: Track, evidence: Evidence) -> Track:
-    """The track about the level of the run's offset, where the shot noise that it lacks shows."""
+    """The track plus the run's mean offset, if its lack of shot noise is significant."""
     level, error = noiseless_level(evidence, evidence.fringes[track.set])
     if abs(level) < SIGNIFICANT * error:
         return track

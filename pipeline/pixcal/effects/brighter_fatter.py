@@ -20,13 +20,13 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 _DISAGREE = 4.0
-# standard deviations, with a response that is free beside, from which it may explain all
+# significance, with a free response, above which it may explain all harmonics
 _HINTED = 1.5
-_NEEDED = 12.0  # chi-square of three terms beyond which they are needed: one in 130 by chance
-_APART = 9.0  # chi-square from which shifts along x and y are not the same
-_MAX_ALONG_Y = 10.0  # of the shift along y over that along x
+_NEEDED = 12.0  # chi-square of three terms above which they are needed: one in 130 by chance
+_APART = 9.0  # chi-square above which shifts along x and y differ
+_MAX_ALONG_Y = 10.0  # largest ratio of the shift along y to that along x
 _MAX_SHIFT = 1e-3  # px/e-; wells of a few thousand electrons have 1e-5 and more
-_TURNS = 4  # of the inverse: each gains the size of the effect, a few per cent
+_TURNS = 4  # iterations of the inverse; each cuts the error to a few per cent
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class BrighterFatter(Effect):
         evidence = central_crop(evidence)
         explaining = _explaining(evidence, cls().falloff_px) if evidence.fringes else None
         falloff = cls().falloff_px if explaining is None else explaining.falloff_px
-        # Noise is weak evidence, and of another falloff it may seem to contradict the harmonics.
+        # Noise is weak evidence; with another falloff it might seem to contradict the harmonics.
         falloff = min(FALLOFFS_PX, key=lambda px: abs(np.log(px / falloff)))
         noise = shared_charge(evidence, boundary_shifts(falloff))
         if noise is None:
@@ -120,7 +120,7 @@ class BrighterFatter(Effect):
             if abs(free.shift - size) < _DISAGREE * np.sqrt(variance + free.variance):
                 both = boundaries_beside(evidence, falloff, (size, variance))
                 size, variance = both.shift, both.variance
-                # Of chi-square with a degree of freedom for each axis.
+                # Chi-square has a degree of freedom for each axis.
                 beyond = max(both.gain - both.axes + 1, 0.0)
                 significance = float(np.copysign(np.sqrt(beyond), size))
                 why += ", and a second harmonic of the fringes that depends on their direction"
@@ -143,7 +143,7 @@ class BrighterFatter(Effect):
 
 
 def _by_axis(noise: SharedCharge) -> tuple[float, float, float, float]:
-    """Shift between columns, its variance, that between rows over it, and their significance."""
+    """Shift between columns, its variance, ratio of the shift between rows, significance."""
     together = noise.size**2 / noise.variance
     chi2 = float(noise.axes @ np.linalg.solve(noise.covariance, noise.axes))
     if chi2 - together < _APART:
@@ -156,7 +156,7 @@ def _by_axis(noise: SharedCharge) -> tuple[float, float, float, float]:
 
 
 def _explaining(evidence: Evidence, otherwise_px: float) -> Boundaries | None:
-    """Boundaries that explain all harmonics; None where a bent response is needed too."""
+    """Boundaries that explain all harmonics; None if a nonlinear response is also needed."""
     found = boundaries_alone(evidence, otherwise_px)
     if found.against > _NEEDED:
         found = boundaries_alone(evidence, otherwise_px, by_axis=True)
@@ -164,7 +164,7 @@ def _explaining(evidence: Evidence, otherwise_px: float) -> Boundaries | None:
 
 
 def _beside_noise(found: Boundaries, evidence: Evidence) -> Boundaries | None:
-    """The same, if the noise of neighbours does not speak against them."""
+    """The boundaries, unless the noise of neighbours contradicts them."""
     noise = shared_charge(evidence, boundary_shifts(found.falloff_px))
     if noise is None:
         return None
@@ -173,7 +173,7 @@ def _beside_noise(found: Boundaries, evidence: Evidence) -> Boundaries | None:
 
 
 def _errors(found: Boundaries) -> tuple[dict[str, float], tuple[dict[str, float], ...]]:
-    """Of all parameters, and how they hang together."""
+    """Errors of all parameters, and their correlated steps."""
     own = {"shift_px_per_e": found.shift_error}
     ratio = {"along_y": found.along_y_error} if found.along_y_error else {}
     together = [d for d in (own, ratio) if d]

@@ -18,22 +18,22 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.forward import numbers
 from pixcal.simulation.shot import Shot
 
-MARGIN_PX = 16  # how far beside the window tracks may begin
-THRESHOLD = 6.5  # standard deviations of the noise from which a sample is an outlier
-JOINED = 3.0  # standard deviations from which samples join outliers that lie near each other
+MARGIN_PX = 16  # margin around the window where tracks may begin, px
+THRESHOLD = 6.5  # standard deviations of the noise above which a sample is an outlier
+JOINED = 3.0  # standard deviations above which a sample joins an outlier near it
 
 _STRAGGLING = 0.15
-# laws of the tracks that are tried
+# trial laws of the tracks
 _LAWS = {
     "thickness_um": (2.0, 4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 64.0),
     "spread": (0.0, 0.3, 0.6, 0.9, 1.2),
     "diffusion_um": (0.5, 1.0, 1.5, 2.5, 4.0),
 }
-_LAW_GAIN = 5.0  # rise of the log-likelihood from which another law than the default is believed
-_AS_LIKELY = 3.0  # other laws within so many errors of the likeliest widen the error of the rate
-_SHAPED = 30  # hits that tell a law
-# classes of hits: samples that stand out, in all and next to the brightest, and its brightness over
-# the least that stands out
+_LAW_GAIN = 5.0  # gain in log-likelihood above which another law replaces the default
+_AS_LIKELY = 3.0  # errors within which other laws widen the error of the rate
+_SHAPED = 30  # least number of hits to choose a law
+# classes of hits: number of outlying samples, in all and next to the brightest, and brightness over
+# the faintest outlier
 _SIZES = (1.5, 2.5, 4.5, 8.5)
 _NEAR = (1.5, 2.5, 3.5, 5.5)
 _BRIGHTNESS = (1.25, 1.6, 2.0, 2.8, 4.0, 8.0)
@@ -44,12 +44,12 @@ _MIN_HITS = 5
 _OFTEN = 2
 _RARE = 0.01
 _BRIGHTEST = 16
-# outliers of the noise itself over those of a Gaussian: shot noise of faint light is skewed
+# number of noise outliers over that of a Gaussian, as shot noise of faint light is skewed
 _SKEW = 5.0
-# Hits of parts of the frames on the same pixels, over those by chance, and as a share of all hits
+# recurrent hits on the same pixels, over those by chance, and as a share of all hits
 _AGAIN, _SHARE_AGAIN = 2.0, 0.1
 _NOISY_PIXELS = "the hits recur in the same pixels: these pixels are noisy, as with telegraph noise"
-_STEPS = 300  # of the maximisation
+_STEPS = 300  # most steps of the maximisation
 _FEWEST = 1e-6
 
 
@@ -107,8 +107,8 @@ class CosmicHits(Effect):
         area = np.prod([(n + 2 * MARGIN_PX) * pitch * 1e-4 for n in detector.shape])
         recording = shot.recording
         rng = recording.pixel_rng(self.name, shot.frame)
-        # A bias frame is not exposed, whatever its header says. Where no exposure time is known,
-        # frames with light last as long as they are apart.
+        # A bias frame has no exposure, whatever its header says. Frames with light and without
+        # a known exposure time are exposed for the frame period.
         seconds = 0.0 if recording.kind == "bias" else recording.exptime_s or recording.period_s
         count = int(rng.poisson((self.rate_cm2_s * seconds + self.readout_cm2) * area))
         if not count:
@@ -123,7 +123,7 @@ class CosmicHits(Effect):
         self, rng: np.random.Generator, count: int, pitch_um: float, shape: tuple[int, int],
         margin_px: int = MARGIN_PX,
     ) -> F64:  # fmt: skip
-        """Draw tracks as `pixcal.kernels.tracks.draw_tracks` does, for pixels of some pitch."""
+        """Draw tracks by `pixcal.kernels.tracks.draw_tracks`, for pixels of a given pitch."""
         depth, electrons_per_px = self.thickness_um / pitch_um, self.electrons_per_um * pitch_um
         tracks = draw_tracks(rng, count, shape, margin_px, depth, electrons_per_px, _STRAGGLING)
         if self.spread:
@@ -164,7 +164,7 @@ class CosmicHits(Effect):
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
-        """Significance of the hits, whatever tracks they are of."""
+        """Significance of the hits, for any law of the tracks."""
         searches = list(_searches(evidence))
         if not searches:
             return None
@@ -194,12 +194,12 @@ def _rates(counts: F64, chances: F64, exposures: F64) -> tuple[list[float], list
 
 @dataclass(frozen=True)
 class _Hits:
-    """Hits (n,) that are found."""
+    """Detected hits (n,)."""
 
     peaks: F64  # brightest sample, e-
-    sizes: F64  # samples that stand out, and how many of them are no more than a pixel from that
+    sizes: F64  # sizes, near: number of outlying samples, in all and within a pixel of the peak
     near: F64
-    # frames and pixels of the brightest samples, where these are known
+    # frames and pixels of the brightest samples, if known
     frames: F64 = field(default_factory=lambda: np.zeros(0))
     pixels: F64 = field(default_factory=lambda: np.zeros(0))
 
@@ -221,11 +221,11 @@ class _Search:
     seconds: float  # exposure time, s
     area: float  # of all samples, cm²
     samples: int
-    limit: float  # from how many sigmas on a sample is an outlier
-    hits: _Hits  # upwards
-    downwards: int  # number of those downwards
-    sigma: F32  # (t, y, x) noise of the samples, e-; NaN where they do not count
-    faintest: float  # usual charge from which a sample is an outlier, e-
+    limit: float  # sigmas above which a sample is an outlier
+    hits: _Hits  # upward outliers
+    downwards: int  # number of downward outliers
+    sigma: F32  # (t, y, x) noise of the samples, e-; NaN for excluded ones
+    faintest: float  # usual charge above which a sample is an outlier, e-
 
 
 def _searches(evidence: Evidence) -> Iterator[_Search]:
@@ -233,7 +233,7 @@ def _searches(evidence: Evidence) -> Iterator[_Search]:
     for f in evidence.fringes.values():
         # As in `CosmicHits.charge`.
         seconds = f.exptime_s if f.exptime_s > 0 else float(np.median(np.diff(f.time_s)))
-        # A pixel that fits badly may have been hit, as those hit hardest were.
+        # Include pixels with a bad fit: the strongest hits cause one.
         residual = np.where(evidence.good & np.isfinite(f.theta).all(axis=0), f.residual, np.nan)
         yield _search(residual, np.sqrt(f.variance), seconds, area)
     for stack in (*evidence.of_kind("bias"), *evidence.of_kind("dark")):
@@ -243,10 +243,10 @@ def _searches(evidence: Evidence) -> Iterator[_Search]:
 
 
 def _search(residual: F32, sigma: F32, seconds: float, area: float) -> _Search:
-    """Outliers of residuals (t, y, x) with some sigma; ``area`` of a pixel, cm²."""
+    """Outliers of residuals (t, y, x) of given sigma; ``area`` of a pixel, cm²."""
     ratio = residual / sigma
     usable = np.isfinite(ratio)
-    # Of every seventh sample: what the noise is beyond what was predicted.
+    # Ratio of actual to predicted noise, from every seventh sample.
     wide = robust_sigma(ratio.ravel()[::7])
     limit = np.float32(THRESHOLD * np.fmax(wide, 1.0))
     up, down = ratio > limit, ratio < -limit
@@ -268,13 +268,13 @@ def _search(residual: F32, sigma: F32, seconds: float, area: float) -> _Search:
 
 
 def _counts(searches: Sequence[_Search]) -> tuple[F64, F64]:
-    """Hits of each search, and how many are expected by chance."""
+    """Number of hits of each search, and that expected by chance."""
     by_chance = [max(_SKEW * s.samples * float(ndtr(-THRESHOLD)), s.downwards) for s in searches]
     return np.array([float(len(s.hits.peaks)) for s in searches]), np.array(by_chance)
 
 
 def _hits(outliers: Mask, joined: Mask, residual: F32) -> _Hits:
-    """Groups of outliers that lie together in a frame, with fainter samples that join them."""
+    """Groups of adjacent outliers in a frame, with fainter samples that join them."""
     found = []
     for frame in np.flatnonzero(outliers.any(axis=(1, 2))):
         bright = joined[frame] | outliers[frame]
@@ -300,7 +300,7 @@ def _struck(hits: _Hits, shape: tuple[int, ...]) -> tuple[I64, I64]:
 
 
 def _come_back(searches: Sequence[_Search]) -> bool:
-    """Whether different frames have hits on the same pixels, far more often than by chance."""
+    """Whether hits recur on the same pixels far more often than by chance."""
     parts = np.stack([part for s in searches for part in _struck(s.hits, s.sigma.shape)]).astype(
         float
     )
@@ -315,12 +315,12 @@ def _come_back(searches: Sequence[_Search]) -> bool:
 
 
 class _Drawn:
-    """The brightest pixels of tracks, which may lie anywhere in frames of any noise."""
+    """The brightest pixels of drawn tracks, to be placed in frames of any noise."""
 
     def __init__(self, effect: CosmicHits, pitch_um: float) -> None:
         self._rng = np.random.default_rng(0)
         tracks = effect.tracks(self._rng, _DRAWN, pitch_um, (1, 1), 0)
-        # In the middle of a tile; of what is longer than that, a part.
+        # At the centre of a tile; longer tracks are truncated.
         tracks[:, :2] += (_TILE - tracks[:, 2:4]) / 2
         self._charges = np.zeros((_DRAWN, _BRIGHTEST))
         self._pixels = np.zeros((_DRAWN, _BRIGHTEST), int)
@@ -335,15 +335,15 @@ class _Drawn:
         self._noise = self._rng.standard_normal(self._charges.shape)
 
     def noise_at(self, sigma: F32) -> F64:
-        """Noise (track, pixel), e-, at random places; infinite where samples do not count."""
+        """Noise (track, pixel), e-, at random places; infinite for excluded samples."""
         t, y, x = (self._rng.integers(0, n, (_DRAWN, 1)) for n in sigma.shape)
         dy, dx = np.divmod(self._pixels, _TILE)
-        # A track that leaves the window comes in on the other side, as others do from beyond it.
+        # Periodic window: tracks that leave it stand for tracks that enter from outside.
         own = sigma[t, (y + dy) % sigma.shape[1], (x + dx) % sigma.shape[2]]
         return np.where(np.isfinite(own), own, np.inf)
 
     def hits(self, scale: float, noise: F64, limit: float) -> _Hits:
-        """Those of the tracks that are found, as of `_Search`, for ``scale`` times the charge."""
+        """Tracks detected with the limits of a `_Search`, for ``scale`` times the charge."""
         counts = np.isfinite(noise)
         sigma = np.where(counts, noise, 1.0)
         samples = np.where(counts, scale * self._charges + sigma * self._noise, 0.0)
@@ -362,7 +362,7 @@ class _Drawn:
 def _laws(
     start: CosmicHits, searches: list[_Search], pitch_um: float
 ) -> list[tuple[CosmicHits, float]]:
-    """Length, width and charge spread of tracks: the likeliest law, then nearly as likely ones."""
+    """Laws of the tracks: the likeliest, then nearly as likely ones; distances in errors."""
     if sum(len(s.hits.peaks) for s in searches) < _SHAPED:
         return [(start, 0.0)]
     tried: dict[CosmicHits, float] = {}
@@ -395,7 +395,7 @@ def _laws(
 def _fitted(
     law: CosmicHits, searches: list[_Search], pitch_um: float
 ) -> tuple[CosmicHits, dict[str, float], float] | None:
-    """A law with its best rates and charge, errors, and cm² s searched; None if nothing is seen."""
+    """A law with its best rates and charge, errors, and cm² s searched; None without detection."""
     drawn = _Drawn(law, pitch_um)
     places = [drawn.noise_at(s.sigma) for s in searches]
     scale, scale_error = _scale(searches, places, drawn)
@@ -419,34 +419,34 @@ def _fitted(
 
 
 def _steps(effect: CosmicHits, other: CosmicHits, errors: float) -> dict[str, float]:
-    """Change of each number by one error, where another law is so many errors away."""
+    """Change of each number per error, for another law at a distance of ``errors``."""
     own, others = numbers(effect), numbers(other)
     return {n: (others[n] - own[n]) / errors for n in own if others[n] != own[n]}
 
 
 def _log_likelihood(search: _Search, drawn: _Hits) -> float:
-    """Of the classes of the hits found, where tracks are drawn that have these ones."""
+    """Log-likelihood of the classes of the hits, given those of drawn tracks."""
     total = 0.0
     seen, likely = (hits.classes(search.faintest) for hits in (search.hits, drawn))
     for hits, expected in zip(seen, likely, strict=True):
-        # Half a track in a class that none is of.
+        # Half a track more per class, so that none has zero probability.
         expected += 0.5
         total += float(hits @ np.log(expected / expected.sum()))
     return total
 
 
 def _scale(searches: list[_Search], places: list[F64], drawn: _Drawn) -> tuple[float, float | None]:
-    """Charge of the hits over that of the tracks drawn, and its error (None: too few hits)."""
+    """Charge of the hits over that of the drawn tracks, and its error (None: too few hits)."""
     hits = sum(len(s.hits.peaks) for s in searches)
     if hits < _MIN_HITS:
         return 1.0, None
 
     def rank(log_scale: float) -> float:
-        """Mean rank of the hits among the drawn tracks that are found, less one half."""
+        """Mean rank of the hits among the detected drawn tracks, minus one half."""
         total = 0.0
         for s, noise in zip(searches, places, strict=True):
             found = np.sort(drawn.hits(np.exp(log_scale), noise, s.limit).peaks)
-            # Where few drawn tracks are detected, hits are brighter than the law can explain.
+            # If few drawn tracks are detected, hits are brighter than the law can explain.
             rare = len(found) < _RARE * _DRAWN
             ranks = np.searchsorted(found, s.hits.peaks)
             total += len(ranks) if rare else ranks.sum() / len(found)

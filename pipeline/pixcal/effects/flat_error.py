@@ -30,22 +30,22 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.recording import Recording
 
 WAVES = 6  # plane waves that make up the smooth part
-SMOOTH_SEEN = 3.0  # standard deviations of the smooth part from which its scale is fitted
-AGREE = 3.0  # standard deviations within which waves of one length are all that neighbours share
+SMOOTH_SEEN = 3.0  # significance of the smooth part above which its scale is fitted
+AGREE = 3.0  # standard deviations within which waves of one length explain the smooth part
 _CLIP = 5.0
 _MIN_PIXELS = 200
 _MIN_FRAMES = 8
-SHORTEST = 1.25  # scale, px: a shorter wave is no more than two or three pixels from crest to crest
-# windows are this many times as wide as the longest scale: longer waves are parabolas there
+SHORTEST = 1.25  # shortest scale, px: crests of shorter waves are a few pixels apart
+# ratio of the window's width to the longest scale: longer waves resemble parabolas
 WIDEST = 4
-STEP = 0.1  # of the logarithm of the scales that are tried
-# windows are this many times as wide as scales of which a parabola takes nothing that matters
+STEP = 0.1  # step of the logarithm of the trial scales
+# ratio of the window's width to a scale above which the removed parabola does not matter
 NARROW = 12
-# error of the radians of a wave over the window; larger where the window is less than so many times
-# as wide as the scale: there it depends on where few crests lie, and a parabola takes much
+# error of a wave's phase across the window, rad; larger in windows below `FEW` scales, where it
+# depends on the position of few crests, and a parabola absorbs much
 APART, FEW_APART, FEW = 0.5, 2.0, 10
-DIRECTIONS = 16  # of longer waves, whose ring has no more places
-EDGE = 0.02  # of the template's highest power, beyond which the ring ends
+DIRECTIONS = 16  # directions of longer waves, whose ring has few resolution elements
+EDGE = 0.02  # power at the edge of the ring, over the template's highest power
 _PARABOLA = 2
 
 
@@ -163,7 +163,7 @@ def _two_flats(evidence: Evidence) -> tuple[F64, F64] | None:
 def _structure(
     found: FringeEvidence, flat: F64, flats: tuple[F64, F64], good: Mask
 ) -> tuple[F64, F64]:
-    """Logarithms of iota and alpha over the flats, less what is smooth; each of half the frames."""
+    """Logarithms of iota and alpha over the flats minus smooth terms, each from half the frames."""
     free = np.concatenate([polynomial(good.shape, 2), gauge_terms(found)])[:, good].T
     maps = []
     for n in (0, 1):
@@ -179,16 +179,16 @@ def _structure(
 
 
 def _shared_power(pairs: list[tuple[F64, F64]], pixels: int) -> F64:
-    """Mean cross power (y, x); its sum is the mean product of the pixels that count."""
+    """Mean cross power (y, x); its sum is the mean product of the good pixels."""
     products = [(np.fft.fft2(a) * np.conj(np.fft.fft2(b))).real for a, b in pairs]
     return np.asarray(np.mean(products, axis=0) / (pixels * pairs[0][0].size))
 
 
 def _smooth(neighbours: F64, ring: "Ring") -> tuple[float, float, float]:
-    """Variance of the smooth part, its error by noise, and that as one draw of many.
+    """Variance of the smooth part, its error by noise, and its error as a sample of its kind.
 
-    What neighbours share; where waves of one length account for that, these, which are better
-    known.
+    From the covariance of neighbours; from waves of one length if these explain it, as they are
+    better known.
     """
     variance, noise = float(neighbours.mean()), float(neighbours.std() / np.sqrt(neighbours.size))
     if abs(ring.variance - variance) < AGREE * np.hypot(noise, ring.noise):
@@ -198,14 +198,14 @@ def _smooth(neighbours: F64, ring: "Ring") -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class Ring:
-    """Waves of one length that two maps share."""
+    """Waves of one length common to two maps."""
 
-    # variance, noise: of the waves in this window, whatever a parabola takes of them, and its error
+    # variance, noise: of the waves in this window, with the part that a parabola absorbs; error
     variance: float
     noise: float
-    # of the same as that of all waves of the kind, of which few beat with each other in a window
+    # error of the variance as that of all waves of the kind, as a window holds few modes
     error: float
-    # scale, scale_error: wavelength over 2 pi, px; the error is infinite where nothing is there
+    # scale, scale_error: wavelength over 2 pi, px; the error is infinite without waves
     scale: float
     scale_error: float
 
@@ -229,15 +229,15 @@ def ring_power(power: F64) -> Ring:
     unit = np.sqrt((design**2).sum(axis=0)) + 1e-300
     rows = np.linalg.pinv(design / unit, rcond=1e-8) / unit[:, None]
     projected = rows @ data
-    # Waves fill the ring unevenly: their scatter about it counts (Huber's sandwich), and no wave
-    # is longer or shorter than the window tells.
+    # Waves fill the ring unevenly, so their scatter about it gives the error (Huber's sandwich),
+    # which the resolution of the window limits.
     width = float(np.sqrt(2 * ((rows[2] * (data - design @ projected)) ** 2).sum()))
     scale = float(scales[best] * np.exp(np.clip(projected[2], -STEP, STEP)))
     apart = FEW_APART if scale * FEW > min(shape) else APART
     width = min(float(np.hypot(width, apart * scale / min(shape))), 0.75)
-    # Of the wavelength; longer ones are further away than shorter ones.
+    # Error of the wavelength, larger towards longer wavelengths.
     width /= 1 - width
-    # Of the variance that there should be, and that may well be the larger.
+    # Relative to the expected variance, which may be larger than the measured one.
     draws = min(float(np.sqrt(2 / modes)), 0.75)
     error = float(np.hypot(noise, variance * draws / (1 - draws)))
     # A parabola absorbs more of longer waves.
@@ -248,9 +248,9 @@ def ring_power(power: F64) -> Ring:
 
 
 def _sum_of_ring(data: F64, template: F64) -> tuple[float, float, float]:
-    """Variance of the waves from all of the ring's power, its error by noise, modes in the ring."""
-    # Waves fill the ring unevenly; their sum does not mind. The modes k and -k of a real map are
-    # one.
+    """Variance of the waves from the ring's total power, its error by noise, number of modes."""
+    # Waves fill the ring unevenly, which does not affect the sum. Modes k and -k of a real map
+    # are equal.
     inside = template > EDGE * template.max()
     white, noise = float(data[~inside].mean()), float(data[~inside].var())
     power, share = float((data[inside] - white).sum()), float(template[inside].sum())
@@ -281,7 +281,7 @@ def _of_short_waves(shape: tuple[int, int], scale: float) -> F64:
 
 
 def _of_long_waves(shape: tuple[int, int], scale: float) -> F64:
-    """Mean power (y, x) of waves of some directions, less what a parabola takes of each."""
+    """Mean power (y, x) of waves of several directions, each minus its fitted parabola."""
     free = polynomial(shape, _PARABOLA).reshape(-1, shape[0] * shape[1]).T
     y, x = np.mgrid[: shape[0], : shape[1]].reshape(2, -1).astype(float)
     angle = np.pi * (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS

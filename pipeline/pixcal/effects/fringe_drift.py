@@ -64,7 +64,7 @@ class FringeDrift(Effect):
     along_y: tuple[Track, ...] = quantity((), unit="rad/px", doc="measured slow change of ky")
 
     def vector_change(self, time_s: F64) -> F64:
-        """Change (t, 2) of the fringe vector, rad/px, that is not random, from the first frame."""
+        """Deterministic change (t, 2) of the fringe vector since the first frame, rad/px."""
         fade = np.exp(-time_s / self.settle_s) - 1
         return np.asarray(np.outer(time_s / HOUR_S, self.ramp) + np.outer(fade, self.settle))
 
@@ -76,6 +76,6 @@ class FringeDrift(Effect):
         return moved(states, recording, change, self.along_x, self.along_y)
 
     def replayed(self, evidence: Evidence) -> Self | None:
-        """As in `Effect.replayed`: the slow part of each frame's own fringe vector."""
+        """As in `Effect.replayed`: the slow part of the frames' fringe vectors."""
         x, y = vector_tracks(evidence, slow=True)
         return replace(self.scaled(0.0), along_x=x, along_y=y)

@@ -61,6 +61,6 @@ class FringeJitter(Effect):
         return moved(states, recording, change, self.along_x, self.along_y)
 
     def replayed(self, evidence: Evidence) -> Self | None:
-        """As in `Effect.replayed`: each frame's own fringe vector, but for its slow changes."""
+        """As in `Effect.replayed`: the frames' fringe vectors without slow changes."""
         x, y = vector_tracks(evidence, slow=False)
         return replace(self.scaled(0.0), along_x=x, along_y=y)

@@ -27,7 +27,7 @@ from pixcal.simulation.shot import Shot
 _DISAGREE = 2.5
 _MIN_FRAMES = 8
 _CURVED = 3.0
-_STEP = 1e-4  # of the deviations of a response, for derivatives
+_STEP = 1e-4  # step of the deviations of a response, for derivatives
 
 
 @dataclass(frozen=True)
@@ -111,11 +111,11 @@ class GainError(Effect):
 
 
 def shot_share_of_flats(evidence: Evidence) -> tuple[float, float] | None:
-    """Noise that grows with the level in flats over that expected; None without samples.
+    """Signal-dependent noise in flats over the expected noise; None without samples.
 
-    A response that is not linear changes the noise in proportion to the level, and a wrong gain
-    changes it by one factor: the former is taken out as the levels show it or, where the lamp was
-    changed between them, by the noise at level zero.
+    A nonlinear response changes the noise in proportion to the level, a wrong gain by one factor.
+    The nonlinearity is corrected by the levels or, if the lamp was changed between them, by
+    extrapolation of the noise to level zero.
     """
     pooled = shot_share(sums_of_stacks(evidence))
     curve = transfer_curve(evidence, whole=True)
@@ -123,7 +123,7 @@ def shot_share_of_flats(evidence: Evidence) -> tuple[float, float] | None:
         return pooled
     response = ladder_response(evidence, curve.top)
     straight = None if response is None else _straightened(curve, *response)
-    # Levels of a lamp that was changed constrain the response less than noise does.
+    # If the lamp was changed, its levels constrain the response less than noise does.
     if straight is not None and straight[1] < curve.error:
         return straight
     curved = abs(curve.slope) > _CURVED * curve.slope_error
@@ -131,7 +131,7 @@ def shot_share_of_flats(evidence: Evidence) -> tuple[float, float] | None:
 
 
 def _straightened(curve: TransferCurve, sizes: F64, covariance: F64) -> tuple[float, float]:
-    """Share of noise without a response of relative deviations (2,) at the highest level."""
+    """Share of noise, corrected for a response of relative deviations (2,) at the highest level."""
     u, weight = curve.levels / curve.top, curve.errors**-2
 
     def share(sizes: F64) -> float:
@@ -141,12 +141,12 @@ def _straightened(curve: TransferCurve, sizes: F64, covariance: F64) -> tuple[fl
 
     found = share(sizes)
     slope = np.array([share(sizes + step) - found for step in _STEP * np.eye(2)]) / _STEP
-    slope[sizes == 0] = 0  # a power that few levels do not tell
+    slope[sizes == 0] = 0  # a power that few levels do not constrain
     return found, float(np.sqrt(1 / weight.sum() + slope @ covariance @ slope))
 
 
 def _joined(found: dict[str, tuple[float, float]]) -> tuple[float, float]:
-    """Share and error of all ways; of the flats alone where fringes have another one."""
+    """Share and error from all methods; from the flats only if the fringes disagree."""
     shares, errors = np.array(list(found.values())).T
     if len(found) == 2 and abs(shares[0] - shares[1]) > _DISAGREE * np.hypot(*errors):
         found = {"flats": found["flats"]}
@@ -156,7 +156,7 @@ def _joined(found: dict[str, tuple[float, float]]) -> tuple[float, float]:
 
 
 def _of_fringes(found: FringeEvidence) -> F64 | None:
-    """Sums of `residual_sums` of a fringe set's residuals; None of too few."""
+    """Sums of `residual_sums` of a fringe set's residuals; None if too few."""
     pixels = np.count_nonzero(found.good)
     if len(found.g) < _MIN_FRAMES or pixels < MIN_PIXELS:
         return None
@@ -165,8 +165,8 @@ def _of_fringes(found: FringeEvidence) -> F64 | None:
     of_time = (freedom.of_time[i] * freedom.of_time[j]).T * np.where(i == j, 1, 2)
     of_pixels = np.zeros((len(i), *found.good.shape))
     of_pixels[:, found.good] = freedom.pixel_inverse[:, i, j].T
-    # (B, A cos phi, A sin phi) of every frame, and the fringe vector where it is free: what they
-    # take from the residuals is alike in neighbours as far as the pattern is.
+    # (B, A cos phi, A sin phi) of every frame, and free fringe vectors, absorb residuals in
+    # proportion to the correlation of their patterns in neighbours.
     alike = np.cos(STEPS @ np.array([found.k[1], found.k[0]]))
     taken = (1 + (4 if np.any(found.dk) else 2) * alike) / pixels
     return residual_sums(

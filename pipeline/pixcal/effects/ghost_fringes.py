@@ -17,7 +17,7 @@ from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
 
 Beat = tuple[float, float]
-Parent = tuple[str, bool]  # a fibre, and whether the ghost is crossed with the other one
+Parent = tuple[str, bool]  # a fibre; whether the ghost is polarised orthogonally to the other
 _EVERY_PARENT: tuple[Parent, ...] = ((MODULATED, False), (FIXED, False), (MODULATED, True))
 PARENTS: dict[str, tuple[Parent, ...]] = {
     "modulated": _EVERY_PARENT[:1],
@@ -25,19 +25,18 @@ PARENTS: dict[str, tuple[Parent, ...]] = {
     "both": _EVERY_PARENT[:2],
     "crossed": _EVERY_PARENT[2:],
 }
-# static, forward and backward fringes by the ghost of one fibre, of one amplitude; laws of the
-# amplitudes
+# laws of the amplitudes: whether the ghost of one fibre has static, forward and backward fringes
 SINGLE = {
     "static fringes alone: a ghost crossed in polarisation with the other fibre": (1, 0, 0),
     "ghost of the modulated fibre: static and moving fringes": (1, 1, 0),
     "ghost of the fixed fibre: static and moving fringes": (1, 0, 1),
 }
 BOTH = "ghosts of both fibres"
-OF_ONE, OF_BOTH = 2, 4  # of the six numbers of a wave, those that a law leaves free
-# chi-square of a wave that the second ghost must explain at least, and that static fringes have
+OF_ONE, OF_BOTH = 2, 4  # number of a wave's six numbers that a law leaves free
+# least chi-square per wave for a second ghost
 TWO_GHOSTS = 25.0
-UNTIED = 0.5  # share of the chi-square of the waves that the law of a beam may leave
-# differences between sets, relative and in errors, of a pattern that is the flat's
+UNTIED = 0.5  # largest share of the waves' chi-square that the law of a beam may leave
+# largest differences between sets, relative and in errors, of a pattern of the flat
 ALIKE, ALIKE_SIGMAS = 0.1, 5.0
 
 
@@ -61,7 +60,7 @@ class GhostWave:
 
     @property
     def of_beams(self) -> tuple[complex, ...]:
-        """Amplitudes of the three ghosts, in the order of `_EVERY_PARENT`, that make this wave."""
+        """Amplitudes of the three ghosts that make this wave, in the order of `_EVERY_PARENT`."""
         forward, backward = complex(*self.forward), complex(*self.backward).conjugate()
         return forward, backward, complex(*self.static).conjugate() - forward - backward
 
@@ -142,7 +141,7 @@ class GhostFringes(Effect):
         return light.with_beams(ghosts)
 
     def _factors(self, of: str, rows: Rows, columns: Rows) -> tuple[F64, C128]:
-        """By what mean light and fringe phasor (y, x) are multiplied on rows and columns."""
+        """Factors (y, x) of mean light and fringe phasor on rows and columns."""
         one = np.ones((rows[1] - rows[0], columns[1] - columns[0]))
         light = self._reflected(Light.of_fringes(one, one.astype(complex)), of, rows, columns)
         return light.mean, light.phasor
@@ -205,7 +204,7 @@ class GhostFringes(Effect):
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
-        """As in `Effect.detect`, from the strongest wave of each set alone."""
+        """As in `Effect.detect`, from the strongest wave of each set only."""
         found = find_waves(evidence, most=1)
         if found is None:
             return None
@@ -214,10 +213,10 @@ class GhostFringes(Effect):
 
 
 def _wave(found: WaveFit, middle: tuple[float, float]) -> GhostWave:
-    """A wave counted from the window's first pixel instead of its middle."""
+    """A wave relative to the window's first pixel instead of its centre."""
     qx, qy = found.q
     turn = np.exp(-1j * (qx * middle[0] + qy * middle[1]))
-    # Of the mean light Re(s e), of the fringes f e and b / e.
+    # Mean light: Re(s e); fringes: f e and b / e.
     static, forward, backward = found.static * turn, found.forward * turn, found.backward / turn
     return GhostWave(
         (float(np.clip(qx, -np.pi, np.pi)), float(np.clip(qy, -np.pi, np.pi))),
@@ -234,17 +233,17 @@ def _pair(value: complex) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class TiedWaves:
-    """Waves whose amplitudes follow a law, and how badly they are fitted."""
+    """Waves whose amplitudes follow a law, and the misfit."""
 
     waves: list[WaveFit]
-    misfit: float  # chi-square that the law leaves,
-    freedom: int  # and by noise alone
+    misfit: float  # chi-square that the law leaves
+    freedom: int  # its expectation from noise
 
     def shrunk(self, measured: Sequence[WaveFit], alike: int) -> list[WaveFit]:
-        """The measured waves, nearer to the law by the share that chance has in their misfit.
+        """The measured waves, shrunk to the law by the share of noise in their misfit.
 
-        By Stein's estimator (James & Stein 1961), where they depart from the law significantly.
-        ``alike``: sets along one axis, to whose waves the true offsets do the same.
+        By Stein's estimator (James & Stein 1961), if they depart from the law significantly.
+        ``alike``: number of sets along one axis, whose waves the true offsets change equally.
         """
         chi2, freedom = self.misfit / alike, self.freedom // alike
         sure = sigmas_of_chi2(max(chi2, 1e-9), max(freedom, 1)) > SIGNIFICANT
@@ -261,7 +260,7 @@ class TiedWaves:
 
 
 def _law(waves: Sequence[WaveFit]) -> tuple[str, TiedWaves, float]:
-    """Law of the amplitudes, the waves that follow it, and the share of chi-square it leaves."""
+    """Law of the amplitudes, waves that follow it, and the share of chi-square that it leaves."""
     laws = {law: [_tied(w, weights) for w in waves] for law, weights in SINGLE.items()}
     both = [_tied_of_both(w) for w in waves]
 
@@ -271,8 +270,8 @@ def _law(waves: Sequence[WaveFit]) -> tuple[str, TiedWaves, float]:
     law = min(laws, key=lambda name: misfit(laws[name]))
     best, unknown = laws[law], OF_ONE
     static = sum(abs(w.static) ** 2 / w.errors[0] ** 2 for w in waves)
-    # Two ghosts have more free numbers, and must explain much that one does not. Coupled pixels
-    # leave no static fringes.
+    # Two ghosts have more free numbers, and must explain much more than one. Crosstalk causes no
+    # static fringes.
     if misfit(best) > 2 * misfit(both) + TWO_GHOSTS * len(waves) < static:
         law, best, unknown = BOTH, both, OF_BOTH
     left = misfit(best) / max(sum(one.unrelated for one in best), 1e-300)
@@ -281,7 +280,7 @@ def _law(waves: Sequence[WaveFit]) -> tuple[str, TiedWaves, float]:
 
 
 def _of_a_beam(waves: Sequence[WaveFit], law: str, left: float, evidence: Evidence) -> bool:
-    """Whether waves are a reflection's, by their law and the share of them that it leaves."""
+    """Whether waves are due to a reflection, by their law and the share that it leaves."""
     moving = law == BOTH or any(SINGLE[law][1:])
     return left < UNTIED and not (moving and _of_the_flat(waves, evidence))
 
@@ -291,12 +290,12 @@ class Tied:
     """A wave whose amplitudes follow a law."""
 
     wave: WaveFit
-    misfit: float  # chi-square that the law leaves,
-    unrelated: float  # and that it leaves of unrelated amplitudes of these sizes
+    misfit: float  # chi-square that the law leaves
+    unrelated: float  # the same for unrelated amplitudes of these sizes
 
 
 def _tied(w: WaveFit, weights: tuple[int, int, int]) -> Tied:
-    """Of one complex amplitude: static s·a, forward f·a, backward b·conj(a)."""
+    """Fit of one complex amplitude: static s·a, forward f·a, backward b·conj(a)."""
     amplitudes = np.array([w.static, w.forward, w.backward.conjugate()])
     information = 1 / np.array(w.errors[:3]) ** 2
     unit = np.array(weights)
@@ -308,7 +307,7 @@ def _tied(w: WaveFit, weights: tuple[int, int, int]) -> Tied:
 
 
 def _tied_of_both(w: WaveFit) -> Tied:
-    """Of an amplitude for each fibre's ghost: the static fringes are those of both."""
+    """Fit of an amplitude for each fibre's ghost; both contribute to the static fringes."""
     variance = np.array(w.errors[:3]) ** 2
     sizes = np.abs([w.static, w.forward, w.backward])
     off = (w.static - w.forward - w.backward.conjugate()) / float(variance.sum())
@@ -323,7 +322,7 @@ def _tied_of_both(w: WaveFit) -> Tied:
 
 
 def _of_the_flat(waves: Sequence[WaveFit], evidence: Evidence) -> bool:
-    """Whether the waves of all sets are one pattern of the light, as an error of flats makes."""
+    """Whether the waves of all sets are one pattern of the light, as from an error of the flat."""
     first = waves[0]
     same = [w for w in waves if w.q == first.q]
 

@@ -46,7 +46,7 @@ class HyperbolicFringes(Effect):
     domains = ("space",)
     strengths = ("share",)
     fit_model = "hyperbolic"
-    smooth_degree = 1  # the curvature of the phase is the effect's own
+    smooth_degree = 1  # keeps the curvature of the phase, which is the effect
     frames_needed = ("axis",)
     sources = (
         "Rousset et al., section 5.2 and figures 5, 14 and 15: fibres at 40 cm, (18 mm, 18 mm) "
@@ -84,7 +84,7 @@ class HyperbolicFringes(Effect):
         return replace(light, beams=tuple(beams))
 
     def geometry(self, bench: Bench, number: int) -> Geometry:
-        """That of a fringe set, with the foot and the distance given, of the same fringe vector."""
+        """Geometry of a fringe set with given foot and distance, and the same fringe vector."""
         own, pitch = geometry(bench, number), bench.detector.pitch_um * 1e-3
         distance = self.distance_mm or own.distance
         wider = distance / own.distance
@@ -109,7 +109,7 @@ class HyperbolicFringes(Effect):
 
     @classmethod
     def starts(cls, evidence: Evidence) -> list[LightStart]:
-        """One foot for all sets, or a position of each set's fibres, at the nominal distance."""
+        """A common foot of all sets, or one position per set, at the nominal distance."""
         pairs = tuple(FibrePair(name, (0.0, 0.0)) for name in evidence.fringes)
         common = cls((0.0, 0.0), evidence.distance_mm)
         own = cls(None, evidence.distance_mm, pairs=pairs)
@@ -120,5 +120,5 @@ class HyperbolicFringes(Effect):
 
 
 def bending(x: F64, y: F64, where: Geometry) -> F64:
-    """Exact phase less the paraxial one, rad, at pixels x, y."""
+    """Exact minus paraxial phase, rad, at pixels x, y."""
     return optics.phase(x, y, where) - optics.paraxial_phase(x, y, where)

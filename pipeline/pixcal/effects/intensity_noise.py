@@ -15,7 +15,7 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.track import Track, at
 
-# share of light that does not follow the laser beyond which contrast noise is likelier
+# share of ambient light above which contrast noise is more likely
 MAX_AMBIENT = 0.3
 
 
@@ -104,7 +104,7 @@ class IntensityNoise(Effect):
         )
 
     def _ambient(self, number: int) -> float:
-        """Share of a set; zero where none is given."""
+        """Share of ambient light in a set; zero if not given."""
         return self.ambient[number] if number < len(self.ambient) else 0.0
 
     @classmethod

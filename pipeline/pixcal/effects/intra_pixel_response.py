@@ -20,7 +20,7 @@ from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
 
-REPEAT = 0.002  # to what part the visibility of two pairs of fibres is taken to be the same
+REPEAT = 0.002  # assumed relative agreement of the visibilities of two fibre pairs
 SHARED = "the visibility scatters alike in sets of crossed fringes, which pixel widths do not cause"
 _MIN_PIXELS = 200
 _APART = 1.1
@@ -105,7 +105,7 @@ class IntraPixelResponse(Effect):
                 "width_px[1]": width_error,
                 "width_rms_px": rms_error,
             },
-            # Pairs of fibres of other powers have another visibility, which is nominal.
+            # Of the scatter only, because unequal fibre powers also change a visibility.
             float(scatter / its_error),
             "visibility that varies from pixel to pixel, more strongly at shorter fringe periods",
             {"of_width": float(square / error), "of_scatter": float(scatter / its_error)},
@@ -114,7 +114,7 @@ class IntraPixelResponse(Effect):
 
 
 def transfer(k: Any, width: Any) -> Any:
-    """Visibility that a box of a width (px) leaves of fringes of k rad/px."""
+    """Factor of the visibility of fringes of k rad/px by a box of given width, px."""
     return np.sinc(k * width / (2 * np.pi))
 
 
@@ -131,7 +131,7 @@ def _width(k: F64, seen: F64) -> tuple[float, float]:
         model = np.log(np.abs(transfer(k, width)).prod(axis=1))
         more = np.log(np.abs(transfer(k, np.sqrt(width**2 + 1e-4))).prod(axis=1))
         slope = (more - model) / 1e-4
-        # Below nothing the law goes on in a straight line, so that chance is not one-sided.
+        # For negative squares the law is extended linearly, so that noise is not one-sided.
         model = model + slope * (square - width**2)
         slope = slope - slope.mean()
         rest = seen - model
@@ -144,7 +144,7 @@ def _width(k: F64, seen: F64) -> tuple[float, float]:
 
 
 def _bias_variance(evidence: Evidence) -> float:
-    """Of the bias that was taken off every frame, e-²: it is in both halves of them."""
+    """Variance of the subtracted bias, e-², which is common to both halves of the frames."""
     counts = [len(s.adu) for s in evidence.of_kind("bias")]
     return evidence.read_noise**2 / sum(counts) if counts else 0.0
 
@@ -152,7 +152,7 @@ def _bias_variance(evidence: Evidence) -> float:
 def _scatter(
     sets: list[FringeEvidence], width: float, bias_variance: float
 ) -> tuple[float, float, bool]:
-    """Variance of the width, px², its error, and whether other directions share most of it."""
+    """Variance of the width, px², its error, and whether crossed directions share most of it."""
     normal, right = np.zeros((2, 2)), np.zeros(2)
     maps, scatters = [], []
     for found in sets:
@@ -161,7 +161,7 @@ def _scatter(
         one, other = _structure(one, kept), _structure(other, kept)
         square, error = _of_pixels(one, other, kept)
         square -= bias_variance / _light(found) ** 2
-        # Widths along both axes scatter by themselves; what does not depend on the fringe is free.
+        # Widths along both axes scatter independently; a term independent of the fringe is free.
         terms = np.array([_gain(found, found, width), 1.0])
         normal += np.outer(terms, terms) / error**2
         right += terms * square / error**2
@@ -181,14 +181,14 @@ def _scatter(
 
 
 def _of_pixels(one: F64, other: F64, kept: Mask) -> tuple[float, float]:
-    """Mean product (and its error) of two maps pixel by pixel, beyond what neighbours share."""
+    """Mean product (and its error) of two maps per pixel, minus the covariance of neighbours."""
     products = neighbour_products(one, other, kept)
     white = (products[0] - (4 * products[1] - products[2]) / 3)[kept]
     return float(white.mean()), float(white.std() / np.sqrt(len(white)))
 
 
 def _gain(one: FringeEvidence, other: FringeEvidence, width: float) -> float:
-    """Covariance of the visibilities of two sets for widths that scatter by a pixel."""
+    """Covariance of the visibilities of two sets for a width scatter of one pixel."""
     return float((np.square(one.k) * np.square(other.k)).sum() * (width / 12) ** 2)
 
 
@@ -197,7 +197,7 @@ def _light(found: FringeEvidence) -> float:
 
 
 def _visibility(found: FringeEvidence, half: int) -> F64:
-    """Logarithm of the visibility (y, x) of half the frames, without fringes; NaN of outliers."""
+    """Logarithm of the visibility (y, x) of half the frames, without fringes; outliers are NaN."""
     good = found.good
     theta = half_theta(found, half, good)
     rest = np.full(good.shape, np.nan)
@@ -209,7 +209,7 @@ def _visibility(found: FringeEvidence, half: int) -> F64:
 
 
 def _structure(visibility: F64, kept: Mask) -> F64:
-    """Of it (y, x), without rows and columns; zero where not kept."""
+    """Visibility (y, x) minus means of rows and columns; zero where not kept."""
     rest = visibility[kept]
     for index in np.nonzero(kept):
         count = np.maximum(np.bincount(index), 1)

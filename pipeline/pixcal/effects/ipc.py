@@ -30,18 +30,18 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.shot import Shot
 
-MIN_SHARE = 2e-5  # couplings below do not move offsets by what matters, and take time
-MIN_FLAT = 0.01  # least response that maps are divided by
+MIN_SHARE = 2e-5  # couplings below have negligible effect on offsets, and take time
+MIN_FLAT = 0.01  # least response by which maps are divided
 
-# A kernel of the size and kind that the paper finds on its GIGAPYX-4600
+# a kernel of the size and kind measured on the paper's GIGAPYX-4600
 FOUR_ROWS = (
-    # Rows in pairs, unequal ones, and one that skips a row: the paper finds 2 to 3 % up and down,
-    # repeating every four rows, "sparse", and not always between closest neighbours.
+    # Unequal couplings of pairs of rows, one of which skips a row: the paper finds 2 to 3 % up and
+    # down, repeating every four rows, "sparse", and not always between nearest neighbours.
     Coupling(1, 0, 0.030, every_rows=4, row=0),
     Coupling(-1, 0, 0.025, every_rows=4, row=1),
     Coupling(1, 0, 0.020, every_rows=4, row=2),
     Coupling(-2, 0, 0.025, every_rows=4, row=3),
-    # And 0.6 % to the left and right, a little less to the left of two rows in four.
+    # 0.6 % to the left and right, a little less to the left in two rows of four.
     Coupling(0, 1, 0.006),
     Coupling(0, -1, 0.006, every_rows=4, row=0),
     Coupling(0, -1, 0.006, every_rows=4, row=1),
@@ -90,7 +90,7 @@ class Ipc(Effect):
 
     @classmethod
     def nearest(cls, share: float, diagonal: float = 0.0) -> Self:
-        """The same share to each of the four nearest pixels, and another to those diagonal."""
+        """Equal shares to the four nearest pixels, and another share to the diagonal ones."""
         weights = np.array([[diagonal, share, diagonal], [share, 0, share]])
         return cls.of_kernel(np.stack([weights[0], weights[1], weights[0]]))
 
@@ -101,14 +101,14 @@ class Ipc(Effect):
         Parameters
         ----------
         kernel : (odd, odd) float64
-            ``kernel[c + dy, c + dx]`` is what the pixel (dy, dx) away reads of a unit; the centre
+            ``kernel[c + dy, c + dx]`` is the share that the pixel at (dy, dx) receives. The centre
             is not used: a pixel keeps the rest.
         """
         return cls(tuple(_couplings_of(np.asarray(kernel, float))))
 
     @classmethod
     def of_rows(cls, kernels: Sequence[F64]) -> Self:
-        """A dense kernel for the sources of each of n rows, repeating; each as in `of_kernel`."""
+        """A dense kernel, as in `of_kernel`, for sources in each of n rows, which repeat."""
         n = len(kernels)
         return cls(
             tuple(
@@ -120,7 +120,7 @@ class Ipc(Effect):
 
     @property
     def halo(self) -> int:
-        """Rows that the longest coupling reaches over."""
+        """Reach of the longest coupling, rows."""
         return max((abs(c.dy) for c in self.couplings), default=0)
 
     def signal(self, signal: F32, shot: Shot) -> F32:
@@ -152,10 +152,10 @@ class Ipc(Effect):
         return significance(evidence)
 
     def predict(self, maps: FringeMaps) -> FringeMaps:
-        """Maps with the couplings on: ``L (flat theta) / L flat`` (physics note, section 5).
+        """Maps with the couplings: ``L (flat theta) / L flat`` (physics note, section 5).
 
-        Shares that change with the signal are those at intensity and amplitude 1, of the flat at
-        small signals. Pixels without data (NaN) stay so; to others they are like those around them.
+        Signal-dependent shares are those at intensity and amplitude 1, for the flat at small
+        signals. Pixels without data (NaN) stay so; as sources they are like their neighbours.
         """
         return _on_charge(
             maps,
@@ -166,8 +166,8 @@ class Ipc(Effect):
     def undo(self, maps: FringeMaps) -> FringeMaps:
         """Maps without the couplings: the inverse of `predict`, to rounding.
 
-        A piece of the window needs `undo_halo` more rows and columns around it than are wanted,
-        except where the window ends.
+        A part of the window needs a margin of `undo_halo` rows and columns, except at the edge of
+        the window.
         """
         return _on_charge(
             maps,
@@ -176,10 +176,9 @@ class Ipc(Effect):
         )
 
     def measured_again(self, parts: Iterable[Evidence]) -> Estimate | None:
-        """All couplings within two pixels, and those found beyond, of the period that was found.
+        """All couplings within two pixels, and those found beyond, with the period found before.
 
-        Shares that the frames do not show are shrunk by their errors; the details hold the
-        covariance.
+        Shares that are not significant are shrunk by their errors; the details hold the covariance.
         """
         if not self.couplings or any(c.per_ke for c in self.couplings):
             return None
@@ -207,17 +206,17 @@ class Ipc(Effect):
 
     @property
     def undo_halo(self) -> int:
-        """Pixels around a piece that undoing it to 1e-8 depends on."""
+        """Margin around a part of the window that `undo` needs for a precision of 1e-8, px."""
         reach = max((max(abs(c.dy), abs(c.dx)) for c in self.couplings), default=0)
         most = 2 * largest_outflow(self.couplings)
         return reach * math.ceil(math.log(1e-8) / math.log(most)) if 0 < most < 1 else 0
 
     def noise_factor(self, charge: float, read_noise: float, maps: FringeMaps) -> F64:
-        """As in `Effect.noise_factor`: shot noise is coupled, read noise came after."""
+        """As in `Effect.noise_factor`: shot noise is coupled, read noise is added later."""
         shape = (maps.theta.shape[1], maps.theta.shape[2])
         shot, read = noise_shares(self._at_small_signals, shape, maps.origin)
         before, after = charge * shot + read_noise**2, charge + read_noise**2 * read
-        # A fit scales its errors to the noise that pixels have on average.
+        # A fit scales its errors to the mean noise of the pixels.
         return np.asarray(np.sqrt(after / np.mean(before)))
 
     @property
@@ -237,14 +236,14 @@ def _couplings_of(kernel: F64) -> list[Coupling]:
 
 
 def _worth_it(couplings: Sequence[Coupling]) -> tuple[Coupling, ...]:
-    """The couplings, too small ones at zero: they stay, since their errors go with the others'."""
+    """The couplings, with negligible ones set to zero but kept for the covariance."""
     return tuple(c if abs(c.share) > MIN_SHARE else c.scaled(0.0) for c in couplings)
 
 
 def _on_charge(
     maps: FringeMaps, of_theta: Callable[[F64], F64], of_flat: Callable[[F64], F64]
 ) -> FringeMaps:
-    """Act on the charge: what samples were before they were divided by the flat."""
+    """Act on the charge, that is, on samples before their division by the flat."""
     before = np.ones(maps.theta.shape[1:]) if maps.flat is None else maps.flat
     after = before if maps.flat is None else np.maximum(of_flat(before), MIN_FLAT)
     theta = of_theta(filled(maps.theta * before, maps.k)) / after

@@ -25,9 +25,9 @@ from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
-TAIL = 1e-3  # share of the charge left behind whose release is brought forward to the last frame
-_TELL_LAMP = 3  # fewest flats of a level to separate a lamp that warms up from lag
-_TURNS = 3  # of the inverse: each gains a factor of the share
+TAIL = 1e-3  # truncated tail of the release, added to the last frame; share of the charge left
+_TELL_LAMP = 3  # fewest flats per level to distinguish a warming lamp from lag
+_TURNS = 3  # iterations of the inverse; each reduces the error by a factor of the share
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Lag(Effect):
 
     @property
     def releases(self) -> F64:
-        """Share of what stayed behind that comes out 1, 2, ... frames later; their sum is one."""
+        """Shares of the charge left that appear 1, 2, ... frames later; their sum is one."""
         if sum(self.later) > 0 and not self.capacity_e:
             return np.array(self.later) / sum(self.later)
         if not self.decay_frames:
@@ -118,7 +118,7 @@ class Lag(Effect):
 
     @property
     def _keep(self) -> float:
-        """Part of what is held that stays for another frame."""
+        """Share of the held charge that stays for another frame."""
         return float(np.exp(-1 / self.decay_frames)) if self.decay_frames else 0.0
 
     def charge(self, charge: F32, shot: Shot) -> F32:
@@ -134,14 +134,14 @@ class Lag(Effect):
         return found
 
     def _charge_before(self, shot: Shot, back: int) -> F32 | None:
-        """Charge of a frame before this one, as far as it was carried; None where there is none."""
+        """Charge of an earlier frame, if carried over; None if there is none."""
         if back <= shot.frame:
             return shot.charge(shot.frame - back)
         charge = shot.charge(shot.frame - back) if self.carried else None
         return None if charge is None else np.float32(self.carried) * charge
 
     def _with_traps(self, charge: F32, shot: Shot) -> F32:
-        """A frame without what traps take of it, and with what they give back of earlier ones."""
+        """A frame minus the charge that traps capture, plus charge released from earlier frames."""
         scale = _shares(self, shot.bench.detector, shot.rows) / np.float32(self.share)
         held = np.zeros_like(charge)
         for back in range(self.frames_back, 0, -1):
@@ -153,7 +153,7 @@ class Lag(Effect):
     def _held(
         self, held: F32, charge: F32, scale: F32, shot: Shot, frame: int, noisy: float = 1.0
     ) -> F32:
-        """What traps hold after a frame, e-: each electron is caught by its own chance."""
+        """Charge in the traps after a frame, e-; electrons are captured independently."""
         taken = scale * self._left(np.maximum(charge, 0))
         if shot.bench.shot_noise and noisy > 0:
             taken += np.sqrt(np.float32(noisy) * taken) * shot.normals(self.name, frame)
@@ -161,7 +161,7 @@ class Lag(Effect):
         return np.asarray(np.minimum(full, scale * np.float32(self.capacity_e)))
 
     def lost(self, charge: F32) -> tuple[F32, F32]:
-        """Mean net loss of frames, and what comes out of earlier ones; both (t, ...), e-.
+        """Mean net loss of frames, and charge released from earlier ones; both (t, ...), e-.
 
         ``charge``: (t, ...) e-, in the order of time without gaps; the first one after darkness.
         """
@@ -174,7 +174,7 @@ class Lag(Effect):
         return taken - released, released
 
     def _left_behind(self, charge: F32, shot: Shot, frame: int, noisy: float = 1.0) -> F32:
-        """Electrons of a frame that stay: each by its own chance, so that noise stays white."""
+        """Electrons of a frame that stay, each independently, so that noise stays white."""
         share = _shares(self, shot.bench.detector, shot.rows)
         noise = np.zeros_like(charge)
         if shot.bench.shot_noise and noisy > 0:
@@ -182,7 +182,7 @@ class Lag(Effect):
         return left_behind(charge, share, *_bands(self), noise)
 
     def _left(self, charge: F32) -> F32:
-        """Mean of what stays of a charge, e-."""
+        """Mean charge left behind, e-."""
         share = np.float32(self.share)
         if not self.bands:
             return share * charge
@@ -192,7 +192,7 @@ class Lag(Effect):
         )
 
     def restored(self, frames: F32) -> F32:
-        """Frames (t, y, x) without lag, e-; the scatter of the share from pixel to pixel is left.
+        """Frames (t, y, x) without lag, e-, except for scatter of the share between pixels.
 
         ``frames``: (t, y, x) e-, in the order of time without gaps; the first one after darkness.
         """
@@ -245,7 +245,7 @@ class Lag(Effect):
         sure, unalike = common.sigmas > CLEAR, uneven.sigmas > CLEAR
         rms = uneven.rms(common.keep, common.share) if unalike else 0.0
         missed = float(np.mean([common.share - seen_share(f, common.share, rms) for f in fringes]))
-        # The common share is at least the scatter of the pixels' shares.
+        # The common share is at least as large as the scatter of the pixels' shares.
         share = float(np.clip(common.share + missed, rms, 0.5))
         pixels = min(int(f.good.sum()) for f in fringes)
         common = replace(common, share_error=float(np.hypot(common.share_error, rms / pixels**0.5)))
@@ -272,14 +272,14 @@ class Lag(Effect):
 
     @classmethod
     def _undone(cls, share: float, decay_frames: float, frames: F32) -> tuple[F32, F64]:
-        """Frames without a lag, and the shares that come out 1, 2, ... frames later."""
+        """Frames without a lag, and the shares that appear 1, 2, ... frames later."""
         lag = cls(share, decay_frames)
         return lag.restored(frames), share * lag.releases
 
 
 @lru_cache(maxsize=4)
 def _bands(lag: Lag) -> tuple[F32, F32]:
-    """Where bands of the charge begin, e-, and the share in each over the mean one."""
+    """Lower ends of bands of the charge, e-, and the share in each over the mean share."""
     weights = lag.bands or (1.0,)
     begins = np.array(BANDS[: len(weights)], np.float32) * np.float32(lag.level_e)
     return begins, np.array(weights, np.float32)
@@ -287,7 +287,7 @@ def _bands(lag: Lag) -> tuple[F32, F32]:
 
 @lru_cache(maxsize=4)
 def _pixels(detector: SimulatedDetector, rows: Rows) -> F32:
-    """Standard normals of the chip's pixels on these rows."""
+    """Standard normals of the chip's pixels on given rows."""
     return chip_map(detector, rows, Lag.name, lambda rng: rng.standard_normal(TILE))
 
 
@@ -302,7 +302,7 @@ def _shares(lag: Lag, detector: SimulatedDetector, rows: Rows) -> F32:
 
 
 def _by_level(evidence: Evidence, lag: Lag) -> tuple[Lag, dict[str, float]]:
-    """The lag by level, and its errors: a share of each band, or traps that fill up."""
+    """The lag by level, and its errors: a share per band, or traps of limited capacity."""
 
     def banded(shares: F64, charge: F32) -> F32:
         return _banded(lag, shares).lost(charge)[0]
@@ -326,12 +326,12 @@ def _by_level(evidence: Evidence, lag: Lag) -> tuple[Lag, dict[str, float]]:
 
 
 def _banded(lag: Lag, shares: F64) -> Lag:
-    """The lag with a share of each band of the level."""
+    """The lag with a share for each band of the level."""
     return replace(lag, bands=tuple(float(v) for v in np.clip(shares / lag.share, 0, 100)))
 
 
 def _trapped(lag: Lag, values: F64) -> Lag:
-    """Traps that take shares of the bands of the level, keep a part, and hold so much at most."""
+    """Traps with shares of the bands of the level, a kept share, and a capacity."""
     *shares, keep, most = values
     decay = -1 / np.log(np.clip(keep, 1e-3, np.exp(-1 / MAX_DECAY)))
     share = float(np.mean(np.maximum(shares, 0)))
@@ -342,7 +342,7 @@ def _trapped(lag: Lag, values: F64) -> Lag:
 
 
 def _quiet(evidence: Evidence, lag: Lag) -> tuple[float, float]:
-    """Part of what comes out that has no shot noise, and its error; zero unless it shows."""
+    """Share of the released charge without shot noise, and its error; zero if insignificant."""
 
     def comes_out(_: FringeEvidence, signal: F32) -> F32:
         return lag.lost(signal)[1]

@@ -22,14 +22,12 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.effect import SETS_DISAGREE, Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
-FALLOFF_PX = 0.5  # of the shift of boundaries by the brighter-fatter effect beside the response
-# levels at which a response is measured, as shares of the way from the darkest samples to the
-# brightest
+FALLOFF_PX = 0.5  # falloff of boundary shifts (brighter-fatter effect) fitted with the response
+# levels at which a response is measured, from the darkest samples (0) to the brightest (1)
 KNOTS = np.array([0, 1 / 64, 1 / 32, *np.arange(1, 17) / 16])
 BEYOND = 4  # points beyond the brightest fringe, up to the brightest flat
-TAIL = 1e-3  # share of the samples that are darker, and brighter
-# chi-square of a measured response beside a polynomial, over that of the polynomial, from which it
-# is told
+TAIL = 1e-3  # share of samples below, and above, the range of levels
+# least chi-square of a measured response added to a polynomial, over that of the polynomial
 BESIDE = 0.05
 _INVERSE = 1 << 14
 _NOT_TOLD = 1e-3
@@ -96,7 +94,7 @@ class Nonlinearity(Effect):
 
     @property
     def turns_at(self) -> float:
-        """Level (u) from which the response no longer rises; infinite when it always does."""
+        """Level (u) at the maximum of the response; infinite if it always rises."""
         roots = np.roots([3 * self.cubic, 2 * self.quadratic, 1.0])
         rising = [float(r.real) for r in roots if abs(r.imag) < 1e-12 and r.real > 0]
         return min(rising, default=np.inf)
@@ -111,7 +109,7 @@ class Nonlinearity(Effect):
             )
 
     def response(self, charge: F32) -> F32:
-        """Signal of a charge, e-; where the polynomial would fall again it stays at its top."""
+        """Signal of a charge, e-; constant beyond the maximum of the polynomial."""
         u = np.minimum(charge / np.float32(self.level_e), np.float32(self.turns_at))
         bent = u * (1 + u * (np.float32(self.quadratic) + np.float32(self.cubic) * u))
         signal = np.asarray(bent * np.float32(self.level_e), np.float32)
@@ -122,7 +120,7 @@ class Nonlinearity(Effect):
         return signal
 
     def linearised(self, signal: F32) -> F32:
-        """Charge (e-) that gives a signal: the inverse of `response` up to its top; NaN stays."""
+        """Charge (e-) of a signal: the inverse of `response` up to its maximum; NaN stays."""
         wanted = np.asarray(signal, float)
         brightest = float(np.nanmax(wanted, initial=self.level_e, where=np.isfinite(wanted)))
         top = min(self.turns_at * self.level_e, 2 * brightest)
@@ -187,7 +185,7 @@ class Nonlinearity(Effect):
 class _Polynomial:
     """Quadratic and cubic term of the response."""
 
-    level_e: float  # at which the deviations are given
+    level_e: float  # reference level of the deviations
     sizes: F64  # (2,)
     covariance: F64  # (2, 2)
     why: str
@@ -196,7 +194,7 @@ class _Polynomial:
 
     @property
     def size(self) -> dict[str, object]:
-        # A power that the flats do not constrain is taken as zero, its error as large.
+        # A power that flats do not constrain has size zero and a large error; it is left out.
         terms = (self.top_e / self.level_e) ** np.array([1, 2]) * (self.sizes != 0)
         error = float(np.sqrt(terms @ self.covariance @ terms))
         return _size(self.top_e, self.top_e * float(terms @ self.sizes), self.top_e * error)
@@ -211,10 +209,10 @@ class _Polynomial:
 
 
 def _polynomial(evidence: Evidence) -> _Polynomial | None:
-    """From fringes or, without them, from what flats tell best."""
+    """Polynomial from fringes or, without them, from the best constraint of the flats."""
     level = _full_scale(evidence, Nonlinearity().level_e)
     levels, curve = ladder_response(evidence, level), _of_noise(evidence, level)
-    # Information on the quadratic term alone: the ladder has a cubic term too.
+    # Information on the quadratic term only, as the exposure-time steps also give a cubic term.
     told = [0.0 if one is None else np.linalg.inv(one[1])[0, 0] for one in (levels, curve)]
     by_levels = told[0] > told[1]
     if evidence.fringes:
@@ -245,7 +243,7 @@ def _polynomial(evidence: Evidence) -> _Polynomial | None:
 
 
 def _size(charge: float, change: float, error: float) -> dict[str, object]:
-    """`Estimate.size` of a response by its departure at a charge, all in e-."""
+    """`Estimate.size` of a response from its deviation at a charge, all in e-."""
     at = f"{float(f'{charge:.2g}'):.0f} e-"
     return {
         "value": float(change / charge),
@@ -258,7 +256,7 @@ def _size(charge: float, change: float, error: float) -> dict[str, object]:
 def _bends(
     evidence: Evidence, response: Callable[[F32], F32], chi2_of_polynomial: float
 ) -> tuple[tuple[tuple[Bend, ...], list[float]] | None, Agreement]:
-    """Points of the response beside a polynomial, errors, and the sets' agreement; None without."""
+    """Points of the response on top of a polynomial, errors (or None); the sets' agreement."""
     ends = [np.nanquantile(f.electrons[::7], [TAIL, 1 - TAIL]) for f in evidence.fringes.values()]
     low, top = max(min(float(a) for a, _ in ends), 0.0), max(float(b) for _, b in ends)
     seen = low + KNOTS * (top - low)
@@ -273,7 +271,7 @@ def _bends(
 
 
 def _straight_on(curve: Nonlinearity, evidence: Evidence) -> list[Bend]:
-    """Points up to the brightest flats, where the response goes straight on beyond the fringes."""
+    """Points up to the brightest flats; beyond the fringes the response is extended linearly."""
     flats = [(s.adu[0] - evidence.bias) * evidence.gain for s in evidence.of_kind("flat")]
     top = curve.bends[-1].level_e
     brightest = max((float(np.quantile(f, 1 - TAIL)) for f in flats), default=0.0)
@@ -287,7 +285,7 @@ def _straight_on(curve: Nonlinearity, evidence: Evidence) -> list[Bend]:
 
 
 def _full_scale(evidence: Evidence, usual: float) -> float:
-    """Where to give the deviations: the usual level, unless fringes are of another order."""
+    """Reference level of the deviations: the usual one, unless fringes are of another order."""
     brightest = [float(np.nanquantile(f.electrons[::7], 0.99)) for f in evidence.fringes.values()]
     for stack in evidence.of_kind("flat"):
         brightest.append(float(np.median(stack.adu[0] - evidence.bias)) * evidence.gain)
@@ -299,7 +297,7 @@ def _full_scale(evidence: Evidence, usual: float) -> float:
 def _of_noise(evidence: Evidence, level_e: float) -> tuple[F64, F64] | None:
     """(quadratic, 0) and covariance from photon transfer; None with too few levels.
 
-    A signal ``S (1 + q u)`` has the variance ``S (1 + 2 q u)²``: over the signal it rises by 3 q u.
+    A signal ``S (1 + q u)`` has variance ``S (1 + 2 q u)²``; their ratio rises as 1 + 3 q u.
     """
     curve = transfer_curve(evidence)
     if curve is None:

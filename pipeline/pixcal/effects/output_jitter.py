@@ -25,14 +25,14 @@ HOUR_S = 3600.0
 _WALK = 1000  # first key of the walk's random numbers
 MIN_FRAMES = 8
 MAX_EDGES = 15  # along each axis
-NARROWEST = 8  # rows or columns of an output at least; even: two that alternate cancel
-# lines on either side whose means are compared: levels differ little beside the noise of few lines
+NARROWEST = 8  # least rows or columns of an output; even, so that alternate lines cancel
+# numbers of lines on either side whose means are compared: small steps need many lines
 WIDTHS = (NARROWEST, 3 * NARROWEST, 9 * NARROWEST)
-_FAR = 24  # lines on either side by which an edge is placed
-_WILD = 5.0  # standard deviations from which a sample, _CLIP from which a step of a frame is cut
+_FAR = 24  # lines on either side that determine the position of an edge
+_WILD = 5.0  # standard deviations above which a sample (_CLIP: a frame's step) is clipped
 _CLIP = 3.0
 _STEPS = 30  # of the likelihood's maximisation
-_LEAST = 1e-9  # noise of a level, e-²: frames may be alike
+_LEAST = 1e-9  # least noise of a level, e-², as frames may be equal
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class OutputJitter(Effect):
 
 
 def _outputs(evidence: Evidence) -> "Outputs | None":
-    """Outputs of the frames without light, edges in the window at hand."""
+    """Outputs in the frames without light, with edges in window coordinates."""
     stacks = [s for s in evidence.stacks if s.kind in ("bias", "dark") and len(s.adu) >= MIN_FRAMES]
     gain = np.float32(evidence.gain)
     rests = [(s.adu - s.adu.mean(axis=0)) * gain for s in stacks]
@@ -128,7 +128,7 @@ def _outputs(evidence: Evidence) -> "Outputs | None":
 class Outputs:
     """Edges between outputs, and the noise of their levels."""
 
-    row_edges: tuple[int, ...]  # row_edges, column_edges: first line of each output but the first
+    row_edges: tuple[int, ...]  # row_edges, column_edges: first line of each output after the first
     column_edges: tuple[int, ...]
     # size, error: white noise of an output's level (e-²), and its random walk (e-²/s)
     size: tuple[float, float]
@@ -137,9 +137,9 @@ class Outputs:
 
 
 def find_outputs(stacks: Sequence[F32], times: Sequence[F64], good: Mask) -> Outputs | None:
-    """Outputs of stacks (t, y, x), e-, less the mean of each pixel, at times (t,), s.
+    """Outputs of stacks (t, y, x), e-, minus the mean of each pixel, at times (t,), s.
 
-    None with too few frames. Where no edge is significant, the clearest one is given.
+    None with too few frames. If no edge is significant, the most significant one is given.
     """
     chosen = [n for n, rest in enumerate(stacks) if len(rest) >= MIN_FRAMES]
     rests = [_calm(stacks[n], good) for n in chosen]
@@ -161,14 +161,14 @@ def find_outputs(stacks: Sequence[F32], times: Sequence[F64], good: Mask) -> Out
 def output_numbers(
     row_edges: Sequence[int], column_edges: Sequence[int], rows: Indices, columns: Indices
 ) -> Indices:
-    """Number (y, x) of the output that reads each pixel of some rows and columns."""
+    """Number (y, x) of the output that reads each pixel of given rows and columns."""
     along = np.searchsorted(column_edges, columns, side="right")
     down = np.searchsorted(row_edges, rows, side="right")
     return np.asarray(down[:, None] * (len(column_edges) + 1) + along)
 
 
 def _calm(rest: F32, good: Mask) -> F32:
-    """Without the mean of each frame; samples of bad pixels and outliers are zero."""
+    """Residuals without the mean of each frame; samples of bad pixels and outliers are zero."""
     rest = rest - rest[:, good].mean(axis=1)[:, None, None]
     spread = robust_sigma(rest[:, good])
     rest[np.abs(rest) > _WILD * max(spread, 1e-6)] = 0
@@ -176,7 +176,7 @@ def _calm(rest: F32, good: Mask) -> F32:
 
 
 def _edges(rests: Sequence[F32], good: Mask, axis: int) -> tuple[list[tuple[int, float]], float]:
-    """Edges along an axis with their significance, clearest first, and that of the clearest."""
+    """Significant edges along an axis, best first, with significance; that of the best edge."""
     size = good.shape[axis]
     if size < 6 * NARROWEST - 1:
         return [], -np.inf
@@ -195,7 +195,7 @@ def _edges(rests: Sequence[F32], good: Mask, axis: int) -> tuple[list[tuple[int,
         found.append((edge, sigmas))
         if sigmas < SIGNIFICANT:
             break
-        # Clipped steps are equal at several places, of which the first need not be the edge.
+        # Clipped steps are equal at several places; the first is not necessarily the edge.
         for width, square in free.items():
             for middle in (at, edge):
                 square[max(middle - width, 0) : middle + width + 1] = 0
@@ -208,7 +208,7 @@ def _steps(lines: Sequence[F64], width: int, dof: int) -> F64:
     places = np.arange(width, size - width + 1)
     square = np.zeros(len(places))
     for own in lines:
-        # Noise may differ from place to place.
+        # Noise may depend on position.
         noise = _line_noise(own)[None]
         expected = _means(noise, places, width)[0] + _means(noise, places - width, width)[0]
         steps = _means(own, places, width) - _means(own, places - width, width)
@@ -221,20 +221,20 @@ def _steps(lines: Sequence[F64], width: int, dof: int) -> F64:
 
 
 def _line_noise(lines: F64) -> F64:
-    """Variance (n,) of means (t, n) of lines, by how they differ from the next; no step counts."""
+    """Variance (n,) of line means (t, n), from differences of neighbours, insensitive to steps."""
     change = np.square(np.diff(lines, axis=1)).mean(axis=0) / 2
     near = np.pad(change, (NARROWEST, NARROWEST + 1), mode="reflect")
     return np.asarray(np.median(sliding_window_view(near, 2 * NARROWEST + 1), axis=1))
 
 
 def _means(lines: F64, first: Indices, count: int) -> F64:
-    """Means (t, n) of so many lines from some on."""
+    """Means (t, n) of ``count`` lines beginning at ``first``."""
     total = np.concatenate([np.zeros((len(lines), 1)), np.cumsum(lines, axis=1)], axis=1)
     return np.asarray((total[:, first + count] - total[:, first]) / count)
 
 
 def _placed(lines: Sequence[F64], about: int) -> int:
-    """Place about an edge that parts the lines best."""
+    """Position near ``about`` that separates the lines best."""
     size = lines[0].shape[1]
     first, last = max(about - _FAR, 0), min(about + _FAR, size)
     places = range(max(about - NARROWEST, first + 1), min(about + NARROWEST, last - 1) + 1)
@@ -249,7 +249,7 @@ def _placed(lines: Sequence[F64], about: int) -> int:
 def _sizes(
     rests: Sequence[F32], times: Sequence[F64], good: Mask, numbers: Indices
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """White noise and walk of the outputs' levels beyond pixels, rows and columns; with errors."""
+    """White noise and walk of outputs' levels beyond pixel, row and column noise; errors."""
     masks = [good & (numbers == n) for n in range(int(numbers.max()) + 1)]
     masks = [mask for mask in masks if np.count_nonzero(mask) >= NARROWEST**2]
     if len(masks) < 2:
@@ -269,7 +269,7 @@ def _sizes(
         normal = (weight * shape) @ shape.T
         size = np.linalg.solve(normal, (weight * shape) @ (square - noise))
         if size.min() < 0:
-            # The other one alone.
+            # Only the other component.
             other = int(size.argmax())
             size = np.zeros(2)
             size[other] = (weight * shape[other]) @ (square - noise) / normal[other, other]
@@ -278,7 +278,7 @@ def _sizes(
 
 
 def _noise(rest: F32, mask: Mask) -> float:
-    """Variance of the mean of some pixels that are a rectangle but for bad ones."""
+    """Variance of the mean of a rectangle of pixels without its bad ones."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     cut = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
     own, used = rest[:, *cut] * mask[cut], np.maximum(np.count_nonzero(mask), 1)

@@ -25,11 +25,11 @@ from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
-# A step between codes moves by less than a code, so that only its neighbours need be asked
+# largest displacement of a threshold, so that only neighbouring codes need checks
 FARTHEST = 0.98
-FEW_MISSING = 1.1  # step up to which wrong bits may be why codes never come, every so often
+FEW_MISSING = 1.1  # largest step for which wrong bits may explain the missing codes
 _KEY = 997
-_CELLS = 16  # to a step, in which codes are looked up; a power of two, so that it is exact
+_CELLS = 16  # cells of the lookup table per step; a power of two, to be exact
 _LAW = "wrong weights of bits, scatter and a ripple of the widths"
 _OTHER_GAIN = (
     "only codes of bright samples are uneven, as in a camera that reads bright pixels at another "
@@ -117,7 +117,7 @@ class Quantisation(Effect):
     )
 
     def __hash__(self) -> int:
-        """Without every width: it is asked for in each frame."""
+        """Fast hash without the individual widths, as it is needed in each frame."""
         return hash((self.coarse_adu, self.dnl_rms, self.ripple, self.bits, len(self.widths)))
 
     @property
@@ -127,11 +127,11 @@ class Quantisation(Effect):
 
     @property
     def law(self) -> Law:
-        """Where codes begin by the levels that their bits make."""
+        """Law of the thresholds of codes, given the levels of their bits."""
         return Law(self.below, self.any_code)
 
     def thresholds(self, specimen: int, codes: int) -> F64:
-        """Where codes begin, in steps, in the order of `code_cells`; code n near ``n - 1/2``."""
+        """Thresholds of codes, in steps, in the order of `code_cells`; code n near ``n - 1/2``."""
         number = np.arange(codes)
         shift = np.zeros(codes)
         measured = np.array(self.widths)
@@ -140,7 +140,7 @@ class Quantisation(Effect):
             shift += self.dnl_rms / np.sqrt(2) * rng.standard_normal(codes)
         if self.ripple and not len(measured):
             turn = 2 * np.pi / self.ripple_codes
-            # Sum of the ripple of all codes below.
+            # Sum of the ripple over all codes below.
             phase = turn * (number - 0.5) + self.ripple_phase_rad
             shift += self.ripple * np.sin(phase) / (2 * np.sin(turn / 2))
         begins, order = code_cells(np.array(self.bits), self.law, codes)
@@ -152,20 +152,20 @@ class Quantisation(Effect):
         return np.asarray(begins)
 
     def converted(self, adu: F32, specimen: int, top_adu: float, normals: F32 | None = None) -> F32:
-        """Codes in ADU: each sample passes the thresholds that it reaches.
+        """Codes in ADU: the number of thresholds that each sample reaches.
 
-        Thresholds that have changed places leave a code out, as in a flash converter that counts.
+        Swapped thresholds leave a code out, as in a flash converter that counts.
 
         Parameters
         ----------
         adu : ndarray of float32
-            Samples. Large ones lie on a grid as coarse as thresholds are displaced.
+            Samples. The float32 grid of large ones is as coarse as threshold displacements.
         specimen : int
             Seed of the detector.
         top_adu : float
             Highest sample.
         normals : ndarray of float32, optional
-            Standard normals by which samples are scattered over the meshes of that grid.
+            Standard normals by which samples are scattered within the steps of that grid.
         """
         codes = int(top_adu / self.step_adu) + 3
         if any(self.bits) or any(self.widths):
@@ -178,7 +178,7 @@ class Quantisation(Effect):
         begins = _thresholds(self, specimen, codes)
         level = np.clip(adu / np.float32(self.step_adu), 0, np.float32(codes - 2))
         nearest = (level + np.float32(0.5)).astype(np.int32)
-        # Small numbers, on which there is no grid.
+        # A small number, for which the float32 grid is negligible.
         over = level - nearest.astype(np.float32)
         if normals is not None:
             over += np.spacing(level) * np.float32(0.5) * normals
@@ -233,13 +233,13 @@ class _ByLaw:
 
     values: dict[str, Any]
     errors: dict[str, float]
-    sigmas: list[float]  # of each of these
+    sigmas: list[float]  # significance of each
     together: tuple[dict[str, float], ...]  # steps of the bits, of one sigma each
     widths: CodeWidths | None
 
 
 def _by_law(evidence: Evidence, far: bool = False) -> _ByLaw | None:
-    """What the counts of the codes say; None where samples are no codes, or too few."""
+    """Converter from the counts of its codes; None if samples are not codes, or too few."""
     lit = [f.adu for f in evidence.fringes.values()]
     counts = histogram([*(s.adu for s in evidence.stacks), *lit], evidence.good)
     if counts is None or not counts.any():
@@ -261,7 +261,7 @@ def _by_law(evidence: Evidence, far: bool = False) -> _ByLaw | None:
         widths = code_widths(converter_counts(counts, step), noise, first, top / step)
     if widths is None and step == evidence.step_adu:
         return None
-    # A camera that shifts its codes by whole bits is an ordinary one.
+    # A camera that shifts its codes by whole bits is not an anomaly.
     sigmas = [-1.0 if step == evidence.step_adu else min((step - 1) / step_error, 1e6)]
     values: dict[str, Any] = {"coarse_adu": step - 1, "dnl_rms": 0.0, "ripple": 0.0}
     errors = {"coarse_adu": step_error}
@@ -273,13 +273,13 @@ def _by_law(evidence: Evidence, far: bool = False) -> _ByLaw | None:
 
 @lru_cache(maxsize=4)
 def _thresholds(effect: Quantisation, specimen: int, codes: int) -> F32:
-    """Where each code begins, from its number."""
+    """Threshold of each code minus its number."""
     return (effect.thresholds(specimen, codes) - np.arange(codes)).astype(np.float32)
 
 
 @lru_cache(maxsize=4)
 def _reached(effect: Quantisation, specimen: int, codes: int) -> tuple[F64, Indices, Indices]:
-    """Lowest sample of each code reached, these codes in order, and the first of each cell."""
+    """Lowest sample of each occurring code, these codes in order, and the first per cell."""
     begins = effect.thresholds(specimen, codes)
     order = code_cells(np.array(effect.bits), effect.law, codes)[1]
     begins = np.minimum.accumulate(begins[::-1])[::-1]
@@ -288,7 +288,7 @@ def _reached(effect: Quantisation, specimen: int, codes: int) -> tuple[F64, Indi
 
 
 def _has_wrong_bits(widths: CodeWidths | None) -> bool:
-    """Whether codes are wide or narrow where some bit changes, beyond their scatter."""
+    """Whether code widths depend on bit transitions beyond their scatter."""
     return widths is not None and "bits" in _uneven(widths)[0]
 
 
@@ -301,12 +301,12 @@ def _uneven(
     sure = sigmas(line.log_chance)
     values: dict[str, Any] = {"ripple": 0.0}
     errors = {"ripple": line.amplitude_error}
-    # Of displaced thresholds neighbouring widths have up to twice the scatter of the others.
+    # With displaced thresholds, neighbouring widths may have twice the variance.
     found = widths.wrong_bits(2 * variance)
     wrong = sigmas_of_chi2(found.chi2, max(int((np.diag(found.covariance) > 0).sum()), 1))
     share = 1.0 if line.period == 2 else 0.5
     rest = widths.without(found.bits, found.law).scatter()[0]
-    # Bits repeat too: the least of them as a ripple of two or four codes.
+    # Bits are periodic too: the lowest ones resemble a ripple of two or four codes.
     clearer = 2 * rest < variance - share * line.amplitude**2
     bits: F64 | None = None
     if wrong > SIGNIFICANT and (wrong > sure or clearer):
@@ -316,7 +316,7 @@ def _uneven(
             rest = widths.without(found.bits, found.law).scatter()[0]
         bits, covariance = widths.bits(2 * rest, found.law, start)
         levelled = np.stack([widths.level(one) for one in np.eye(len(bits))], 1)
-    # No bit is off by more than its own weight; a fit to few codes may give that.
+    # No bit deviates by more than its own weight, although a fit to few codes may say so.
     if bits is not None and (np.abs(levelled @ bits) <= 2.0 ** np.arange(len(bits))).all():
         values, errors, others, _ = _uneven(widths.without(bits, found.law))
         covariance = levelled @ covariance @ levelled.T

@@ -25,8 +25,8 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Again, Effect, Estimate, FittedFrames, FringeMaps, Stage
 from pixcal.simulation.shot import Shot
 
-FEWEST = 4  # rows at which a profile of the settling is given
-# relative error of the slope: what the frames' own parameters absorb is known to about that
+FEWEST = 4  # least number of rows of a settling profile
+# relative error of the slope, from the correction for what the frames' parameters absorb
 _MODEL = 0.01
 
 
@@ -100,10 +100,10 @@ class RollingShutter(Effect):
             )
 
     def shares(self, rows: F64, exptime_s: float, period_s: float) -> tuple[F64, F64]:
-        """Shares of the next and of the last phase in the exposure of rows of the window."""
+        """Shares of the next and of the previous phase in the exposure of rows of the window."""
         start = self.line_time_us * 1e-6 * rows
         step = exptime_s + self.delay_us * 1e-6
-        # An exposure that is not known counts as none.
+        # An unknown exposure time counts as zero.
         lit = max(exptime_s, 1e-12)
         after = np.clip((start + exptime_s - step) / lit, 0, 1)
         before = np.clip((step - period_s - start) / lit, 0, 1)
@@ -119,13 +119,13 @@ class RollingShutter(Effect):
         mixed = mean
         for share, frame in zip(shares, (shot.frame + 1, shot.frame - 1), strict=True):
             other = shot.mean(frame) if share.any() else None
-            # Before the first frame and after the last one the modulator stands still.
+            # Before the first frame and after the last one, the modulator is at rest.
             if other is not None:
                 mixed = mixed + share.astype(np.float32)[:, None] * (other - mean)
         return mixed + self._settled(shot) if any(self.settling) else mixed
 
     def _settled(self, shot: Shot) -> F32:
-        """What the phases of the rows being off adds to the mean of a frame, e-."""
+        """Change of a frame's mean signal by phase errors of the rows, e-."""
         states, light, shape = shot.states, shot.light, shot.bench.detector.shape
         step = steps_of(states.phi, -1 if self.of_step == "last" else 1, self.origin_rad)
         rows = np.arange(*shot.rows) / max(shape[0] - 1, 1)
@@ -143,13 +143,13 @@ class RollingShutter(Effect):
         return found[1] - found[0]
 
     def undo(self, maps: FringeMaps) -> FringeMaps | None:
-        """Maps without what the rows' other phases left in them; None of unknown frames."""
+        """Maps corrected for the rows' other phases; None if frames are unknown."""
         if maps.frames is None:
             return None
         flat = 1.0 if maps.flat is None else maps.flat
         theta = maps.theta * flat
         first, count = maps.frames.rows
-        # Pixels beyond the window are like those at its edge.
+        # Pixels outside the window take the values at its edge.
         rows = np.clip(maps.origin[0] - first + np.arange(theta.shape[1]), 0, count - 1)
         g, noise = maps.frames.g, maps.frames.read_noise_e
         for share, change in self._changes(maps.frames):
@@ -157,7 +157,7 @@ class RollingShutter(Effect):
         return replace(maps, theta=theta / flat)
 
     def noise_factor(self, charge: float, read_noise: float, maps: FringeMaps) -> F64:
-        """As in `Effect.noise_factor`: errors were scaled by the usual residuals of a pixel."""
+        """As in `Effect.noise_factor`: errors were scaled by the usual residuals of pixels."""
         left = np.zeros(1)
         if maps.frames is not None:
             g, noise = maps.frames.g, maps.frames.read_noise_e
@@ -166,10 +166,10 @@ class RollingShutter(Effect):
         return np.full(maps.theta.shape[1:], (1 + np.median(left)) ** -0.5)
 
     def _changes(self, frames: FittedFrames) -> Iterator[tuple[F64, F64]]:
-        """Shares of the window's rows (y,), and by how much each frame (t, 3) is off at one.
+        """Shares of the window's rows (y,), and changes of the frames (t, 3) for a share of one.
 
-        Less what the frames' parameters take up: what all rows have and, where vectors are free,
-        slopes.
+        Minus the part that the frames' parameters absorb: the mean of all rows and, if vectors are
+        free, slopes.
         """
         g, rows = frames.g, np.arange(frames.rows[1], dtype=float)
         turned = np.stack([np.zeros(len(g)), -g[:, 2], g[:, 1]], axis=1)
@@ -205,7 +205,7 @@ class RollingShutter(Effect):
         many = [RowSums.of(f) for f in evidence.fringes.values() if enough_frames(f)]
         if not many:
             return None
-        sets = [sums for sums in many if sums.found.exptime_s > 0]  # not so where unknown (nan)
+        sets = [sums for sums in many if sums.found.exptime_s > 0]  # false if unknown (NaN)
         settled = find_settling(many)
         which = "from the previous" if settled.way < 0 else "to the next"
         law = "phase error of the rows in proportion to the phase step, with any profile"
@@ -228,7 +228,7 @@ class RollingShutter(Effect):
 
     @classmethod
     def _mixed(cls, sets: list[RowSums]) -> Estimate:
-        """Light of two frames in the exposure of a row."""
+        """Estimate of light of two frames in the exposure of a row."""
         sums = [RowRamp.of(sets, way) for way in (1, -1)]
         following, last = (s.slope / s.error for s in sums)
         ramp, found = sums[int(last > max(following, 4.0))], sets[0].found
@@ -255,6 +255,6 @@ class RollingShutter(Effect):
 
 
 def _settling_again(way: int, origin: float | None, evidence: Evidence) -> float | None:
-    """Significance of a profile of the same steps in other frames."""
+    """Significance of a settling profile with the same steps in other frames."""
     many = [RowSums.of(f) for f in evidence.fringes.values() if enough_frames(f)]
     return settling_sigmas(many, way, origin) if many else None

@@ -20,11 +20,11 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 FREEDOM = 3  # parameters of a pixel in the fit of the fringes
-TURNS = 2.0  # fringes along a row from which its mean tells nothing of them
-# lowest mode across the rows that counts in frames with light, whose pattern is smooth
+TURNS = 2.0  # least number of fringes along a row, so that they cancel in its mean
+# lowest mode across the rows that is used in frames with light, whose pattern is smooth
 FIRST_MODE = 3
 _rms = partial(quantity, unit="e-", low=0, high=1e5)
-BLOCKS, MIN_BLOCK = 16, 4  # blocks of a row at most, and pixels of a block at least
+BLOCKS, MIN_BLOCK = 16, 4  # most blocks per row, and least pixels per block
 FEWEST_BLOCKS = 4
 FEWEST_FRAMES = 8
 FEWEST_LINES = 8
@@ -84,7 +84,7 @@ class RowNoise(Effect):
         rows = self.row_rms * rng.standard_normal(ny)
         columns = self.column_rms * rng.standard_normal(nx)
         rows += self.interlace_rms * rng.standard_normal() * (1 - 2 * (np.arange(ny) % 2))
-        # Last, so that the random numbers of the others do not depend on it.
+        # Last, so that the random numbers above do not depend on it.
         if self.flicker_rms:
             rows += self.flicker_rms * flicker(rng, ny)
         if self.alternate_rms:
@@ -134,7 +134,7 @@ def _turned(residual: F32) -> F32:
 
 
 def _row_shapes(spectrum: "LineSpectrum") -> F64:
-    """White noise, flicker, alternate rows, and what every second row shares (m, n)."""
+    """Powers (m, n) of white noise, flicker, alternate rows, noise of every second row."""
     alternate = np.where(spectrum.modes == spectrum.lines // 2, spectrum.lines, 0.0)
     power = flicker_power(spectrum.lines)[spectrum.modes]
     turn = np.cos(4 * np.pi * spectrum.modes / spectrum.lines)
@@ -147,7 +147,7 @@ def _flat(spectrum: "LineSpectrum") -> F64:
 
 
 def _of_fringes(found: FringeEvidence, across: bool) -> "LineSpectrum | None":
-    """Spectrum of a set's residuals; None where its fringes run along the lines."""
+    """Spectrum of a set's residuals; None if its fringes run along the lines."""
     ny, nx = found.good.shape
     turns = (found.k[1] * ny if across else found.k[0] * nx) / (2 * np.pi)
     if abs(turns) < TURNS:
@@ -165,13 +165,13 @@ def _of_fringes(found: FringeEvidence, across: bool) -> "LineSpectrum | None":
 
 @dataclass(frozen=True)
 class LineSpectrum:
-    """Variance that rows have in common, by mode across the rows."""
+    """Variance of common noise of rows, by mode across the rows."""
 
-    lines: int  # rows that were transformed, an even number
-    power: F64  # (n,) of modes 1 to `lines / 2`, e-²; noise of single pixels does not add to it
-    dof: F64  # (n,) degrees of freedom of each
+    lines: int  # number of transformed rows, even
+    power: F64  # (n,) of modes 1 to `lines / 2`, e-²; without the noise of single pixels
+    dof: F64  # (n,) degrees of freedom of each mode
     noise: float  # variance of a row's mean by the noise of its pixels, e-²
-    pair_noise: float  # the same, as products of distant blocks see it, e-²
+    pair_noise: float  # the same in products of distant blocks, e-²
 
     @property
     def modes(self) -> I64:
@@ -179,16 +179,16 @@ class LineSpectrum:
         return np.arange(1, self.lines // 2 + 1)
 
     def variance(self, common: F64) -> F64:
-        """Of ``power``, where the rows have ``common`` (n,) in common."""
+        """Variance of ``power`` for common noise of power ``common`` (n,)."""
         square = (common + self.noise) ** 2 - self.noise**2 + self.pair_noise**2
         return np.asarray(2 * square / self.dof)
 
 
 def line_spectrum(residual: F32, good: Mask, fitted: int = 1) -> LineSpectrum | None:
-    """Spectrum of what rows have in common; None where rows or frames are too few.
+    """Spectrum of common noise of rows; None with too few rows or frames.
 
-    Of residuals (t, y, x), e-, without what is constant in time, NaN where there is no sample,
-    after so many parameters of each pixel were fitted to the frames.
+    ``residual``: (t, y, x), e-, without the constant part, NaN without a sample. ``fitted``: number
+    of parameters per pixel that were fitted to the frames.
     """
     frames, lines, width = residual.shape
     lines -= lines % 2
@@ -227,9 +227,9 @@ def line_spectrum(residual: F32, good: Mask, fitted: int = 1) -> LineSpectrum | 
 class LineVariances:
     """Variances of several kinds of noise of rows."""
 
-    size: F64  # (m,) e-²; of nothing zero on average, so some come out below
+    size: F64  # (m,) e-²; unbiased, so it may be negative
     covariance: F64  # (m, m)
-    sigmas: F64  # (m,) significance of each where it is the only one
+    sigmas: F64  # (m,) significance of each if it is the only one
 
     @property
     def roots(self) -> tuple[F64, F64]:
@@ -258,11 +258,11 @@ def fit_lines(spectra: Sequence[LineSpectrum], shapes: Sequence[F64]) -> LineVar
 
 
 def _alone(power: F64, shape: F64, variance: F64, dof: F64) -> float:
-    """Standard deviations by which one shape is there, its sum of squares being skew."""
+    """Significance (standard deviations) of one shape, allowing for the skewness of its sum."""
     weight = shape / variance
     z = float(weight @ power / np.sqrt(weight @ shape))
     skew = float(np.sum((weight * np.sqrt(variance)) ** 3 * np.sqrt(8 / dof)))
     total = 8 / (skew / float(weight @ shape) ** 1.5) ** 2
-    # A chi-square of as much skewness, by the cube root of Wilson and Hilferty (1931).
+    # A chi-square of equal skewness, by the cube root of Wilson and Hilferty (1931).
     ratio = max(1 + z * np.sqrt(2 / total), 0.0)
     return float((np.cbrt(ratio) - 1 + 2 / (9 * total)) / np.sqrt(2 / (9 * total)))

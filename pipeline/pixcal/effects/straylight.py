@@ -15,7 +15,7 @@ from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, FringeMaps, LightStart, Stage
 from pixcal.simulation.recording import Recording
 
-DEGREE = 8  # of the polynomials that a measured pattern is made of
+DEGREE = 8  # of the polynomials of a measured pattern
 
 
 @lru_cache(maxsize=8)
@@ -40,7 +40,7 @@ class StrayPattern:
         return replace(self, coefficients=tuple(factor * c for c in self.coefficients))
 
     def share(self, rows: F64, columns: F64) -> F64:
-        """Share (y, x) of the fibres' light; beyond the part that of its edge. Never negative."""
+        """Share (y, x) of the fibres' light, never negative; outside the part, that at its edge."""
         (y0, y1), (x0, x1) = self.rows, self.columns
         y = np.clip(2 * (rows - y0) / max(y1 - y0 - 1, 1) - 1, -1, 1)
         x = np.clip(2 * (columns - x0) / max(x1 - x0 - 1, 1) - 1, -1, 1)
@@ -71,7 +71,7 @@ class Straylight(Effect):
     order = 8
     domains = ("space",)
     strengths = ("share", "slope_per_px", "bump", "patterns")
-    smooth_degree = 2  # of what two Gaussian beams do to the logarithm of the visibility
+    smooth_degree = 2  # degree that two Gaussian beams cause in the logarithm of the visibility
     frames_needed = ("axis",)
     sources = (
         "Rousset et al., eq. 3: straylight is a part of the mean term B iota",
@@ -120,7 +120,7 @@ class Straylight(Effect):
         return light.with_incoherent(share * light.power)
 
     def predict(self, maps: FringeMaps) -> FringeMaps:
-        """As in `Effect.predict`: iota alone changes."""
+        """As in `Effect.predict`: only iota changes."""
         return replace(maps, theta=np.stack([maps.theta[0] * self._more(maps), *maps.theta[1:]]))
 
     def undo(self, maps: FringeMaps) -> FringeMaps:
@@ -132,7 +132,7 @@ class Straylight(Effect):
 
     @classmethod
     def starts(cls, evidence: Evidence) -> list[LightStart]:
-        """A pattern of each set by itself, of any smooth shape."""
+        """A separate pattern for each set, of any smooth shape."""
         nothing = (0.0,) * ((DEGREE + 1) * (DEGREE + 2) // 2)
         patterns = []
         for f in evidence.fringes.values():

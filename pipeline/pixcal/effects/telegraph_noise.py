@@ -20,8 +20,8 @@ from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
-HARMONICS = 5  # of the phase that are taken out of fringe residuals before they count as noise
-LIT_HARMONICS = 1  # of pixels that are known to jump
+HARMONICS = 5  # of the phase, removed from fringe residuals before they count as noise
+LIT_HARMONICS = 1  # the same for pixels that are known to jump
 _MIN_FRAMES = 10
 _ENOUGH = 20
 _HOT = 4.0
@@ -47,7 +47,7 @@ class MeasuredPixels:
     upper: tuple[float, ...] = quantity(doc="share of the time in its upper level")
 
     def __hash__(self) -> int:
-        """Without the pixels: it is asked for in each frame."""
+        """Fast hash without the pixels' values, as it is needed in each frame."""
         return hash((self.rows, self.columns, self.faintest, len(self.row)))
 
 
@@ -193,7 +193,7 @@ def _pixels(
     upper: float,
     measured: tuple[MeasuredPixels, ...],
 ) -> tuple[Indices, Indices, F32, F32, F32]:
-    """Pixels of a block that jump: rows, columns, amplitudes, stays, shares of time above."""
+    """Jumping pixels of a block: rows, columns, amplitudes, dwell times, shares of time above."""
     rows = block * BLOCK_ROWS, min((block + 1) * BLOCK_ROWS, detector.shape[0])
 
     def draw(rng: np.random.Generator) -> F64:
@@ -219,7 +219,7 @@ def _pixels(
 
 @lru_cache(maxsize=4)
 def _states(seed: int, frames: int, kept: bytes, upper: bytes) -> U8:
-    """Whether each pixel is in its upper level, in bits: (frame, pixel / 8)."""
+    """Bits that are set for pixels in the upper level: (frame, pixel / 8)."""
     rng, keep, share = np.random.default_rng(seed), np.frombuffer(kept), np.frombuffer(upper, "f4")
     pixels = len(keep)
     up = np.zeros(pixels, bool)
@@ -249,11 +249,11 @@ def _series(evidence: Evidence) -> Iterator[Series]:
 
 
 def _of_stack(stack: Stack, evidence: Evidence) -> Series | None:
-    """Bias or dark frames; without what rows have in common, and without hot pixels."""
+    """Bias or dark frames without common noise of rows and without hot pixels."""
     seconds = float(np.nan_to_num(stack.exptime_s))
     dark = np.maximum(evidence.dark_rate, 0) * seconds
     pixels = (dark < _HOT * evidence.read_noise**2) & (stack.adu < evidence.saturation_adu).all(0)
-    # Medians of a few steps of the converter are steps too, and hide what rows have in common.
+    # Medians of samples within a few converter steps are steps too, and hide common row noise.
     rest = (stack.adu - stack.adu.mean(axis=0)).astype(float)
     wide = rest.shape[2] >= _WIDE
     rest -= np.median(rest, axis=2 if wide else (1, 2), keepdims=True)
@@ -262,7 +262,7 @@ def _of_stack(stack: Stack, evidence: Evidence) -> Series | None:
         return None
     spread = float(np.sqrt(np.median(rest.var(axis=0, ddof=1))))
     if spread**2 < (DITHER**2 + 1 / 12) * (evidence.gain * evidence.step_adu) ** 2:
-        # Noise far below a step of the converter has the shape of the steps.
+        # The distribution of noise far below a converter step depends on the steps.
         return None
     return Series(
         rest / spread, stack.frame, np.flatnonzero(pixels), spread,
@@ -271,7 +271,7 @@ def _of_stack(stack: Stack, evidence: Evidence) -> Series | None:
 
 
 def _lit(evidence: Evidence, pixels: Indices) -> list[LitSeries]:
-    """Charge of some pixels in every fringe set that the fringes do not explain."""
+    """Residual charge of given pixels in every fringe set."""
     found = []
     for fringes in evidence.fringes.values():
         own = np.zeros(fringes.good.size, bool)
@@ -289,7 +289,7 @@ def _lit(evidence: Evidence, pixels: Indices) -> list[LitSeries]:
 
 
 def _turned_away(evidence: Evidence) -> Indices:
-    """Pixels that the fit left out for their noise."""
+    """Pixels that the fit excluded for their noise."""
     noisy = np.zeros(evidence.good.shape, bool)
     for fringes in evidence.fringes.values():
         noisy |= evidence.good & np.isfinite(fringes.theta).all(axis=0) & ~fringes.good
@@ -297,7 +297,7 @@ def _turned_away(evidence: Evidence) -> Indices:
 
 
 def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Series:
-    # With the pixels that the fit turned away for their noise: they are the ones.
+    # Include pixels that the fit excluded for their noise, as these may be telegraph noise.
     every = evidence.good & np.isfinite(fringes.theta).all(axis=0)
     fringes = replace(fringes, good=every)
     freedom = Freedom(fringes, HARMONICS)

@@ -18,9 +18,9 @@ from pixcal.simulation.recording import Recording
 
 HOUR_S = 3600.0
 SETS_DIFFER = "fringe sets disagree: a wavelength changes all fringe vectors by the same share"
-# scatter about two levels, over that from frame to frame, up to which there are no more
+# largest scatter about two levels, over that from frame to frame, for which two levels suffice
 LEVEL = 1.5
-CALM = 2.0  # errors of a walk up to which the levels hold still
+CALM = 2.0  # significance of a walk up to which the levels are constant
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class WavelengthDrift(Effect):
             self.ramp * recording.times_s / HOUR_S + self.walk * np.sqrt(hours) * steps.cumsum()
         )
         change = change + self.hop * (np.cumsum(hops) % 2)
-        # One over the wavelength, less what it was.
+        # Relative change of the inverse wavelength.
         shrunk = -change / (1 + change)
         ny, nx = bench.detector.shape
         where, place = geometry(bench, recording.number), ((nx - 1) / 2, (ny - 1) / 2)
@@ -107,23 +107,23 @@ class WavelengthDrift(Effect):
 
 
 def _sharpest(motion: Motion) -> float:
-    """Standard deviations by which the clearest hop stands out."""
+    """Significance (standard deviations) of the clearest hop."""
     return float(max((h.sigmas for hops in motion.hops.values() for h in hops), default=-np.inf))
 
 
 def _hops(
     motion: Motion, jumps: Sequence[Hop], *, walks: bool
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Size and rate of the hops; up and down count alike.
+    """Size and rate of the hops, both upwards and downwards.
 
-    Those that stand out are the start; short stays are told by the likelihood, of the rate alone
-    beside a walk, unless the colour does more than hop between two levels.
+    Significant hops are the start; the likelihood accounts for short dwell times (with a walk, it
+    fits the rate only), unless the wavelength does more than hop between two levels.
     """
     size, error = np.array([abs(h.size) for h in jumps]), np.array([h.error for h in jumps])
     weight = 1 / error**2
     seconds = sum(len(s) * s.step_s for s in motion.raw)
     hop, rate = float(size @ weight / weight.sum()), len(jumps) / seconds
-    # They may scatter by more than the noise.
+    # Hops may scatter by more than the noise.
     excess = float(weight @ (size - hop) ** 2) / max(len(jumps) - 1, 1)
     own_error = float(np.sqrt(max(excess, 1.0) / weight.sum()))
     found = Hopping(hop, own_error, rate, float(np.sqrt(len(jumps))) / seconds)

@@ -1,1 +1,1 @@
-"""Types only: what an acquisition, a flag, an error is. Imports nothing of the other folders."""
+"""Types only, such as acquisition, flags and errors. Imports nothing from other folders."""

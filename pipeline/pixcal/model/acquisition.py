@@ -51,7 +51,7 @@ def _check_globs(key: str, globs: tuple[str, ...]) -> None:
 
 
 def check_set(name: str, baseline_mm: tuple[float, float]) -> None:
-    """Raise InputError if a fringe set, real or simulated, cannot have this name or baseline."""
+    """Raise InputError if the name or baseline of a fringe set, real or simulated, is invalid."""
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
         raise InputError(f"name: {name!r:.80} is not made of letters, digits, '-' and '_'")
     if baseline_mm == (0.0, 0.0):

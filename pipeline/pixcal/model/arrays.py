@@ -1,4 +1,4 @@
-"""Arrays by the type of their numbers; shapes and units stand in the docstrings."""
+"""Array types by data type; docstrings give shapes and units."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -12,7 +12,7 @@ from pixcal.model.yaml_file import read_yaml
 
 SCHEMA = "pixcal/bench/1"
 
-# kinds of calibration frames; their folders, so no fringe set may have these names
+# kinds of calibration frames, and their folders; no fringe set may have these names
 CALIBRATIONS = ("bias", "dark", "flat")
 
 MAX_FRAMES = 10_000_000
@@ -168,7 +168,7 @@ class SimulatedOptics:
 
 
 def _of_pair(name: str, doc: str) -> Any:
-    """What a pair of fibres may have of its own."""
+    """Declare an optical setting that a fringe set may override."""
     return as_in(SimulatedOptics, name, default=None, doc=f"{doc}; default: that in optics")
 
 
@@ -312,7 +312,7 @@ class Bench:
     )
 
     def optics_of(self, number: int) -> SimulatedOptics:
-        """Optics of a fringe set, by its number: what the set says goes before ``optics``."""
+        """Optics of a fringe set, by its number: settings of the set override ``optics``."""
         scan = self.frames.fringes[number]
         given = {n: v for n in _OPTICS_OF_SETS if (v := getattr(scan, n)) is not None}
         return replace(self.optics, **given) if given else self.optics

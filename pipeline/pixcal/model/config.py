@@ -1,8 +1,8 @@
-"""Strict configuration: plain data into frozen dataclasses, every mistake named by its key.
+"""Strict configuration: plain data into frozen dataclasses, with errors that name the key.
 
-A configuration class is a frozen dataclass whose fields carry their limits in ``metadata``; make
-them with `quantity`. Its class variable ``moved`` says what to write for keys of old files.
-`to_plain` writes out what `parse` reads.
+A configuration class is a frozen dataclass whose fields have their limits in ``metadata``; make
+them with `quantity`. Its class variable ``moved`` gives the replacement of keys of old files.
+`to_plain` is the inverse of `parse`.
 """
 
 import dataclasses
@@ -39,9 +39,9 @@ def quantity(
     unit : unit, for messages and the documentation
     low, high : inclusive limits of a number (of each number of a tuple)
     above : exclusive lower limit
-    choices : the only words allowed
+    choices : the allowed words
     doc : one line on the meaning
-    **more : of options, as `pixcal.model.options` says
+    **more : further metadata of options, see `pixcal.model.options`
     """
     meta = dict(more, unit=unit, low=low, high=high, above=above, choices=choices, doc=doc)
     if isinstance(default, (list, dict)):
@@ -50,14 +50,14 @@ def quantity(
 
 
 def as_in(kind: type, name: str, **changes: Any) -> Any:
-    """Declare a field as another class has it, but for some changes of what `quantity` takes."""
+    """Declare a field as in another class, with changes of the arguments of `quantity`."""
     (field,) = (f for f in dataclasses.fields(kind) if f.name == name)
     return quantity(**{"default": field.default, **field.metadata, **changes})
 
 
 @dataclasses.dataclass(frozen=True)
 class _Place:
-    """Where a value stands: file, dotted key, and line where it is known."""
+    """Place of a value: file, dotted key, and line if known."""
 
     file: str
     key: str
@@ -80,7 +80,7 @@ def parse(cls: type[T], data: Any, where: str, *, key: str = "") -> T:
     range.
 
     cls : a frozen dataclass with type-annotated fields
-    data : mapping as read from YAML (mistakes then have their line) or JSON
+    data : mapping as read from YAML (errors then name the line) or JSON
     where : name of the file, for messages
     key : dotted path of ``data`` inside the file, for messages
     """
@@ -118,7 +118,7 @@ def _section(cls: type[T], data: Any, place: _Place) -> T:
 
 
 def to_plain(config: Any) -> Any:
-    """Plain data (dicts, lists, numbers, words) of a configuration, as `parse` reads it."""
+    """Plain data (dicts, lists, numbers, words) of a configuration, as input of `parse`."""
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
         return {f.name: to_plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
     if isinstance(config, (tuple, list)):
@@ -129,7 +129,7 @@ def to_plain(config: Any) -> Any:
 
 
 def result_options(config: Any, kind: type | None = None) -> dict[str, Any]:
-    """Plain data of the options that a result depends on, of all or those of a parent ``kind``."""
+    """Plain data of options that affect a result; with ``kind``, only of this parent class."""
     return {
         f.name: to_plain(getattr(config, f.name))
         for f in dataclasses.fields(kind or config)
@@ -164,7 +164,7 @@ def _value(hint: Any, value: Any, place: _Place, meta: Any) -> Any:
     if hint is Path and isinstance(value, (str, PathLike)):
         return Path(value)
     kind, expected = {
-        dict: (dict, "keys and values"),  # a section whose keys another module knows
+        dict: (dict, "keys and values"),  # a section whose keys another module checks
         bool: (bool, "true or false"),
         str: (str, "text"),
         Path: (str, "text"),

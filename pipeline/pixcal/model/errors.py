@@ -1,4 +1,4 @@
-"""Errors that a user can mend: one line that names the file, the key or the option."""
+"""Errors that a user can correct: one line that names the file, the key or the option."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,11 +9,11 @@ class PixcalError(Exception):
 
 
 class InputError(PixcalError):
-    """A file, key or option is wrong; the message says which and what mends it (exit code 2)."""
+    """A file, key or option is wrong; the message names it and the remedy (exit code 2)."""
 
 
 class DamagedError(InputError):
-    """Something that pixcal wrote is missing or altered, and what ``message`` says of ``path``.
+    """A file written by pixcal is missing or altered: ``path``, with ``message`` about it.
 
     ``advice`` is how to repair it; code that knows the run gives the exact command.
     """
@@ -29,7 +29,7 @@ class DamagedError(InputError):
 
 @contextmanager
 def naming(place: str) -> Iterator[None]:
-    """Name the place of an error of the input; what is damaged has a name already."""
+    """Add the place to an input error; errors of damaged files already name it."""
     try:
         yield
     except DamagedError:
@@ -39,12 +39,12 @@ def naming(place: str) -> Iterator[None]:
 
 
 class PlanError(InputError):
-    """The work does not fit the memory allowed; the message holds both numbers."""
+    """The work does not fit the allowed memory; the message has both numbers."""
 
 
 class RemoteError(InputError):
-    """A place at a URL cannot be used, or not now; what was written there is not in doubt."""
+    """A URL cannot be used, perhaps temporarily; data written there remain valid."""
 
 
 class ClusterError(PixcalError):
-    """Workers or their scheduler were lost; what was done is kept (exit code 1)."""
+    """Workers or their scheduler were lost; finished work is kept (exit code 1)."""

@@ -4,7 +4,7 @@ from enum import IntFlag
 
 
 class PixelFlag(IntFlag):
-    """Why a pixel's offset is not given. Zero is a good pixel."""
+    """Reasons why a pixel has no offset; zero is a good pixel."""
 
     HOT = 1
     DEAD = 2
@@ -21,7 +21,7 @@ class PixelFlag(IntFlag):
 
     @property
     def meaning(self) -> str:
-        """What a pixel with this flag is."""
+        """Description of a pixel with this flag."""
         return _MEANINGS[self.value]
 
 

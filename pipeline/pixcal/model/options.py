@@ -1,13 +1,13 @@
-"""Every command and its options, each said once: type, range, default, unit and meaning.
+"""Every command and its options, defined once: type, range, default, unit and meaning.
 
 The command line, the functions of `pixcal.api` and the stages take them from here. The docstring of
-a class is the help text of its command. An option is called as its field; the command line leaves
-out the unit (``--diameter`` is ``diameter_m``). Beside those of `pixcal.model.config.quantity`, a
-field may say
+a class is the help text of its command. An option has the name of its field; the command line omits
+the unit (``--diameter`` is ``diameter_m``). In addition to the metadata of
+`pixcal.model.config.quantity`, a field may have
 
-- ``in_key``: false where the result does not depend on it;
-- ``python_only``: true where the command line does not offer it;
-- ``metavar``, ``flag``, ``shown``: how help shows its value, its name, and a default of None.
+- ``in_key``: false if the result does not depend on it;
+- ``python_only``: true if the command line does not offer it;
+- ``metavar``, ``flag``, ``shown``: its value, its name, and a default of None in the help.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from pixcal.model.errors import InputError
 # limits (y0, y1, x0, x1) of a rectangle of pixels, ends excluded
 Region = tuple[int, int, int, int]
 
-MAX_ELECTRONS = 1e15  # the Poisson generator counts so far
+MAX_ELECTRONS = 1e15  # limit of the Poisson generator
 FWHMS = (0.5, 50.0)  # widths of stars, px
 
 

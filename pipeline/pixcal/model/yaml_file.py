@@ -1,4 +1,4 @@
-"""YAML files of settings: plain data that know the line of each key."""
+"""YAML files of settings: plain data with the line of each key."""
 
 import re
 from pathlib import Path
@@ -13,7 +13,7 @@ MAX_CONFIG_BYTES = 1_000_000
 
 
 class _Section(dict[str, Any]):
-    """A mapping of a YAML file that knows the line of each key."""
+    """A mapping of a YAML file with the line of each key."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -21,10 +21,10 @@ class _Section(dict[str, Any]):
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Plain YAML only: no tags, no aliases, no key twice.
+    """Plain YAML only: no tags, no aliases, no duplicate keys.
 
-    Bare words mean what YAML 1.2 says: PyYAML by itself would read ``010`` as 8, ``1:30`` as 90,
-    ``no`` as false and ``4e2`` as text.
+    Bare words have their YAML 1.2 meaning: PyYAML's default is to read ``010`` as 8, ``1:30`` as
+    90, ``no`` as false and ``4e2`` as text.
     """
 
     def compose_node(self, parent: Any, index: Any) -> Any:
@@ -90,7 +90,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _reason(error: Exception) -> str:
-    """What is wrong with a text and where, in one line."""
+    """The fault of a text and its place, in one line."""
     if isinstance(error, yaml.MarkedYAMLError) and error.problem and error.problem_mark:
         mark = error.problem_mark
         return f"{error.problem} (line {mark.line + 1}, column {mark.column + 1})"
@@ -98,7 +98,7 @@ def _reason(error: Exception) -> str:
 
 
 def to_yaml(config: Any) -> str:
-    """Text of a configuration, as `read_yaml` and `parse` read it."""
+    """YAML text of a configuration, for `read_yaml` and `parse`."""
     return yaml.dump(
         to_plain(config), Dumper=_StrictDumper, sort_keys=False, default_flow_style=None
     )

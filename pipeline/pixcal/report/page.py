@@ -23,7 +23,7 @@ from pixcal.report import (
 from pixcal.report.contents import Contents
 from pixcal.report.drawing import png
 
-# Each section is the template of its name.
+# sections, each with the template of its name
 SECTIONS = {
     "maps": "Maps of the offsets",
     "allan": "Allan deviation",
@@ -38,7 +38,7 @@ SECTIONS = {
 }
 WITHOUT_FRINGES = ("diagnosis", "detector", "masks", "provenance")
 
-# What templates may draw, tabulate and write.
+# functions that templates may use for figures, tables and text
 FIGURES = (
     vars(map_figures) | vars(set_figures) | vars(detector_figures)
     | vars(diagnosis_figures) | vars(diagnosis_maps)
@@ -47,7 +47,7 @@ DATA = vars(tables) | vars(diagnosis) | vars(diagnosis_maps)
 
 
 def render(contents: Contents) -> str:
-    """Draw all figures and write the page: HTML without any reference to something outside it."""
+    """Draw all figures and write the page: HTML without external references."""
     what = "pixel offsets" if contents.has_fringes else "detector"
     name = contents.acquisition["detector"].get("name")
     return _fill(
@@ -87,9 +87,9 @@ def _fill(template: str, contents: Contents, **values: Any) -> str:
 
 
 def _draw(figure: Figure) -> dict[str, Any]:
-    """A figure as a PNG that is part of the page, and its size there."""
+    """A figure as a PNG embedded in the page, and its size there."""
     data = base64.b64encode(png(figure)).decode("ascii")
-    # The size in the page is the figure's in inches at 106 px an inch: text of 10 pt is 15 px.
+    # The size in the page is the figure's at 106 px per inch, so text of 10 pt has 15 px.
     width, height = (round(v * 106) for v in figure.get_size_inches())
     return {"src": f"data:image/png;base64,{data}", "width": width, "height": height}
 

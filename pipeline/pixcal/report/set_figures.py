@@ -33,7 +33,7 @@ TURN = ("0", "π", "2π")  # labels of a phase axis
 
 
 def temporal(sets: Sequence[SetContents]) -> Figure:
-    """Parameters of each frame, a column for each set, and below how often each phase occurs."""
+    """Parameters of each frame, a column for each set, with histograms of the phase below."""
     moving = any(s.series.moving for s in sets)
     rows = 5 if moving else 3
     figure, grid = axes_grid(
@@ -41,7 +41,7 @@ def temporal(sets: Sequence[SetContents]) -> Figure:
         between=0.5,
     )  # fmt: skip
     for column, fringes in zip(grid.T, sets, strict=True):
-        step = -(-len(fringes.series.time) // 6000)  # of longer runs, every n-th frame
+        step = -(-len(fringes.series.time) // 6000)  # every n-th frame of longer runs
         time, clock = _clock(fringes.series.time[::step])
         for axes, (label, values) in zip(column, _parameters(fringes, moving), strict=False):
             size = float(np.clip(70 / np.sqrt(max(len(time), 1)), 1.2, 4.5))
@@ -77,7 +77,7 @@ def _parameters(fringes: SetContents, moving: bool) -> list[tuple[str, F64]]:
 
 
 def _phases(axes: Axes, phi: F64) -> None:
-    """How often each phase occurs, beside a uniform distribution."""
+    """Histogram of the phase, with a uniform distribution for comparison."""
     finite = phi[np.isfinite(phi)]
     count, edges = np.histogram(finite, PHASE_BINS, range=(0, 2 * np.pi))
     mean = len(finite) / PHASE_BINS
@@ -143,7 +143,7 @@ def allan_figure(sets: Mapping[str, tuple[Facts, Facts]]) -> Figure:
         (WIDE, 6.2), 2, 1, top=0.65, between=0.2, sharex=True, height_ratios=[3, 1.1]
     )
     curves = {
-        # Where there is no value, None becomes NaN.
+        # None (no value) becomes NaN.
         name: {key: np.array(measured.get(key) or (), dtype=float) for key in ALLAN_COLUMNS}
         for name, (measured, _) in sets.items()
     }
@@ -181,7 +181,7 @@ def _allan_lines(
     axes.errorbar(at, adev * unit.factor, bars * unit.factor, zorder=3, label=label, **drawing)
     below.errorbar(at, adev / white, bars / white, **drawing)
     law: dict[str, Any] = {"color": color, "lw": 1.5}
-    first = color == LINES[0]  # the legend says once what styles of lines mean
+    first = color == LINES[0]  # the legend explains line styles once
     axes.plot(frames, white * unit.factor, label="square-root law from σ" if first else None, **law)
     if facts.get("crb_median_px"):
         bound = facts["crb_median_px"] * np.sqrt(facts["frames"] / frames)

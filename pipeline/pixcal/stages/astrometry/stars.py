@@ -24,11 +24,11 @@ SAMPLINGS = (0.4, 40.0)  # range of pixels per lambda / D of the table of the pa
 BATCH = 16  # stars of a task
 # largest share of the position information in masked pixels at a usable place
 MAX_LOST = 0.1
-# errors of a star at a place: with pixels on a perfect grid or at the places of the maps; without
-# and with photon noise; and the first two as predicted by `centroids.Star.weights`
+# errors of a star at a place: with pixels on a perfect grid or at mapped positions; without and
+# with photon noise; and the first two as predicted by `star_centroids.Star.weights`
 KINDS = ("perfect", "measured", "perfect_photons", "measured_photons", "linear", "linear_measured")
-TILE = 512  # side of a task's part of the map, about, px
-SHOWN = 96  # most blocks along the longer side of the pictures of the whole detector
+TILE = 512  # approximate side of a task's part of the map, px
+SHOWN = 96  # most blocks along the longer side of the whole detector's pictures
 # least side of such a block, px: its rms needs a few independent places
 MIN_BLOCK = 8
 GRIDS = ("perfect", "measured")
@@ -64,7 +64,7 @@ class Telescope:
         return self.pitch_um * 1e-6 / self.focal_length_m * 180 / np.pi * 3600e6
 
     def psf(self, window: int | None) -> tuple[Psf, int]:
-        """The pattern in its pixels, and half of the window's side, px."""
+        """The pattern in the detector's pixels, and half of the window's side, px."""
         half = max(2, math.ceil(WINDOW * self.sampling)) if window is None else window // 2
         return diffraction_psf(self.sampling, self.obscuration, half), half
 
@@ -97,7 +97,7 @@ class Observation:
 def observe(detector: PixelPositions, plan: Observation, runtime: Runtime) -> F64:
     """Observe and fit stars all over the detector: errors (star, position, kind, component), px.
 
-    NaN at places that are not used, and where a fit has failed.
+    NaN at unused places and for failed fits.
     """
     batches = [range(n, min(n + BATCH, plan.stars)) for n in range(0, plan.stars, BATCH)]
     core = core_weights(plan.star, detector.axes)
@@ -157,22 +157,22 @@ def observe_star(detector: PixelPositions, plan: Observation, core: F64, number:
 
 @dataclass(frozen=True)
 class ErrorMaps:
-    """Error of a star in the middle of every pixel whose window lies on the detector."""
+    """Error of a star at the centre of every pixel whose window lies on the detector."""
 
-    # (grid, component, y, x) sum of squares over blocks, px²: pixels taken for a perfect grid,
-    # or where the maps say
+    # (grid, component, y, x) sum of squares over blocks, px², with pixels assumed on a perfect
+    # grid, or at mapped positions
     squares: F64
-    places: F64  # (y, x) pixels of the blocks that count
+    places: F64  # (y, x) number of valid pixels of the blocks
     block: int  # side of the blocks, px
 
     @property
     def mean_square(self) -> F64:
-        """Over the whole detector, (grid, component), px²; NaN where no place counts."""
+        """Mean over the whole detector, (grid, component), px²; NaN without valid pixels."""
         return np.asarray(self.squares.sum(axis=(2, 3)) / (self.places.sum() or np.nan))
 
     @property
     def rms(self) -> F64:
-        """Of each block, (grid, component, y, x), px; NaN where no place counts."""
+        """Rms of each block, (grid, component, y, x), px; NaN without valid pixels."""
         return np.sqrt(self.squares / np.where(self.places > 0, self.places, np.nan))
 
 
@@ -183,9 +183,9 @@ def tile_side(shape: tuple[int, int]) -> tuple[int, int]:
 
 
 def error_maps(folder: Path, detector: PixelPositions, star: Star, runtime: Runtime) -> ErrorMaps:
-    """Write the error at every place as arrays (y, x), px, and sum it up.
+    """Write the error at every pixel as arrays (y, x), px, and sum the squares.
 
-    ``perfect_<component>`` and ``measured_<component>`` are NaN at places that do not count.
+    ``perfect_<component>`` and ``measured_<component>`` are NaN at invalid pixels.
     """
     ny, nx = detector.shape
     side, block = tile_side(detector.shape)
@@ -212,7 +212,7 @@ def _tile(
     block: int,
     corner: tuple[int, int],
 ) -> F64:
-    """Write a part of the maps; sums over its blocks (map + 1, y, x) of squares and of places."""
+    """Write a part of the maps; sums over its blocks (map + 1, y, x): squares, valid pixels."""
     y, x = ((a, min(a + side, n)) for a, n in zip(corner, detector.shape, strict=True))
     errors = place_errors(detector, star, y, x)
     maps = errors.reshape(-1, *errors.shape[2:])
@@ -227,7 +227,7 @@ def _tile(
 def place_errors(
     detector: PixelPositions, star: Star, y: tuple[int, int], x: tuple[int, int]
 ) -> F64:
-    """Errors (grid, component, y, x), px, of stars in the middle of some pixels."""
+    """Errors (grid, component, y, x), px, of stars at the centres of given pixels."""
     half, (ny, nx) = star.half, detector.shape
     patch = detector.patch((y[0] - half, y[1] + half), (x[0] - half, x[1] + half))
     shape = (y[1] - y[0], x[1] - x[0])
@@ -237,7 +237,7 @@ def place_errors(
     kernels = np.conj(rfft2(weights, size))
 
     def sums(kernel: C128, values: F64) -> F64:
-        """Sum of the values about each place, (kernel of sums) weighted."""
+        """Weighted sums of the values around each place, by convolution."""
         spectrum = np.einsum("kl...,l...->k...", kernel, rfft2(values, size))
         return np.asarray(irfft2(spectrum, size)[:, : shape[0], : shape[1]])
 

@@ -1,9 +1,9 @@
 """The errors of the stars as the numbers of ``astrometry.json``, and as a table.
 
 True offsets t, errors of the maps e and their draw d are independent, e and d alike. Stars fitted
-on a perfect grid err by K(t + e + d), K being the weights of the pixels; those fitted where the
-maps say by K d. So the mean square by true offsets is that of the first less twice that of the
-second.
+on a perfect grid have errors K(t + e + d), K being the weights of the pixels; those fitted with
+mapped positions have errors K d. So the mean square due to true offsets is the first mean square
+minus twice the second.
 """
 
 import math
@@ -17,11 +17,11 @@ from pixcal.stages.astrometry.stars import KINDS
 
 TARGET_PX = 5e-5  # what a mission to Earth-like planets needs (paper, section 1)
 GRIDS = ("perfect", "measured")
-SEEN = 2.0  # a mean square is significant when it is so many of its errors above zero
+SEEN = 2.0  # least ratio of a significant mean square to its error
 
 
 class Value(NamedTuple):
-    """A number and its 1-sigma error by resampling the stars; NaN where there is none."""
+    """A number and its 1-sigma error by resampling the stars; NaN if undefined."""
 
     value: float
     error: float
@@ -30,8 +30,8 @@ class Value(NamedTuple):
 class GridComparison(NamedTuple):
     """Root mean square errors of centroids, px, and the ratio of both."""
 
-    # perfect, measured: pixels taken for a perfect grid, and where the maps say. `perfect` is
-    # NaN where the scatter of the offsets is not significant above the maps' errors
+    # perfect, measured: pixels assumed on a perfect grid, and at mapped positions. `perfect` is
+    # NaN if the scatter of the offsets is not significant above the maps' errors
     perfect: Value
     measured: Value
     gain: Value
@@ -48,10 +48,10 @@ class Row(NamedTuple):
 
 
 def compare(perfect: F64, measured: F64, noise: F64, rng: np.random.Generator) -> GridComparison:
-    """Root mean squares of errors (star, position), px, NaN where there are none.
+    """Root mean squares of errors (star, position), px, NaN where missing.
 
-    ``noise``: of the maps, whose mean square ``perfect`` holds twice; zero where they are the
-    truth.
+    ``noise``: errors due to the maps, whose mean square ``perfect`` contains twice; zero if the
+    truth is given.
     """
     columns = (perfect**2, measured**2, noise**2)
     good = np.isfinite(perfect) & np.isfinite(measured)
@@ -59,7 +59,7 @@ def compare(perfect: F64, measured: F64, noise: F64, rng: np.random.Generator) -
     rms, stars = _roots(sums.sum(axis=1)), sums.shape[1]
     picks = (np.bincount(rng.integers(0, stars, stars), minlength=stars) for _ in range(300))
     again = np.array([_roots(sums @ pick) for pick in picks])
-    # Squares: their errors are meaningful where the root of one does not exist.
+    # Squares, because their errors are meaningful even if they are negative.
     square_error = np.std(again[:, 3])
     if not rms[3] > SEEN * square_error:
         rms[0] = rms[2] = np.nan
@@ -69,7 +69,7 @@ def compare(perfect: F64, measured: F64, noise: F64, rng: np.random.Generator) -
 
 
 def _roots(sums: F64) -> F64:
-    """Perfect, measured, gain, and the first one's square, from sums of squares and a count."""
+    """Perfect, measured, gain, and square of the first, from sums of squares and a count."""
     perfect, measured, noise = sums[:3] / max(sums[3], 1)
     square = perfect - 2 * noise
     root = np.sqrt(square) if square > 0 else np.nan
@@ -106,7 +106,7 @@ def axis_facts(
         compared({kind: values[n] for kind, values in means.items()}, "_photons")
         for n in range(len(lengths))
     ]
-    # Two stars a row; an unpaired star is left out.
+    # Pairs of stars; an unpaired star is left out.
     last = {kind: values[-1] for kind, values in means.items()}
     pairs = {kind: v[1::2] - v[: len(v) // 2 * 2 : 2] for kind, v in last.items()}
     photons = compared(kinds, "_photons")
@@ -181,7 +181,7 @@ def with_error(value: float, error: float | None) -> str:
     """The value rounded to its error's first digit (two where that is a one)."""
     if not error or not math.isfinite(error):
         return scientific(value)
-    # What rounds up to a power of ten is written as one.
+    # A value that rounds up to a power of ten takes its exponent.
     exponent = math.floor(math.log10(abs(value) + error / 2))
     shown = 0 if -2 < exponent < 4 else exponent
     value, error = value / 10.0**shown, error / 10.0**shown

@@ -1,9 +1,9 @@
-"""``pixcal simulate``: an acquisition as a bench would write it, and the truth apart from it.
+"""``pixcal simulate``: an acquisition as a bench would write it, and its truth separately.
 
-The work is cut into pieces of some frames by some rows, which `pixcal.simulation.exposure` makes
-from the bench and its effects alone.
+The work is divided into tasks of a range of frames and rows, which `pixcal.simulation.exposure`
+computes from the bench and its effects only.
 
-The truth is a directory of its own: ``delta_x``, ``delta_y`` (px), ``response``, ``bias`` (ADU),
+The truth is a separate directory: ``delta_x``, ``delta_y`` (px), ``response``, ``bias`` (ADU),
 ``dark_rate`` (e-/s) and ``mask`` (`PixelFlag`) as FITS images; ``truth.json`` with the geometry of
 each set (``centre_px`` from the window's first pixel, ``kx`` and ``ky`` at its centre in rad/px)
 and its frames (``B``, ``A``, ``phi``, ``dkx``, ``dky``); and the bench file.
@@ -51,24 +51,24 @@ from pixcal.storage.manifest import (
 STAGE, TRUTH = STAGES["simulate"], STAGES["simulate-truth"]
 FRAMES_PER_TASK = 128  # frames for which the maps of a block of rows are computed once
 
-# peak of a task for each pixel of its rows: maps, phases in float64, one frame (measured)
+# peak memory of a task per pixel of its rows: maps, phases in float64, one frame (measured)
 _BYTES_PER_PIXEL = 160
 
-# for each pixel and frame that an effect looks back to: charge before and after, and its noise
+# per pixel and earlier frame that an effect needs: charge before and after, and its noise
 _BYTES_PER_FRAME_BACK = 12
 
-# peak of a task for each sample of a file that is compressed (measured)
+# peak memory of a task per sample of a compressed file (measured)
 _BYTES_PER_COMPRESSED_SAMPLE = 10
 
 _MJD_EPOCH = datetime(1858, 11, 17)
 Effects = tuple[Effect, ...]
 
-# maps that are told; read noise and gain of a simulated detector are the same in all pixels
+# maps in the truth; read noise and gain of a simulated detector are equal in all pixels
 TRUTH_MAPS = tuple(f for f in fields(DetectorMaps) if f.name not in ("read_noise", "adu_per_e"))
 
 
 class Exposes(Protocol):
-    """Some rows of a bench, as `Camera`."""
+    """A camera of a range of rows, such as `Camera`."""
 
     def expose(self, recording: Recording, frames: range) -> Iterator[tuple[int, U16]]:
         """Frames as in `Camera.expose`."""
@@ -76,15 +76,15 @@ class Exposes(Protocol):
 
 Cameras = Callable[[Bench, Rows, Effects], Exposes]
 
-# some frames of a recording, and the files (by number) that they go to
+# a range of frames of a recording, and their files by number
 Span = tuple[Recording, range, dict[int, FrameWriter]]
 
 
 def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
     """Simulate a bench (schema ``pixcal/bench/1``).
 
-    The directory appears when it is complete. The key of its manifest is a digest, so that it tells
-    nothing of the truth.
+    The directory appears when it is complete. The key of its manifest is a digest, so that it does
+    not reveal the truth.
     """
     plan = load_bench(bench)
     there = Target.of(out, "--out", STAGE)
@@ -119,7 +119,7 @@ def acquire(
 ) -> None:
     """Write an acquisition into an empty folder, without manifest or truth.
 
-    With these effects, whatever the bench names; ``camera`` makes the frames of some rows.
+    ``effects`` replace those that the bench names; ``camera`` makes the frames of a range of rows.
     """
     recorded = recordings(bench)
     runtime = _fitting(bench, recorded, effects, runtime)
@@ -128,7 +128,7 @@ def acquire(
 
 
 def _checked_effects(bench: Bench, where: Path, own: tuple[Path, ...]) -> Effects:
-    """Effects of a bench file, which must go together with the bench."""
+    """Effects of a bench file, which must be consistent with the bench."""
     found = parse_effects(bench.effects, str(where), known_effects(own))
     for effect in found:
         with naming(f"{where}: effects.{effect.name}"):
@@ -252,7 +252,7 @@ def _write_description(bench: Bench, folder: Path) -> None:
 
 
 def row_blocks(bench: Bench) -> list[Rows]:
-    """The window's rows, in blocks that are simulated at a time."""
+    """The window's rows, in blocks that are simulated separately."""
     ny, step = bench.detector.shape[0], synthesis.BLOCK_ROWS
     return [(row, min(row + step, ny)) for row in range(0, ny, step)]
 
@@ -304,12 +304,12 @@ def _set_truth(bench: Bench, effects: Effects, recording: Recording) -> dict[str
     }
 
 
-# The directories that it writes to: made aside, then put in place
+# Output directories, built at a temporary place and then moved
 
 
 @dataclass(frozen=True)
 class Target:
-    """A directory to write, the option that names it, and what it will hold."""
+    """A directory to write, the option that names it, and the kind of its contents."""
 
     final: Path
     option: str
@@ -317,11 +317,11 @@ class Target:
 
     @classmethod
     def of(cls, folder: Path, option: str, stage: ArtefactKind) -> "Target":
-        """Where a directory is, or will be made."""
+        """Target at a given directory, which may not exist yet."""
         try:
             folder = folder.resolve()
             folder.parent.mkdir(parents=True, exist_ok=True)
-        except (OSError, RuntimeError) as error:  # the latter for links in a circle
+        except (OSError, RuntimeError) as error:  # the latter for circular links
             raise InputError(
                 f"{option} {folder}: cannot be made ({error}); choose another"
             ) from error
@@ -329,11 +329,11 @@ class Target:
 
     @property
     def aside(self) -> Path:
-        """Where it is made."""
+        """Temporary place where the directory is built."""
         return self.final.with_name(f".{self.final.name}.partial")
 
     def up_to_date(self, key: str) -> Manifest | None:
-        """Manifest of what was made with this key and is whole, if it is."""
+        """Manifest of the present directory, if it has this key and is complete."""
         folder, place = self.final, f"{self.option} {self.final}"
         if not folder.exists():
             return None
@@ -355,7 +355,7 @@ class Target:
 
     @contextmanager
     def building(self) -> Iterator[Path]:
-        """An empty directory to make it in, gone at the end."""
+        """An empty temporary directory for the contents, removed at the end."""
         made = self.aside / "made"
         try:
             shutil.rmtree(made, ignore_errors=True)
@@ -365,7 +365,7 @@ class Target:
             shutil.rmtree(self.aside, ignore_errors=True)
 
     def put_in_place(self, key: str, config: dict[str, Any]) -> Manifest:
-        """Write the manifest and put what was made in place of what stood there."""
+        """Write the manifest and replace the present directory by the new one."""
         made, stage = self.aside / "made", self.stage
         summary = {"files": _sizes(made)}
         manifest = Manifest(stage.name, stage.format, key, config, {}, summary=summary)
