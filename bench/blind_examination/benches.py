@@ -1,4 +1,4 @@
-"""The bench of a case: its frames and its numbers are drawn without knowing the truth."""
+"""The bench of a case, drawn independently of the truth."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ from pixcal.model.bench import (
 
 PITCH_UM, WAVELENGTH_NM, DISTANCE_MM = 4.4, 632.8, 400.0
 LAMP_E_S = 1.2e6
-# of a ramp of the phase: near the golden angle, so that the phases of any run of frames spread
+# phase step of a ramp: near the golden angle, so that phases of any run of frames spread evenly
 STEP_RAD = (2.37, 2.43)
 
 
@@ -26,33 +26,33 @@ class Layout:
 
     shape: tuple[int, int]  # rows and columns
     frames: int  # of each fringe set
-    bias: int  # bias, dark, flat: frames; of flats those of each level
+    bias: int  # bias, dark, flat: number of frames; for flats per level
     dark: int
     flat: int
     second: float  # share of the cases with a second baseline along one axis
 
 
-# by the name of the size; `tiny` is for tests of the procedure, too small to find much
+# by name of the size; `tiny` is for tests of the procedure, too small to detect much
 LAYOUTS = {
     "tiny": Layout((33, 35), 60, 12, 8, 8, 0.0),
     "small": Layout((61, 67), 300, 60, 20, 20, 0.0),
     "standard": Layout((128, 128), 600, 100, 24, 24, 0.3),
 }
 
-MAX_SETS = 3  # fringe sets of a case at most
+MAX_SETS = 3  # most fringe sets of a case
 FLATS_S = (0.006, 0.014, 0.022, 0.03)
 
 
 def draw_bench(layout: Layout, rng: np.random.Generator) -> Bench:
     """A bench within the ranges of real ones.
 
-    One fringe set has random phases and the other a ramp: some effects are seen only with the one
-    or with the other.
+    One fringe set has random phases and the other a ramp, because some effects are detectable only
+    with one of these.
 
     Parameters
     ----------
     rng : numpy.random.Generator
-        Of the case's layout, which is not that of its truth.
+        For the case's layout, separate from that of its truth.
     """
     detector = SimulatedDetector(
         shape=layout.shape,
@@ -90,7 +90,7 @@ def draw_bench(layout: Layout, rng: np.random.Generator) -> Bench:
 
 
 def _sets(layout: Layout, rng: np.random.Generator) -> tuple[SimulatedSet, ...]:
-    """Two axes of different interfringe; in some cases a third set along one of them."""
+    """Two axes of different fringe period; in some cases a third set along one of them."""
     spacings = [rng.uniform(4.2, 5.6), rng.uniform(6.4, 9.0)]
     rng.shuffle(spacings)
     ramp = int(rng.integers(2))
@@ -119,5 +119,5 @@ def _sets(layout: Layout, rng: np.random.Generator) -> tuple[SimulatedSet, ...]:
 
 
 def _round(value: float) -> float:
-    """To four significant digits."""
+    """Round to four significant digits."""
     return float(f"{value:.4g}")

@@ -1,9 +1,9 @@
 """``pixcal blind make``: acquisitions whose effects are withheld, and the truth in a sealed file.
 
-Nothing but the samples depends on the truth. Folders, files, their sizes and headers, the frames
-and the bench are those that the case would have with any other effect; all times of files are the
-same; and all cases are copied into place at the end, one after the other, so that not even the
-hour of a file's birth tells how long its case took to make.
+Only the samples depend on the truth. Folders, files, their sizes and headers, the frames and the
+bench are the same as with any other effect; all file times are equal; and all cases are copied into
+place at the end, one after the other, so that a file's creation time does not reveal how long its
+case took to make.
 """
 
 import os
@@ -48,7 +48,7 @@ def make(out: Path, sealed: Path, config: MakeConfig, runtime: Runtime) -> Exami
     Raises
     ------
     InputError
-        If something stands in the way, or the truth would lie beside the cases.
+        If an output exists already, or the truth would lie inside the cases.
     """
     _check(out, sealed, config)
     seed = EXAMINATION + secrets.randbelow(MAX_SEED) if config.seed is None else config.seed
@@ -103,7 +103,7 @@ def _case(folder: Path, size: str, item: tuple[int, Bench, Truth]) -> None:
 
 
 def effects_of(truth: Truth, bench: Bench) -> tuple[Effect, ...]:
-    """The library's effects of a case, which go together with its bench."""
+    """The library's effects of a case, checked for consistency with its bench."""
     plain = {d.effect: d.parameters for d in truth.drawn}
     effects = parse_effects(plain, "blind")
     for effect in effects:
@@ -112,7 +112,7 @@ def effects_of(truth: Truth, bench: Bench) -> tuple[Effect, ...]:
 
 
 def _copied(aside: Path, names: Sequence[str]) -> Path:
-    """The cases together; none of them takes longer to copy than another."""
+    """Folder with all cases, copied so that copying times reveal nothing."""
     made = aside / "made"
     shutil.rmtree(made, ignore_errors=True)
     for name in names:

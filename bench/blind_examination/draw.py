@@ -1,4 +1,4 @@
-"""The cases of an examination: which effects, how strong, in which order."""
+"""Draw the cases of an examination: effects, strengths and order."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -25,13 +25,13 @@ PARTS = {
     LEFT_OUT: "self-check: the effect is no candidate",
 }
 SECOND = (SECOND_ONE, SECOND_NOTHING, SECOND_PAIR, SECOND_OTHER)
-# of the cases of each bench; both have as many
+# share of the cases of each bench; both benches have equal numbers
 SHARES = {
     "second": {SECOND_ONE: 0.55, SECOND_NOTHING: 0.25, SECOND_PAIR: 0.1, SECOND_OTHER: 0.1},
     "own": {ONE: 0.5, NOTHING: 0.16, SEVERAL: 0.17, LEFT_OUT: 0.17},
 }
 VISIBLE = 0.3  # least strength of the second bench's effects; 0 is barely visible
-# times the threshold that effects are at least, but for part 1, which begins at the threshold
+# least strength over the threshold, except in part 1, which begins at the threshold
 CLEAR = 2.0
 
 _TRUTH, _BENCH = 1, 2
@@ -44,7 +44,7 @@ class Drawn:
     effect: str
     way: str
     strength: float
-    # how many times the threshold that is; nobody knows that of the second bench
+    # strength over the threshold, which is unknown for the second bench
     times: float | None
     parameters: dict[str, Any]  # of the library's effect
 
@@ -54,14 +54,14 @@ class Truth:
     """Effects in a case, and the effect that a diagnosis may not consider."""
 
     part: int
-    left_out: str  # effect that is no candidate
+    left_out: str  # effect that is not a candidate
     drawn: tuple[Drawn, ...] = ()
-    # what the second bench is asked for, where it makes the frames
+    # request to the second bench, if it makes the frames
     second: SecondCase | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the effects."""
+        """Names of the effects."""
         return tuple(d.effect for d in self.drawn)
 
 
@@ -75,7 +75,7 @@ class Examination:
     notes: tuple[str, ...] = field(default=())
 
     def bench(self, number: int) -> Bench:
-        """Bench of a case; its random numbers have nothing to do with those of the truth."""
+        """Bench of a case; its random numbers are independent of those of the truth."""
         rng = np.random.default_rng([self.seed, _BENCH, number])
         return draw_bench(LAYOUTS[self.size], rng)
 
@@ -88,12 +88,12 @@ def draw_examination(cases: int, seed: int, size: str, bench: str = "both") -> E
     size : str
         One of `LAYOUTS`.
     bench : str
-        Whose cases: ``second``, ``own`` or ``both``.
+        Simulator of the cases: ``second``, ``own`` or ``both``.
 
     Raises
     ------
     InputError
-        If the second bench is wanted and cannot be run.
+        If the second bench is requested and cannot be run.
     """
     rng = np.random.default_rng([seed, _TRUTH])
     absent = catalogue()[2] if bench != "own" else ()
@@ -112,7 +112,7 @@ def draw_examination(cases: int, seed: int, size: str, bench: str = "both") -> E
 
 
 def _counts(cases: int, shares: dict[int, float]) -> dict[int, int]:
-    """Cases of each part: in proportion, the largest remainders rounded up."""
+    """Number of cases of each part, in proportion, with the largest remainders rounded up."""
     whole = sum(shares.values())
     exact = {part: cases * share / whole for part, share in shares.items()}
     counts = {part: int(value) for part, value in exact.items()}
@@ -137,7 +137,7 @@ def _part(part: int, count: int, size: str, rng: np.random.Generator) -> Iterato
 
 
 def _second(part: int, count: int, _size: str, rng: np.random.Generator) -> Iterator[Truth]:
-    """Cases of the second bench: effects in turn, and of each a law that frames can show."""
+    """Cases of the second bench: effects in turn, each with a law that frames can show."""
     variations, laws, _ = catalogue()
     of: dict[str, list[SecondLaw]] = {}
     for law in laws:
@@ -147,7 +147,7 @@ def _second(part: int, count: int, _size: str, rng: np.random.Generator) -> Iter
     for number in range(count):
         seed, strength = int(rng.integers(1 << 40)), float(rng.uniform(VISIBLE, 1))
         if part == SECOND_NOTHING:
-            # Half of them differ in everything at once.
+            # Half of them have all variations at once.
             case = next(others) if number % 2 else "ordinary"
             yield Truth(part, _absent((), rng), second=SecondCase(case, seed, strength))
             continue
@@ -162,7 +162,7 @@ def _second(part: int, count: int, _size: str, rng: np.random.Generator) -> Iter
 
 
 def _turns(names: list[str], rng: np.random.Generator) -> Iterator[str]:
-    """All names in random order, over and over."""
+    """All names in random order, repeatedly."""
     while True:
         yield from (names[n] for n in rng.permutation(len(names)))
 

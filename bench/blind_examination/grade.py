@@ -19,9 +19,9 @@ from blind_examination.offsets import AxisError
 from blind_examination.parameters import check_parameters
 from pixcal.effects import effects
 
-BLAMED = 0.5  # share of the gap from which an absent effect is blamed for most of it
-WITHIN = (1, 2, 3)  # errors that a parameter may be off
-WORST = 3  # statistics among which the place of an effect is looked for
+BLAMED = 0.5  # share of the gap above which an absent effect is blamed for most of it
+WITHIN = (1, 2, 3)  # allowed deviations of a parameter, in errors
+WORST = 3  # number of worst statistics that should include the domain of an effect
 
 Diagnosis = Mapping[str, Any]
 
@@ -33,22 +33,22 @@ class Grade:
     case: str
     part: int
     truth: tuple[str, ...]  # effects in the case
-    way: str  # how they come
-    times: float | None  # threshold times of the weakest
+    way: str  # their laws and strengths
+    times: float | None  # strength of the weakest over its threshold
     left_out: str
     verdict: str  # of the diagnosis; `failed` without one
     named: tuple[str, ...]  # causes in their order
-    marks: dict[str, bool]  # questions of the part, answered right or not
-    why: str  # what went wrong; empty where nothing did
-    # what was claimed of each cause: significance of its estimate, share of the gap closed, chance
+    marks: dict[str, bool]  # whether each question of the part was answered right
+    why: str  # reason of a wrong answer, or empty
+    # claims about each cause: significance of its estimate, share of the gap closed, p-value
     claims: tuple[dict[str, Any], ...] = ()
-    # where data and simulation differ most: domain, statistic, set, place
+    # largest differences of data and simulation: domain, statistic, set, place
     worst: tuple[dict[str, str], ...] = ()
     # of true effects that were found: name, true, found, error, and whether it is within one,
     # two and three errors
     parameters: tuple[dict[str, Any], ...] = ()
-    # closed, oracle: share of the gap closed by the causes named, and by the true effects as
-    # they are
+    # closed, oracle: share of the gap closed by the named causes, and by the true effects with
+    # their true parameters
     closed: float | None = None
     oracle: float | None = None
     offsets: tuple[AxisError, ...] = ()  # errors of the offsets along x and y
@@ -59,7 +59,7 @@ class Grade:
         return next(iter(self.marks.values()))
 
 
-# of each part; the first one decides
+# questions of each part; the first one decides
 QUESTIONS = {
     SECOND_ONE: ("named first", "nothing else named", "explained"),
     SECOND_NOTHING: ("no gap", "no cause claimed"),
@@ -78,9 +78,9 @@ def grade(case: str, truth: Truth, diagnosis: Diagnosis | None, error: str = "")
     Parameters
     ----------
     diagnosis : mapping, optional
-        ``diagnosis.json``; None where the case could not be diagnosed.
+        ``diagnosis.json``; None if the diagnosis failed.
     error : str
-        Why it could not.
+        Reason of the failure.
     """
     way = ", ".join(f"{d.effect}: {d.way} {d.strength:.3g}" for d in truth.drawn)
     times = min((d.times for d in truth.drawn if d.times is not None), default=None)
@@ -130,7 +130,7 @@ def _answers(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> tuple[
 
 
 def _domain_seen(truth: Truth, diagnosis: Diagnosis) -> bool:
-    """Whether the worst statistics are of a domain that the effect shows in."""
+    """Whether the worst statistics include a domain in which the effect is visible."""
     known = effects()
     domains = {domain for name in truth.names for domain in known[name].domains}
     worst = diagnosis["gap"]["where"][:WORST]

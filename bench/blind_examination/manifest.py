@@ -1,4 +1,4 @@
-"""The public manifest of an examination: ``blind.json`` beside its cases."""
+"""The public manifest of an examination: ``blind.json`` next to its cases."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,7 @@ from pixcal.storage.manifest import read_json, write_json
 SCHEMA = "pixcal/blind/1"
 FILE = "blind.json"
 RUNS = "runs"
-EXAMINATION = 1000  # seeds from here on are for examinations, those below for development
+EXAMINATION = 1000  # lowest seed of examinations; lower ones are for development
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class ExaminationManifest:
     purpose: str  # examination or development
     size: str
     commitment: str  # to the truth
-    without: tuple[str, ...]  # of each case, the effect that is no candidate
+    without: tuple[str, ...]  # effect of each case that is not a candidate
 
     @property
     def cases(self) -> tuple[str, ...]:
@@ -36,12 +36,12 @@ def case_name(number: int) -> str:
 
 
 def purpose_of(seed: int) -> str:
-    """Purpose of the cases of a seed."""
+    """Purpose of cases drawn with a seed."""
     return "examination" if seed >= EXAMINATION else "development"
 
 
 def write_manifest(folder: Path, examination: Examination, commitment: str) -> None:
-    """Write it into the folder of the cases."""
+    """Write the manifest into the folder of the cases."""
     without = tuple(truth.left_out for truth in examination.truths)
     purpose = purpose_of(examination.seed)
     manifest = ExaminationManifest(SCHEMA, purpose, examination.size, commitment, without)
@@ -49,7 +49,7 @@ def write_manifest(folder: Path, examination: Examination, commitment: str) -> N
 
 
 def read_manifest(folder: Path) -> ExaminationManifest:
-    """Read it.
+    """Read the manifest.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""``pixcal blind score``: the seal is opened, and every case compared with its truth."""
+"""``pixcal blind score``: open the seal and compare every case with its truth."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -31,12 +31,12 @@ _TIMED = ("diagnosis", "maps")
 def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> dict[str, Any]:
     """Score an examination: ``score.json`` and ``score.md`` in its folder.
 
-    Cases that were not run yet are counted as missing, and not scored.
+    Cases that were not run yet count as missing and are not scored.
 
     Parameters
     ----------
     folder : Path
-        Of the cases.
+        Folder of the cases.
     sealed : Path
         The truth.
 
@@ -48,13 +48,13 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
     Raises
     ------
     InputError
-        If the truth is not the one that the cases were made with, no case was run, or examinations
-        of several sizes are given.
+        If the truth does not belong to the cases, no case was run, or examinations of several
+        sizes are given.
     """
     exams = [(folder, sealed), *config.also]
     _require_alike([own for own, _ in exams])
     if config.write is not None:
-        # Before the minutes that scoring takes.
+        # Check this first, as scoring takes minutes.
         around_table(config.write, read_manifest(folder).size)
     marked = [_marked(own, truth, config, runtime) for own, truth in exams]
     first = marked[0]
@@ -65,7 +65,7 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
     result = summary([g for grades, _ in named for g in grades]) | {
         "schema": SCHEMA,
         "purpose": "development" if "development" in purposes else "examination",
-        # Who has it can draw the cases that are still to be run.
+        # With the seed, anybody could draw the cases still to be run.
         "seed": None if missing else seeds[0] if len(seeds) == 1 else seeds,
         "size": first.manifest.size,
         "made": sum(len(one.manifest.cases) for one in marked),
@@ -107,7 +107,7 @@ class _Marked:
     missing: list[str]
 
     def named(self, apart: bool) -> tuple[list[Grade], list[str]]:
-        """Grades, and cases that are missing; with the folder's name where there are several."""
+        """Grades, and missing cases; with the folder's name if there are several folders."""
         if not apart:
             return self.grades, self.missing
         place = self.folder.resolve().name
@@ -137,7 +137,7 @@ def _marked(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -
 
 
 def _is_done(run_dir: Path) -> bool:
-    """Whether a case was diagnosed, or could not be."""
+    """Whether a case was diagnosed, or failed."""
     return (run_dir / DIAGNOSIS).is_file() or (run_dir / FAILED).is_file()
 
 
@@ -174,7 +174,7 @@ def _graded(folder: Path, manifest: ExaminationManifest, opened: Sealed, number:
 def _summary_of_runs(cases: Sequence[Path]) -> dict[str, Any]:
     """Versions of the code that diagnosed the cases, their times, and failures.
 
-    One is right: what was changed after a part of the seal was opened is no blind examination.
+    There should be one version: after changes with part of the seal open, it is not blind.
     """
     files = [case / DONE for case in cases]
     runs = [_case_run(file) for file in files if file.is_file()]
@@ -195,7 +195,7 @@ def _case_run(file: Path) -> dict[str, Any]:
 def _with_oracle(
     folder: Path, opened: Sealed, grades: Mapping[int, Grade], config: ScoreConfig, runtime: Runtime
 ) -> list[Grade]:
-    """Grades with what the true effects close, and where; of some cases of parts 1 and 4."""
+    """Grades with the gap that true effects close, for a number of cases of parts 1 and 4."""
     numbers = [n for n, g in grades.items() if g.part in (ONE, LEFT_OUT) and g.verdict != "failed"][
         : config.oracle
     ]

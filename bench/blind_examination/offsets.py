@@ -1,7 +1,7 @@
 """Errors of the offset maps of a case against its truth, as fitted and as corrected.
 
-What the data cannot tell from the bench (piston, the modes of the fitted fringes and those that
-free intensities leave) is taken off the difference; the rest is given in Cramér-Rao bounds.
+Modes that are degenerate with the bench (piston, modes of the fitted fringes and of the free
+intensities) are removed from the difference; the rest is given in Cramér-Rao bounds.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ F64 = NDArray[np.float64]
 Sets = Mapping[str, Mapping[str, Any]]
 
 AXES = ("x", "y")
-BIASED = 1.1  # bounds from which the error of a map as fitted is more than noise
+BIASED = 1.1  # ratio to the bound above which the error of a fitted map is more than noise
 
 
 @dataclass(frozen=True)
@@ -37,16 +37,16 @@ class AxisError:
     """Error of the offsets along one axis."""
 
     axis: str  # `x` or `y`
-    bound_px: float  # Cramér-Rao bound of an offset, that of the ordinary fit
+    bound_px: float  # Cramér-Rao bound of an offset in the ordinary fit
     # before, after: root mean square of the error over the bound, of the maps as fitted and as
-    # corrected; the same where nothing was corrected
+    # corrected; equal without a correction
     before: float
     after: float
     pull: float  # root mean square of the error over `SIGMA`, as fitted
 
     @property
     def biased(self) -> bool:
-        """Whether the map as fitted is off by more than noise."""
+        """Whether the error of the fitted map exceeds noise."""
         return self.before > BIASED
 
 
@@ -67,9 +67,7 @@ def offset_errors(
     ----------
     products : Path
         Folder of the maps, as ``pixcal fit --with-diagnosis`` leaves it.
-    acquisition : Path
-        Of the case.
-    bench : Bench
+    acquisition, bench : Path, Bench
         Of the case.
     layout : Layout
         Of its examination.
@@ -106,7 +104,7 @@ def offset_errors(
 
 
 def _bound(sets: Sets, axis: int) -> float:
-    """Bound of the offset along x or y, of all sets together, px."""
+    """Bound of the offset along x or y from all sets together, px."""
     information = np.zeros((2, 2))
     for facts in sets.values():
         information += np.outer(facts["axis"], facts["axis"]) / facts["crb_median_px"] ** 2
@@ -116,7 +114,7 @@ def _bound(sets: Sets, axis: int) -> float:
 def _modes(
     products: Path, sets: Sets, acquisition: Acquisition, axis: int, shape: tuple[int, int]
 ) -> F64:
-    """What the fit took off the maps of the sets that are felt along an axis, (mode, y, x)."""
+    """Modes removed from the maps of the sets that contribute to an axis, (mode, y, x)."""
     y, x = np.arange(shape[0], dtype=float)[:, None], np.arange(shape[1], dtype=float)[None, :]
     modes = []
     for facts in sets.values():
@@ -128,7 +126,7 @@ def _modes(
 
 
 def _less_modes(error: F64, modes: F64) -> F64:
-    """An error map (y, x) less the modes; NaN stay NaN."""
+    """An error map (y, x) minus the modes; NaN stay NaN."""
     good = np.isfinite(error)
     scaled = modes / np.sqrt((modes**2).mean(axis=(1, 2)))[:, None, None]
     taken = np.linalg.lstsq(scaled[:, good].T, error[good], rcond=None)[0]

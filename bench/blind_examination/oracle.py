@@ -1,8 +1,8 @@
 """Share of the gap that the true effects close, with their true parameters.
 
-They are simulated as a candidate of the diagnosis is, on the same frames, against the same
-reference and by the same statistics; what then is left is the share that nobody could do better
-than. That costs about what the diagnosis costs, so it is done for some cases.
+They are simulated like a candidate of the diagnosis, on the same frames, against the same reference
+and with the same statistics; the remainder is the least possible residual gap. This takes about as
+long as the diagnosis, so it is done for a number of cases only.
 """
 
 import shutil
@@ -32,7 +32,7 @@ from pixcal.stages.diagnose.search import CONFIRM
 from pixcal.stages.diagnose.trial import Trials
 from pixcal.storage.manifest import read_json
 
-EXPLAINS = 0.5  # share of a statistic's gap that the true effects leave at most where they cause it
+EXPLAINS = 0.5  # largest share of a statistic's gap left by the true effects if they cause it
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Oracle:
     """Effect of the true effects on the gap."""
 
     closed: float  # share of the gap that they close
-    causes: frozenset[tuple[str, str]]  # statistics, of sets, that differ because of them
+    causes: frozenset[tuple[str, str]]  # statistics, by set, that differ because of them
 
 
 def ask_oracle(

@@ -1,4 +1,4 @@
-"""Whether the parameters of a diagnosis are those of the truth, within their errors."""
+"""Compare the parameters of a diagnosis with the truth, given their errors."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,19 +21,19 @@ class ParameterCheck:
     error: float
 
     def within(self, errors: float) -> bool:
-        """Whether it is off by at most some times its error."""
+        """Whether it deviates by at most a number of its errors."""
         return abs(self.estimate - self.true) <= errors * self.error
 
 
 def check_parameters(
     effect: str, true: Plain, estimated: Plain, errors: Mapping[str, float]
 ) -> list[ParameterCheck]:
-    """Every parameter that the diagnosis gives an error of.
+    """Checks of every parameter for which the diagnosis gives an error.
 
     Parameters
     ----------
     true : mapping
-        Parameters as in a bench file; those that are missing have their defaults.
+        Parameters as in a bench file; missing ones have their defaults.
     estimated : mapping
         All parameters.
     errors : mapping

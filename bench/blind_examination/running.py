@@ -1,7 +1,7 @@
-"""``pixcal blind run``: every case is ingested, reduced and diagnosed; the truth is not needed.
+"""``pixcal blind run``: ingest, reduce and diagnose every case, without the truth.
 
-Its offset maps are fitted, and corrected by what was diagnosed: the products stay, whatever is
-large goes.
+Its offset maps are fitted, and corrected for the diagnosed causes. Products are kept, large files
+removed.
 """
 
 import math
@@ -27,26 +27,26 @@ from pixcal.storage.manifest import read_json, write_json
 PRODUCTS = "products"
 DIAGNOSIS = Path(PRODUCTS) / "diagnosis.json"
 FAILED = "failed.json"
-# of a case that is done: by which code, in how many seconds, and why there are no maps
+# for a finished case: version of the code, duration, and reason if there are no maps
 DONE = "sat.json"
-BEGUN = "begun.json"  # of a case: by which code
-MIN_BYTES = 1 << 30  # of a case on a cluster, whose workers have limits of their own
+BEGUN = "begun.json"  # for a case in progress: version of the code
+MIN_BYTES = 1 << 30  # of a case on a cluster, whose workers have their own limits
 # artefacts that are removed once a case is diagnosed
 LARGE = ("ingest", "reduce", "sweep", "fit", "corrected")
 
 
 def run(folder: Path, config: RunConfig, runtime: Runtime) -> tuple[int, int]:
-    """Diagnose the cases of a folder; those that were diagnosed before are skipped.
+    """Diagnose the cases of a folder, except those diagnosed before.
 
     Returns
     -------
     (int, int)
-        Cases that were diagnosed now, and those that could not be.
+        Numbers of cases diagnosed now, and of failures.
 
     Raises
     ------
     InputError
-        If the folder holds no examination.
+        If the folder has no examination.
     PlanError
         If a case does not fit the memory.
     """
@@ -68,14 +68,14 @@ def share(what: str, size: str, cases: int, runtime: Runtime) -> tuple[Runtime, 
     Parameters
     ----------
     what : str
-        Is done, for messages.
+        Name of the work, for messages.
     size : str
         Of the examination.
 
     Returns
     -------
     (Runtime, Runtime)
-        Over the cases, and of each.
+        For all cases, and for each case.
 
     Raises
     ------
@@ -92,20 +92,20 @@ def share(what: str, size: str, cases: int, runtime: Runtime) -> tuple[Runtime, 
     if min(cases, plan.workers) <= 1:
         return over, replace(runtime, quiet=True)
     memory = (runtime.memory - BASE_BYTES) // min(cases, plan.workers)
-    # Processes have an interpreter each; threads share theirs.
+    # Each process has its own interpreter; threads share one.
     return over, Runtime("sync", memory=memory + BASE_BYTES * (runtime.cluster == "threads"))
 
 
 def _case(
     folder: Path, config: RunConfig, code: str, runtime: Runtime, item: tuple[str, str]
 ) -> bool:
-    """Diagnose a case; gives whether that failed.
+    """Diagnose a case; returns whether it failed.
 
-    Whatever breaks the diagnosis is a case answered wrong, and no end of the examination.
+    A failed diagnosis is a wrong answer, and does not end the examination.
     """
     name, left_out = item
     run_dir = folder / RUNS / name
-    # What other code has left is not gone on with: a case is one version's.
+    # Do not continue the work of another version: a case belongs to one version.
     if config.again or _begun_by(run_dir) != code:
         shutil.rmtree(run_dir, ignore_errors=True)
     run_dir.mkdir(parents=True, exist_ok=True)
@@ -133,7 +133,7 @@ def _case(
 
 
 def _begun_by(run_dir: Path) -> str | None:
-    """Version of the code that a case was begun with, if known."""
+    """Version of the code that began a case, if known."""
     try:
         return str(read_json(run_dir / BEGUN)["code"])
     except (DamagedError, FileNotFoundError, LookupError, TypeError):
@@ -146,7 +146,7 @@ def _write_done(run_dir: Path, code: str, seconds: Mapping[str, float], no_maps:
 
 
 def _fit_maps(run_dir: Path, runtime: Runtime) -> str:
-    """Make the offset maps, as fitted and as corrected; gives why there are none."""
+    """Make the offset maps, as fitted and as corrected; returns the reason if there are none."""
     try:
         correct.run(run_dir, correct.Config(), runtime)
     except (ClusterError, PlanError, OSError, MemoryError):

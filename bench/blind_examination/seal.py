@@ -1,7 +1,7 @@
-"""The sealed file: the truth of an examination, and the commitment to it that is made in the open.
+"""The sealed file: the truth of an examination, and the public commitment to it.
 
-The commitment is a SHA-256 of the truth with a random salt that only the sealed file holds: it
-tells nothing, and nobody can change the truth afterwards.
+The commitment is a SHA-256 of the truth with a random salt that only the sealed file has: it
+reveals nothing, and nobody can change the truth afterwards.
 """
 
 import hashlib
@@ -31,7 +31,7 @@ class Sealed:
 
 
 def write_seal(path: Path, examination: Examination, benches: tuple[Bench, ...]) -> str:
-    """Write the truth where only its owner reads it; gives the commitment."""
+    """Write the truth, readable by its owner only; returns the commitment."""
     plain = to_plain(Sealed(SCHEMA, secrets.token_hex(32), examination, benches))
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, plain)
@@ -45,7 +45,7 @@ def read_seal(path: Path, commitment: str) -> Sealed:
     Raises
     ------
     InputError
-        If it is not there, or not what the commitment was made to.
+        If it is missing, or does not match the commitment.
     """
     if not path.is_file():
         raise InputError(

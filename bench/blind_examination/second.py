@@ -1,4 +1,4 @@
-"""Cases of the second bench, which shares no code with pixcal and runs as a program of its own."""
+"""Cases of the second bench, a separate program that shares no code with pixcal."""
 
 import importlib.util
 import json
@@ -22,7 +22,7 @@ F64 = NDArray[np.float64]
 
 PROGRAM = "second_bench"
 NEEDED = ("hcipy", "galsim")
-BIAS, FLATS = 40, 40  # frames of a case, but for the smallest sizes, which have fewer
+BIAS, FLATS = 40, 40  # frames of a case; the smallest sizes have fewer
 INSTALL = "install them with 'pip install pixcal[second-bench]'"
 
 
@@ -37,7 +37,7 @@ class SecondLaw:
     unit: str
     known: bool  # known, decidable: whether pixcal has the effect, and whether frames can show it
     decidable: bool
-    needs: str  # a package
+    needs: str  # required package
 
     def size(self, strength: float) -> float:
         """Size of the effect, in its unit."""
@@ -58,13 +58,13 @@ def _there(package: str) -> bool:
 
 
 def missing() -> list[str]:
-    """Packages that the second bench needs and that are not installed."""
+    """Packages that the second bench needs but that are not installed."""
     return [name for name in (PROGRAM, *NEEDED) if not _there(name)]
 
 
 @cache
 def catalogue() -> tuple[tuple[str, ...], tuple[SecondLaw, ...], tuple[str, ...]]:
-    """Variations of ordinary benches, laws that can be made here, and packages that others need.
+    """Variations of ordinary benches, available laws, and missing packages for other laws.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def catalogue() -> tuple[tuple[str, ...], tuple[SecondLaw, ...], tuple[str, ...]
 
 
 def _asked(*line: str | Path) -> str:
-    """Standard output of the program."""
+    """Standard output of the program for given arguments."""
     command = [sys.executable, "-m", PROGRAM, *map(str, line)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -96,7 +96,7 @@ def _asked(*line: str | Path) -> str:
 
 
 def _options(case: SecondCase, layout: Layout) -> Sequence[str]:
-    # It may come from a file, and must not pass for an option.
+    # The case may come from a file, and must not be taken for an option.
     if not re.fullmatch(r"[a-z0-9_]+(/[a-z0-9_]+)?(\+[a-z0-9_]+(/[a-z0-9_]+)?)*", case.case):
         raise InputError(f"{case.case!r}: not a case of the second bench; give another sealed file")
     many = min(FLATS, layout.frames // 2)
@@ -108,7 +108,7 @@ def _options(case: SecondCase, layout: Layout) -> Sequence[str]:
 
 
 def record_second(case: SecondCase, layout: Layout, out: Path) -> None:
-    """Record a case into a folder that is not there yet."""
+    """Record a case into a new folder."""
     with tempfile.TemporaryDirectory(prefix="pixcal-second-") as scratch:
         truth = Path(scratch) / "truth.json"
         _asked(*_options(case, layout), "--out", out, "--truth", truth)

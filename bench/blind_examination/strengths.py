@@ -1,4 +1,4 @@
-"""Strengths of the effects: from the detection threshold to ten times that."""
+"""Strengths of the effects, from the detection threshold to ten times the threshold."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,32 +17,32 @@ class Variant:
     """A variant of an effect."""
 
     effect: str
-    strength: str  # what its strength is, for people
-    # small, standard: threshold: strength that an estimate on half of the frames sees with
-    # about four sigmas, on the middle bench of each size
+    strength: str  # meaning of its strength, in words
+    # small, standard: threshold, the strength detected on half of the frames with about four
+    # sigmas, on the middle bench of each size
     small: float
     standard: float
-    # parameters of the effect, from a strength and random numbers for all that is left open
+    # parameters of the effect, from a strength and random numbers for all others
     make: Make
 
     def threshold(self, size: str) -> float:
-        """Of an examination's size."""
+        """Threshold for an examination's size."""
         return self.small if size == "small" else self.standard
 
 
 def _around(size: float, rng: np.random.Generator) -> list[float]:
-    """A vector of some length in any direction."""
+    """A vector of given length in a random direction."""
     angle = rng.uniform(0, 2 * np.pi)
     return [float(size * np.cos(angle)), float(size * np.sin(angle))]
 
 
 def _between(low: float, high: float, rng: np.random.Generator) -> float:
-    """Log-uniform."""
+    """A log-uniform random number."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
 def _either(size: float, rng: np.random.Generator) -> float:
-    """Of either sign."""
+    """The size with a random sign."""
     return size if rng.random() < 0.5 else -size
 
 

@@ -1,4 +1,4 @@
-"""From light to samples, frame by frame."""
+"""Samples from light, frame by frame."""
 
 from collections.abc import Iterator
 
@@ -37,7 +37,7 @@ def samples(bench: Bench, lights: list[Light], run: Run, index: int) -> NDArray[
 
 
 def mean_electrons(bench: Bench, lights: list[Light], run: Run, index: int) -> F64:
-    """Electrons that light and dark current make on average."""
+    """Mean electrons of light and dark current."""
     if run.kind == "bias":
         return np.zeros(bench.shape)
     if run.kind == "dark":

@@ -1,4 +1,4 @@
-"""A case: a bench, and what is wrong with it."""
+"""A case: a bench with its effects."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +14,7 @@ ORDINARY = "ordinary"
 
 
 class CaseError(ValueError):
-    """A case that there is not."""
+    """A case that does not exist."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ def make_case(
     seed : int
     layout : Layout
     strength : float, optional
-        From 0 (barely visible) to 1 (strong); without it the seed decides.
+        From 0 (barely visible) to 1 (strong); by default drawn from the seed.
     plain : bool
-        Whether the bench has no ordinary variations beside the effects.
+        Whether the bench has no ordinary variations besides the effects.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Variations of ordinary benches that are met less often: the camera, the phases and the levels."""
+"""Less common variations of ordinary benches: the camera, the phases and the levels."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ def vary_camera(bench: Bench, varied: set[str]) -> None:
     """Read noise, gain and hot pixels."""
     shape = bench.shape
     if "noise_tail" in varied:
-        # Every pixel of a CMOS sensor has an amplifier of its own; some are much noisier.
+        # Every pixel of a CMOS sensor has its own amplifier; a few are much noisier.
         rng = stream(bench.seed, "noise tail")
         tail = rng.uniform(0.1, 0.5)
         bench.read_noise_e *= (1 + rng.exponential(tail, shape)) * rng.lognormal(0, 0.1, shape)
@@ -55,7 +55,7 @@ def vary_light(bench: Bench, varied: set[str]) -> None:
 
 
 def vary_runs(bench: Bench, varied: set[str]) -> None:
-    """Phases that miss their steps, and frames that did not arrive whole."""
+    """Irregular phase steps, and incomplete frames."""
     for run in bench.fringe_runs():
         rng = stream(bench.seed, "frames", run.name)
         if "phase_errors" in varied:
@@ -70,7 +70,7 @@ def vary_runs(bench: Bench, varied: set[str]) -> None:
 
 
 def _cut_frames(bench: Bench) -> None:
-    """The transfer of one or two frames of a set stops at some row; the rest is zero."""
+    """The transfer of one or two frames of a set stops at a random row; the rest is zero."""
     cut: dict[tuple[str, int], int] = {}
     for run in bench.fringe_runs():
         rng = stream(bench.seed, "bad frames", run.name)
@@ -88,5 +88,5 @@ def _cut_frames(bench: Bench) -> None:
 
 
 def without_dropped(phase: F64, lost: int, rng: np.random.Generator) -> F64:
-    """Phases of a run of which some frames were never written."""
+    """Phases of a run with missing frames."""
     return np.delete(phase, rng.choice(np.arange(WARM_UP, len(phase)), lost, replace=False))

@@ -1,4 +1,4 @@
-"""What the bench is made of: beams, runs of frames, and the detector."""
+"""Parts of the bench: beams, runs of frames, and the detector."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ MARGIN = 4
 
 
 def stream(seed: int, *names: str | int) -> np.random.Generator:
-    """Random numbers of their own for a purpose."""
+    """Separate random numbers for a purpose."""
     return np.random.default_rng([seed, *(crc32(str(name).encode()) for name in names)])
 
 
@@ -34,7 +34,7 @@ class Beam:
     tip_mm : ndarray (3,)
         Position from the centre of the plane at the nominal distance, z towards the detector.
     aim_mm : ndarray (2,)
-        Where the axis of the beam meets the detector, from the centre of the window.
+        Intersection of the beam's axis with the detector, from the centre of the window.
     waist_um : float
         1/e^2 radius of the fibre's mode.
     amplitude : float
@@ -80,7 +80,7 @@ class FringeSet:
 
 @dataclass
 class Run:
-    """Consecutive frames of one kind, the unrecorded ones included.
+    """Consecutive frames of one kind, including unrecorded ones.
 
     Attributes
     ----------
@@ -117,14 +117,14 @@ class Run:
 
     @property
     def frames(self) -> int:
-        """Frames, the unrecorded ones included."""
+        """Number of frames, including unrecorded ones."""
         return len(self.phase)
 
 
 def new_run(
     name: str, kind: str, count: int, rows: int, exptime_s: float, start_s: float, number: int = 0
 ) -> Run:
-    """A run in which nothing changes with time."""
+    """A run without any change in time."""
     n = count + WARM_UP
     return Run(
         name, kind, exptime_s, start_s, number, np.zeros(n), np.ones((n, 2)), np.ones(n),
@@ -165,12 +165,12 @@ class Bench:
     sets : list of FringeSet
     runs : list of Run
     charge, signal, offset, samples : list of callables
-        Steps on collected electrons, on the voltage that they make, on what readout adds (e-), and
-        on samples before they are rounded (ADU).
+        Steps on collected electrons, on their voltage, on offsets of the readout (e-), and on
+        samples before rounding (ADU).
     notes : dict
         Ordinary variations that were drawn.
     stamped : bool
-        Whether headers tell when and for how long a frame was exposed.
+        Whether headers have the time and duration of exposures.
     """
 
     seed: int

@@ -67,7 +67,7 @@ def field_of(bench: Bench, beam: Beam, mode: Any = lp01) -> C128:
     y = (y + bench.delta_y) * bench.pitch_um * 1e-3
     far, (sx, sy, sz) = bench.distance_mm, beam.tip_mm
     path = np.sqrt((x - sx) ** 2 + (y - sy) ** 2 + (far - sz) ** 2)
-    # The path less the distance, without the cancellation.
+    # The path minus the distance, without cancellation.
     beyond = ((x - sx) ** 2 + (y - sy) ** 2 - 2 * far * sz + sz**2) / (path + far)
     axis = np.array([*beam.aim_mm, far]) - beam.tip_mm
     axis /= np.linalg.norm(axis)
@@ -84,7 +84,7 @@ def field_of(bench: Bench, beam: Beam, mode: Any = lp01) -> C128:
 
 @dataclass(frozen=True)
 class Light:
-    """Light of a fringe set, in electrons (y, x): of each fibre, and the term that interferes."""
+    """Light of a fringe set, in electrons (y, x): each fibre, and the interference term."""
 
     first: F64
     second: F64

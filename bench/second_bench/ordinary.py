@@ -1,4 +1,4 @@
-"""Benches on which nothing is wrong, in the variety in which they come."""
+"""Benches without faults, in their usual variety."""
 
 from dataclasses import dataclass
 
@@ -80,14 +80,14 @@ def draw_variations(seed: int) -> set[str]:
 
 
 def draw_bench(layout: Layout, seed: int, varied: set[str]) -> Bench:
-    """A bench on which nothing is wrong.
+    """A bench without faults.
 
     Parameters
     ----------
     layout : Layout
     seed : int
     varied : set of str
-        Of `VARIATIONS`: in what the bench is not as plain as can be.
+        Of `VARIATIONS`: deviations from the simplest bench.
     """
     rng = stream(seed, "detector")
     shape = layout.shape
@@ -145,7 +145,7 @@ def _vary_detector(bench: Bench, varied: set[str]) -> None:
         bench.read_noise_e[noisy] *= rng.uniform(2, 8, noisy.sum())
         bench.notes["noisy_pixels"] = int(noisy.sum())
     if "declared_gain" in varied:
-        # Flats tell better than the data sheet.
+        # Flats measure it better than the data sheet says.
         wrong = float(rng.choice([-1, 1])) * rng.uniform(0.01, 0.1)
         bench.declared_gain *= 1 + wrong
         bench.notes["declared_gain"] = bench.declared_gain
@@ -166,7 +166,7 @@ def _dust(bench: Bench, specks: int, rng: np.random.Generator) -> F64:
 
 
 def _stitch(bench: Bench) -> None:
-    """Masks of the foundry that were laid side by side, each off by a little."""
+    """Adjacent masks of the foundry, each with a small misalignment."""
     rng = stream(bench.seed, "stitches")
     size, first = rng.integers(20, 70, 2), rng.integers(0, 60, 2)
     rms = rng.uniform(1e-3, 4e-3)
@@ -181,7 +181,7 @@ def _stitch(bench: Bench) -> None:
 
 
 def _lamp(bench: Bench) -> F64:
-    """Light of the flats, which falls off to one side."""
+    """Light of the flats, which decreases towards one side."""
     rng = stream(bench.seed, "lamp")
     x, y = bench.grid()
     u, v = x / bench.shape[1], y / bench.shape[0]
@@ -192,7 +192,7 @@ def _lamp(bench: Bench) -> F64:
 
 
 def _amplifiers(bench: Bench, rng: np.random.Generator) -> None:
-    """Two halves or four quarters with gains and offsets of their own."""
+    """Two halves or four quarters with different gains and offsets."""
     ny, nx = bench.shape
     count = int(rng.choice([2, 4]))
     gains, offsets = rng.uniform(-0.01, 0.01, count), rng.uniform(-20, 20, count)
@@ -201,7 +201,7 @@ def _amplifiers(bench: Bench, rng: np.random.Generator) -> None:
         columns = (slice(0, nx // 2), slice(nx // 2, nx))[n % 2]
         bench.relative_gain[rows, columns] = 1 + gains[n]
         bench.bias_adu[rows, columns] += offsets[n] / bench.gain_e_per_adu
-    # The declared gain is that of all amplifiers together.
+    # The declared gain is the mean of all amplifiers.
     bench.relative_gain /= bench.relative_gain.mean()
     bench.notes["amplifiers"] = gains.tolist()
 
@@ -214,12 +214,12 @@ def _draw_sets(bench: Bench, varied: set[str]) -> list[FringeSet]:
         period = np.exp(rng.uniform(np.log(5), np.log(20))) if "period" in varied else 9.0
         if "long_period" in varied:
             period = stream(bench.seed, "long period", name).uniform(20, 32)
-        # Fewer than two fringes in the window, which is without the border, cannot be fitted.
+        # Fewer than two fringes in the window (without its margin) cannot be fitted.
         period = min(period, min(bench.shape) / 3)
         angle = turn + n * np.pi / 2
         length = WAVELENGTH_NM * 1e-6 * DISTANCE_MM / (period * PITCH_UM * 1e-3)
         declared = np.round(length * np.array([np.cos(angle), np.sin(angle)]), 3)
-        # What is declared was read off a scale.
+        # The declared value was read from a scale.
         true = np.append(declared * rng.normal(1, 0.002), 0.0)
         true[:2] += rng.normal(0, 0.002, 2) * true[1::-1] * (-1, 1)
         foot = np.append(rng.normal(0, 0.2, 2), 0.0)

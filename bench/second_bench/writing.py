@@ -39,7 +39,7 @@ def write_acquisition(
 
 
 def _longer(run: Run) -> float:
-    """Seconds by which the frames of a run are further apart than those of fringes."""
+    """Additional frame period of a run over that of fringes, s."""
     return run.exptime_s if run.kind in ("dark", "flat") else 0.0
 
 
@@ -71,7 +71,7 @@ def _described(bench: Bench) -> dict[str, Any]:
 
 
 def write_truth(file: Path, truth: dict[str, Any], bench: Bench) -> None:
-    """Write the truth, the offsets (px) of all pixels that are written included."""
+    """Write the truth, including the offsets (px) of all written pixels."""
     maps = {
         name: [[round(float(v), 7) for v in row] for row in values[WINDOW]]
         for name, values in (("delta_x", bench.delta_x), ("delta_y", bench.delta_y))

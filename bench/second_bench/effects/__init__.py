@@ -1,4 +1,4 @@
-"""What can be wrong with a bench."""
+"""Faults of a bench."""
 
 from second_bench.effects import charge, electronics, fringes, light, outside, particles, response
 from second_bench.effects.law import LAWS, Law, laws_of

@@ -14,7 +14,7 @@ _Drawn = dict[str, Any]
 def coupled(e: F64, kernel: F64) -> F64:
     """Voltages after capacitive coupling by a 3 x 3 kernel (y, x), by GalSim.
 
-    An entry is the share that a pixel takes from its neighbour on that side.
+    An entry is the share that a pixel receives from its neighbour on that side.
     """
     image = galsim.ImageD(np.ascontiguousarray(e))
     image.applyIPC(galsim.ImageD(np.ascontiguousarray(kernel)), edge_treatment="extend")
@@ -22,7 +22,7 @@ def coupled(e: F64, kernel: F64) -> F64:
 
 
 def _given(kernel: F64) -> _Drawn:
-    """Shares that a pixel gives to its neighbours (y, x), of a kernel of those that it takes."""
+    """Shares (y, x) that a pixel gives to its neighbours, from a kernel of received shares."""
     return {"kernel": kernel[::-1, ::-1].tolist()}
 
 
@@ -38,7 +38,7 @@ def _kernel(sides: F64, corners: F64) -> F64:
 
 @law("ipc", "symmetric", 1.5e-3, 0.02, "to each next pixel")
 def symmetric(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Capacitances between neighbours, and a tenth of them between diagonal ones."""
+    """Capacitances between neighbours, and about a tenth of them between diagonal ones."""
     kernel = _kernel(np.full(4, size), np.full(4, size * rng.uniform(0.05, 0.15)))
     bench.signal.append(lambda e, _: coupled(e, kernel))
     return _given(kernel)
@@ -56,7 +56,7 @@ def asymmetric(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("ipc", "four_rows", 3e-3, 0.03, "to the next row, the largest")
 def four_rows(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Readout lines shared by groups of four rows: what couples differs from row to row."""
+    """Readout lines shared by groups of four rows: coupling differs from row to row."""
     rows = np.arange(bench.shape[0]) % 4
     up, down, across = rng.uniform(0, 1, (3, 4)) * np.array([[1], [1], [0.25]])
     scale = size / max(up.max(), down.max())
@@ -80,7 +80,7 @@ def four_rows(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 def _left_behind(shares: F64, frames: F64) -> Step:
-    """Traps that take shares of the charge, and give it back within some frames each."""
+    """Traps that capture shares of the charge, each with a release time in frames."""
     kept: dict[str, F64] = {}
     given = 1 - np.exp(-1 / frames)
 
@@ -97,7 +97,7 @@ def _left_behind(shares: F64, frames: F64) -> Step:
 
 @law("lag", "linear", 2e-4, 0.02, "of the last frame", varied_phases=True)
 def linear_lag(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """All that is left comes with the next frame."""
+    """All remaining charge appears in the next frame."""
     bench.charge.append(_left_behind(np.array([size]), np.array([1e-9])))
     return {}
 
@@ -113,7 +113,7 @@ def exponentials(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("lag", "traps", 20, 800, "e- that traps hold", varied_phases=True, needs="pyxel")
 def traps(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Traps that fill up, by Pyxel's model of persistence."""
+    """Traps of limited capacity, by Pyxel's model of persistence."""
     from pyxel.models.charge_collection.utils_persistence import (
         compute_simple_persistence,
     )
@@ -158,7 +158,7 @@ def _power_law(size: float, rng: np.random.Generator) -> tuple[Any, _Drawn]:
 
 @law("brighter_fatter", "power_law", 5e-8, 6e-7, "px/e- of the next border")
 def power_law(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Borders that move by charge, falling as a power of the distance (Antilogus et al. 2014)."""
+    """Shifts of borders by charge, a power law of distance (Antilogus et al. 2014)."""
     model, drawn = _power_law(size, rng)
     bench.charge.append(_deflecting(model))
     return drawn
@@ -166,7 +166,7 @@ def power_law(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("brighter_fatter", "table", 5e-8, 6e-7, "px/e- of the next border")
 def table(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Coefficients as one measures them: no power law, a scatter of their own (Gruen et al. 2015).
+    """Coefficients as measured: no power law, with individual scatter (Gruen et al. 2015).
 
     A border belongs to two pixels, so both have the same coefficient for the same charge.
     """
@@ -176,7 +176,7 @@ def table(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     fall = float(rng.uniform(0.6, 1.2))
 
     def border(axis: int, ahead: Any, beside: Any) -> F64:
-        """Of a border half a pixel ahead, charge at (beside, ahead) from it."""
+        """Coefficient of a border half a pixel ahead for charge at (beside, ahead) from it."""
         r = np.hypot(ahead, beside)
         i, j = (np.abs(ahead) - 0.5).astype(int), np.abs(beside).astype(int)
         size_here = np.where(i <= n, scatter[axis][np.minimum(i, n), np.minimum(j, n)], 0.0)
@@ -185,7 +185,7 @@ def table(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     dy, dx = np.meshgrid(near, near, indexing="ij")
     right, left = border(0, dx - 0.5, dy), -border(0, dx + 0.5, dy)
     top, low = border(1, dy - 0.5, dx), -border(1, dy + 0.5, dx)
-    # Charge beyond the table of one of the two pixels of a border counts for neither.
+    # Charge outside the table of one of the two pixels of a border is ignored for both.
     right[:, 0], left[:, -1], top[0], low[-1] = 0, 0, 0, 0
     scale = size / right[n, n + 1]
     tables = [scale * t for t in (left, right, low, top)]

@@ -1,4 +1,4 @@
-"""Readout: noise of lines, wandering levels, restless pixels and converters."""
+"""Readout: noise of lines, drifting levels, telegraph noise and converters."""
 
 from typing import Any
 
@@ -35,7 +35,7 @@ def columns(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("row_noise", "correlated", 0.5, 10, "e- rms")
 def correlated(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """The reference wanders while rows are read: neighbouring rows have much in common."""
+    """The reference drifts during readout, so noise of neighbouring rows is correlated."""
     kept = float(rng.uniform(0.4, 0.85))
 
     def adds(e: F64, frame: Frame) -> F64:
@@ -66,7 +66,7 @@ for _course in SLOW:
 
 @law("bias_drift", "night", 4, 120, "e- over the night")
 def night(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """One warming-up through all runs."""
+    """Warming-up through all runs."""
     end = max(run.start_s + run.frames * bench.period_s for run in bench.runs)
     scale = float(rng.uniform(0.3, 2)) * end
     for run in bench.runs:
@@ -77,7 +77,7 @@ def night(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 def switching(run: Run, dwell_s: F64, period_s: float, rng: np.random.Generator) -> F64:
-    """Two-level states (t, pixel) of traps that dwell low and high for times (2, pixel), s."""
+    """Two-level states (t, pixel) of traps with mean dwell times low and high (2, pixel), s."""
     leave = 1 - np.exp(-period_s / dwell_s)
     state = np.empty((run.frames, dwell_s.shape[1]))
     high = rng.random(dwell_s.shape[1]) < dwell_s[1] / dwell_s.sum(0)
@@ -112,7 +112,7 @@ def _telegraph(
 
 @law("telegraph_noise", "population", 15, 250, "e-, the median")
 def population(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Amplitudes and dwell times over more than a decade, unequal up and down."""
+    """Amplitudes over a decade, dwell times over more, unequal in the two levels."""
     share = float(np.exp(rng.uniform(np.log(0.005), np.log(0.04))))
     _telegraph(bench, share, lambda n: size * np.exp(rng.uniform(-1.15, 1.15, n)), rng)
     return {"share": share}
@@ -120,7 +120,7 @@ def population(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("telegraph_noise", "exponential", 15, 250, "e-, the mean")
 def exponential(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Amplitudes spread exponentially, as those of MOS transistors (Wang et al. 2006)."""
+    """Exponentially distributed amplitudes, as in MOS transistors (Wang et al. 2006)."""
     share = float(np.exp(rng.uniform(np.log(0.005), np.log(0.04))))
     _telegraph(bench, share, lambda n: rng.exponential(size, n), rng)
     return {"share": share}
@@ -135,7 +135,7 @@ def spikes(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 def _coarse(bench: Bench, rng: np.random.Generator) -> None:
-    """A converter of 12 bits or so, whose steps are of the size of the noise."""
+    """A converter of about 12 bits with steps similar to the noise."""
     coarse = float(rng.uniform(8, 30)) / bench.gain_e_per_adu
     bench.gain_e_per_adu *= coarse
     bench.declared_gain *= coarse
@@ -150,7 +150,7 @@ def _codes(bench: Bench) -> int:
 
 @law("quantisation", "missing", 0.02, 0.3, "of the codes")
 def missing(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Codes that never come; the next one comes instead."""
+    """Codes that never occur and are replaced by the next one."""
     _coarse(bench, rng)
     there = rng.random(_codes(bench)) >= size
     there[-1] = True
@@ -166,7 +166,7 @@ def missing(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("quantisation", "steps", 0.05, 0.6, "codes rms")
 def steps(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Thresholds beside their places, as those of a flash or ramp converter."""
+    """Displaced thresholds, as in a flash or ramp converter."""
     _coarse(bench, rng)
     count = _codes(bench)
     thresholds = np.sort(np.arange(1, count) - 0.5 + rng.normal(0, size, count - 1))
@@ -176,7 +176,7 @@ def steps(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("quantisation", "weights", 5e-4, 0.01, "rms of a bit's weight")
 def weights(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Successive approximation with references that are off."""
+    """Successive approximation with inaccurate references."""
     _coarse(bench, rng)
     bits = int(np.ceil(np.log2(_codes(bench))))
     true = 2.0 ** np.arange(bits) * (1 + size * rng.standard_normal(bits))
@@ -195,7 +195,7 @@ def weights(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("quantisation", "levels", 5e-4, 0.01, "rms of a bit's weight")
 def levels(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """The nearest of the levels that weights make which are off."""
+    """The nearest of the levels of inaccurate weights."""
     _coarse(bench, rng)
     codes = np.arange(_codes(bench))
     bits = int(np.ceil(np.log2(len(codes))))
@@ -209,7 +209,7 @@ def levels(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("quantisation", "references", 0.1, 1.0, "codes rms")
 def references(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Coarse steps between references that are off, each by itself, and even fine steps."""
+    """Coarse steps between independently inaccurate references, with uniform fine steps."""
     _coarse(bench, rng)
     fine = 2 ** int(rng.integers(4, 7))
     count = _codes(bench)

@@ -1,4 +1,4 @@
-"""Fringes whose shape, place or phase is not what it should be."""
+"""Errors of the shape, position or phase of fringes."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ _Drawn = dict[str, Any]
 
 @law("hyperbolic_fringes", "foot", 4, 20, "mm")
 def foot(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Fibre pairs beside the axis of the detector, each set's elsewhere."""
+    """Fibre pairs offset from the detector's axis, differently for each set."""
     drawn = {}
     for one in bench.sets:
         angle = rng.uniform(0, 2 * np.pi)
@@ -25,7 +25,7 @@ def foot(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("hyperbolic_fringes", "depth", 0.1, 0.6, "mm")
 def depth(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """One tip behind the other: fringes are rings cut far from their centre."""
+    """One tip behind the other: fringes are sections of rings far from their centre."""
     drawn = {}
     for one in bench.sets:
         behind = float(size * rng.uniform(0.8, 1.2) * rng.choice([-1, 1]))
@@ -35,7 +35,7 @@ def depth(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 def _tilt(bench: Bench, moved_um: F64) -> F64:
-    """Change of the fringe vector (rad/px) by a tip that moves (t, 2)."""
+    """Change of the fringe vector (rad/px) by displacements of a tip (t, 2), um."""
     per_mm = 2e6 * np.pi / (bench.wavelength_nm * bench.distance_mm) * bench.pitch_um * 1e-3
     return np.asarray(per_mm * moved_um * 1e-3)
 
@@ -47,7 +47,7 @@ def _directions(rng: np.random.Generator) -> F64:
 
 @law("fringe_jitter", "white", 0.05, 0.8, "um rms of a tip")
 def white(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """A tip that trembles in both directions."""
+    """White vibration of a tip in both directions."""
     for run in bench.fringe_runs():
         run.tilt = run.tilt + _tilt(bench, size * rng.standard_normal((run.frames, 2)))
     return {}
@@ -55,7 +55,7 @@ def white(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("fringe_jitter", "resonance", 0.05, 0.8, "um rms of a tip")
 def resonance(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """A mount that swings in one direction, sampled far below its frequency."""
+    """A resonance of the mount in one direction, sampled far below its frequency."""
     hertz = float(rng.uniform(20, 90))
     for run in bench.fringe_runs():
         turns = hertz * bench.period_s * np.arange(run.frames) + rng.normal(0, 0.05, run.frames)
@@ -105,14 +105,14 @@ for _course in SLOW:
 
 
 def _steps(run: Run) -> F64:
-    """How far the modulator moved before each frame, rad."""
+    """Step of the modulator before each frame, rad."""
     step = np.diff(run.phase, prepend=run.phase[0])
     return np.asarray((step + np.pi) % (2 * np.pi) - np.pi)
 
 
 @law("rolling_shutter", "exponential", 0.004, 0.08, "of the step", varied_phases=True)
 def settles(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Rows that are read first see the end of the modulator's step."""
+    """Rows that are read first include the end of the modulator's step."""
     rows = np.arange(bench.shape[0]) / bench.shape[0]
     scale = float(rng.uniform(0.15, 1))
     for run in bench.fringe_runs():
@@ -122,7 +122,7 @@ def settles(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("rolling_shutter", "ringing", 0.004, 0.08, "of the step", varied_phases=True)
 def rings(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """The modulator overshoots, and swings a while."""
+    """The modulator overshoots, with damped ringing."""
     rows = np.arange(bench.shape[0]) / bench.shape[0]
     scale, turns = float(rng.uniform(0.3, 1)), float(rng.uniform(0.5, 2))
     left = np.exp(-rows / scale) * np.cos(2 * np.pi * turns * rows)
@@ -133,7 +133,7 @@ def rings(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("rolling_shutter", "linear", 0.004, 0.08, "of the step", varied_phases=True)
 def creeps(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """The modulator creeps at an even pace until the last row is read."""
+    """The modulator creeps at a constant rate until the last row is read."""
     rows = np.arange(bench.shape[0]) / bench.shape[0]
     for run in bench.fringe_runs():
         run.row_phase = run.row_phase - size * _steps(run)[:, None] * (1 - rows)

@@ -1,4 +1,4 @@
-"""Effects by name, each with the laws that it follows in the world."""
+"""Effects by name, each with its possible laws."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,26 +13,26 @@ Apply = Callable[[Bench, float, np.random.Generator], dict[str, Any]]
 
 @dataclass(frozen=True)
 class Law:
-    """One way in which an effect comes.
+    """One law of an effect.
 
     Attributes
     ----------
     effect, name : str
-        The effect's name is pixcal's, where pixcal knows it.
+        The effect's name is pixcal's, if pixcal has the effect.
     weak, strong : float
         Sizes at strengths 0 and 1.
     unit : str
         Of the size.
     apply : callable
-        Changes a bench by a size; gives what was drawn beside it.
+        Changes a bench by a size; returns further drawn values.
     known : bool
         Whether pixcal has this effect.
     decidable : bool
         Whether frames of the bench can show it at all.
     varied_phases : bool
-        Whether it shows only where the phase step differs from frame to frame.
+        Whether it is detectable only if the phase step differs from frame to frame.
     needs : str
-        Package that it needs beside HCIPy and GalSim.
+        Package that it needs besides HCIPy and GalSim.
     """
 
     effect: str
@@ -53,7 +53,7 @@ LAWS: list[Law] = []
 def law(
     effect: str, name: str, weak: float, strong: float, unit: str, **more: Any
 ) -> Callable[[Apply], Apply]:
-    """Enter a law into `LAWS`."""
+    """Register a law in `LAWS`."""
 
     def entered(apply: Apply) -> Apply:
         LAWS.append(Law(effect, name, weak, strong, unit, apply, **more))

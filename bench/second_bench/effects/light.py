@@ -1,4 +1,4 @@
-"""Light that is not that of two steady fibres."""
+"""Deviations of the light from two steady fibres."""
 
 from dataclasses import replace
 from typing import Any
@@ -23,7 +23,7 @@ def laser(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("intensity_noise", "fibres", 3e-4, 0.03, "rms")
 def fibres(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Coupling into each fibre changes by itself."""
+    """Coupling into each fibre varies independently."""
     for run in bench.fringe_runs():
         run.power = run.power * np.maximum(1 + size * rng.standard_normal((run.frames, 2)), 0.1)
     return {}
@@ -31,7 +31,7 @@ def fibres(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("intensity_noise", "flicker", 3e-4, 0.03, "rms")
 def flicker(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """A laser whose noise falls as the inverse of the frequency."""
+    """A laser with 1/f noise."""
     for run in bench.fringe_runs():
         spectrum = np.fft.rfft(rng.standard_normal(run.frames))
         spectrum[1:] /= np.sqrt(np.arange(1, len(spectrum)))
@@ -43,7 +43,7 @@ def flicker(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("contrast_noise", "vibration", 0.08, 0.7, "rad rms of the amplitude")
 def vibration(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Fringes that swing within an exposure lose contrast as J0 of the amplitude."""
+    """Fringe vibration within an exposure reduces contrast by J0 of the amplitude."""
     for run in bench.fringe_runs():
         run.contrast = run.contrast * j0(size * np.abs(rng.standard_normal(run.frames)))
     return {}
@@ -51,7 +51,7 @@ def vibration(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("contrast_noise", "polarisation", 0.002, 0.06, "of the contrast over a run")
 def polarisation(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """The fibres turn the polarisation slowly."""
+    """The fibres slowly rotate the polarisation."""
     course = str(rng.choice(list(SLOW)))
     for run in bench.fringe_runs():
         run.contrast = run.contrast * (1 - size * SLOW[course](run.frames, rng))
@@ -59,7 +59,7 @@ def polarisation(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 def _ghost(bench: Bench, beam: Beam, size: float, rng: np.random.Generator) -> tuple[Beam, _Drawn]:
-    """Image of a fibre's tip in a plate that is slightly wedged."""
+    """Image of a fibre's tip in a slightly wedged plate."""
     angle, aside = rng.uniform(0, 2 * np.pi), rng.uniform(0.7, 8)
     moved = np.array([aside * np.cos(angle), aside * np.sin(angle), -rng.uniform(0, 4)])
     image = replace(
@@ -75,7 +75,7 @@ def _ghost(bench: Bench, beam: Beam, size: float, rng: np.random.Generator) -> t
 
 @law("ghost_fringes", "first_fibre", 8e-4, 0.02, "of the amplitude")
 def first_fibre(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """A reflection of the fibre that is not modulated."""
+    """A reflection of the unmodulated fibre."""
     return {one.name: _add_ghost(bench, n, 0, size, rng) for n, one in enumerate(bench.sets)}
 
 
@@ -87,7 +87,7 @@ def second_fibre(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("ghost_fringes", "both", 8e-4, 0.02, "of the amplitude")
 def both_fibres(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Reflections of both fibres in one plate: images moved alike."""
+    """Reflections of both fibres in one plate, with equally displaced images."""
     drawn = {}
     for one in bench.sets:
         image, facts = _ghost(bench, one.beams[0], size, rng)
@@ -106,7 +106,7 @@ def both_fibres(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("ghost_fringes", "crossed", 2e-3, 0.05, "of the amplitude")
 def crossed(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """A reflection of the second fibre, polarised across the first: it stands still.
+    """A reflection of the second fibre, polarised orthogonally to the first: static fringes.
 
     The second fibre is polarised some 20 degrees away from the first, and so interferes with both.
     """
@@ -137,14 +137,14 @@ def _stray(bench: Bench, shape: F64) -> None:
 
 @law("straylight", "uniform", 0.01, 0.08, "of the mean", decidable=False)
 def uniform(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """The same everywhere: what fibres that are a little less coherent would show too."""
+    """Uniform light, degenerate with a slightly lower coherence of the fibres."""
     _stray(bench, np.full(bench.shape, size))
     return {}
 
 
 @law("straylight", "slope", 0.01, 0.08, "of the mean", decidable=False)
 def slope(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """From nothing at one edge: what beams that are aimed otherwise show nearly too."""
+    """A ramp from zero at one edge, nearly degenerate with the aims of the beams."""
     x, y = bench.grid()
     angle = float(rng.uniform(0, 2 * np.pi))
     along = np.cos(angle) * x / bench.shape[1] + np.sin(angle) * y / bench.shape[0]
@@ -154,7 +154,7 @@ def slope(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("straylight", "bump", 0.004, 0.08, "of the mean, at the top")
 def bump(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """One broad bump, such as a reflection of the lens mount makes."""
+    """One broad bump, as from a reflection of the lens mount."""
     x, y = bench.grid()
     ny, nx = bench.shape
     wide = float(rng.uniform(0.12, 0.35))

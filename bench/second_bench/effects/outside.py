@@ -1,4 +1,4 @@
-"""Effects that pixcal has no name for: the honest answer is that something is unexplained."""
+"""Effects that pixcal does not have: the right answer is an unexplained gap."""
 
 from typing import Any
 
@@ -15,10 +15,10 @@ _Drawn = dict[str, Any]
     known=False, needs="pyxel",
 )  # fmt: skip
 def charge_transfer(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Charge that traps take on its way to the output, and give back behind it.
+    """Charge captured by traps during its transfer to the output, and released later.
 
-    By Pyxel's model of distortion (Short et al. 2013): the tail grows with the way and less than
-    with the charge.
+    By Pyxel's model of distortion (Short et al. 2013): the tail grows with the number of transfers,
+    and less than in proportion to the charge.
     """
     from pyxel.models.charge_transfer.utils_cdm import (
         run_cdm_parallel,
@@ -43,7 +43,7 @@ def charge_transfer(bench: Bench, size: float, rng: np.random.Generator) -> _Dra
 
 @law("modulated_glow", "corner", 8, 400, "e- at the corner", known=False)
 def modulated_glow(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Light of the modulator's driver leaks in: bright where its voltage is high."""
+    """Stray light of the modulator's driver, bright at high voltage."""
     x, y = bench.grid()
     ny, nx = bench.shape
     corner = rng.choice([-0.5, 0.5], 2)
@@ -61,7 +61,7 @@ def modulated_glow(bench: Bench, size: float, rng: np.random.Generator) -> _Draw
 
 @law("pickup", "tone", 1, 25, "e- amplitude", known=False)
 def pickup(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """A tone of a power supply, as the pixels are read one after the other."""
+    """A tone of a power supply, sampled as pixels are read one after the other."""
     ny, nx = bench.shape
     turns = float(np.exp(rng.uniform(np.log(0.003), np.log(0.3))))
     order = np.arange(ny)[:, None] * (nx + 20) + np.arange(nx)
@@ -76,7 +76,7 @@ def pickup(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("pixel_nonlinearity", "quadratic", 1e-3, 0.015, "rms at the peak", known=False)
 def pixel_nonlinearity(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Every pixel bends its own way, and all together not at all."""
+    """Individual nonlinearity of pixels, zero on average."""
     own = size * rng.standard_normal(bench.shape)
     own -= own.mean()
     bench.signal.append(lambda e, _: e * (1 - own * e / bench.peak_e))
@@ -88,9 +88,9 @@ def pixel_nonlinearity(bench: Bench, size: float, rng: np.random.Generator) -> _
     known=False, decidable=False,
 )  # fmt: skip
 def mirror_crosstalk(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Two outputs that are read at once, from both sides inwards, and couple.
+    """Coupling of two outputs that are read simultaneously, from both sides inwards.
 
-    The mirrored fringes add harmonics of the fringe, which a fit with free intensities takes up.
+    The mirrored fringes add harmonics of the fringe, which a fit with free intensities absorbs.
     """
     sign = float(rng.choice([-1, 1]))
     bench.signal.append(lambda e, _: e + sign * size * e[:, ::-1])

@@ -1,4 +1,4 @@
-"""Response: its curve, and what flats say of it."""
+"""Response: nonlinearity, and errors of flats."""
 
 from typing import Any
 
@@ -27,7 +27,7 @@ def cubic(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("nonlinearity", "dead_zone", 10, 200, "e-")
 def dead_zone(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """The first electrons are lost, more of them the more there are."""
+    """Loss of the first electrons, which saturates with the signal."""
     scale = float(rng.uniform(800, 4000))
     bench.signal.append(lambda e, _: e - size * (1 - np.exp(-np.maximum(e, 0) / scale)))
     return {"scale_e": scale}
@@ -35,7 +35,7 @@ def dead_zone(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("nonlinearity", "knee", 4e-3, 0.1, "at the peak")
 def knee(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Straight up to a knee below the full well."""
+    """Linear up to a knee below the full well."""
     level = float(rng.uniform(0.55, 0.8))
 
     def bends(e: F64, _: Frame) -> F64:
@@ -47,7 +47,7 @@ def knee(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 def _smooth(shape: tuple[int, int], scale: float, rng: np.random.Generator) -> F64:
-    """A random field of a scale in pixels, zero on average, rms 1."""
+    """A random field with a scale in pixels, zero mean and rms 1."""
     edge = int(3 * scale)
     wide = gaussian_filter(rng.standard_normal((shape[0] + 2 * edge, shape[1] + 2 * edge)), scale)
     own = wide[edge : edge + shape[0], edge : edge + shape[1]]
@@ -56,7 +56,7 @@ def _smooth(shape: tuple[int, int], scale: float, rng: np.random.Generator) -> F
 
 @law("flat_error", "illumination", 0.002, 0.03, "rms")
 def illumination(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """The lamp lights the window unevenly."""
+    """Uneven illumination by the lamp."""
     scale = float(min(bench.shape) * rng.uniform(0.06, 0.14))
     bench.flat_response = bench.flat_response * (1 + size * _smooth(bench.shape, scale, rng))
     return {"scale_px": scale}
@@ -64,14 +64,14 @@ def illumination(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 @law("flat_error", "pixels", 1e-3, 0.02, "rms")
 def pixels(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Pixels respond otherwise to the lamp's colour."""
+    """Pixels respond differently to the lamp's colour."""
     bench.flat_response = bench.flat_response * (1 + size * rng.standard_normal(bench.shape))
     return {}
 
 
 @law("flat_error", "etalon", 1e-3, 0.02, "rms")
 def etalon(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Interference of the lamp's light in the window's glass: rings about a point far away."""
+    """Interference of the lamp's light in the window's glass: rings about a distant point."""
     x, y = bench.grid()
     centre, period = rng.normal(0, 600, 2), float(rng.uniform(12, 45))
     r = np.hypot(x - centre[0], y - centre[1])

@@ -39,7 +39,7 @@ def vignetted(sensor: Sensor) -> Drawn:
     sensor.response = sensor.response * shade
     tail = rng.pareto(1.5, sensor.shape) * np.median(sensor.dark_e_s)
     sensor.dark_e_s = sensor.dark_e_s + np.minimum(tail, 20 * sensor.read_noise_e.mean())
-    # A tail has no end: from where on a pixel is a hot one is for each program to say.
+    # The tail is continuous: the limit above which a pixel is hot depends on the program.
     off = np.abs(sensor.dark_e_s - np.median(sensor.dark_e_s))
     sensor.unclear = off > 4 * 1.4826 * np.median(off)
     return {"corner": float(shade.min())}

@@ -1,4 +1,4 @@
-"""Make a sensor of a kind, and write its frames."""
+"""Make a sensor of a given kind, and write its frames."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def make(
     """A sensor with a kind of fault, and the truth about it."""
     own = KINDS[name]
     rng = np.random.default_rng([seed, *name.encode()])
-    # A lamp that is changed with the exposure time tells no levels.
+    # If the lamp changes with the exposure time, levels cannot be derived from it.
     ladder = ladder or LADDERS[seed % len(LADDERS)]
     sensor = ordinary(rng, shape, ladder, own.highest, counts, own.converter)
     drawn = own.change(sensor)
@@ -43,7 +43,7 @@ def make(
 
 
 def _causes(cause: str) -> list[list[str]] | None:
-    """Alternatives of each cause to name; None where the change is no listed effect."""
+    """Alternatives of each cause to name; None if the change is not a listed effect."""
     if cause == "?":
         return None
     return [one.split() for one in cause.split("+")] if cause else []

@@ -1,4 +1,4 @@
-"""A sensor without fringes, and what is recorded with it; kinds of it have names."""
+"""A sensor without fringes and its recorded frames; named kinds of sensors."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -24,7 +24,7 @@ class Series:
 
 @dataclass
 class Sensor:
-    """A sensor and what is recorded with it; steps change an image (y, x) in electrons.
+    """A sensor and its recorded series; steps change an image (y, x) in electrons.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Sensor:
     well_e, top_e : float
         Full well; light of the brightest flats that are not meant to saturate.
     defects, unclear : ndarray (y, x)
-        Pixels to mask, and those that may be masked or not.
+        Pixels to mask, and pixels that may be masked or not.
     flicker : float
         Of the lamp, from frame to frame, relative rms.
     response_curve : callable
@@ -45,11 +45,11 @@ class Sensor:
     converter : callable
         Codes of real samples (ADU).
     shift : int
-        Bits that the codes are shifted by in the files.
+        Shift of the codes in the files, bits.
     stored : dtype
         Of the samples in the files.
     shared_e : float
-        Noise that pixels of an output share, and not all of the frame, rms; part of the read noise.
+        Noise common to pixels of an output but not to the frame, rms; part of the read noise.
     """
 
     rng: np.random.Generator
@@ -82,7 +82,7 @@ class Sensor:
         return ny, nx
 
     def frames(self) -> Iterator[tuple[Series, NDArray[Any]]]:
-        """Samples (t, y, x) of every series, in the order in which they are recorded."""
+        """Samples (t, y, x) of every series, in the order of recording."""
         number = 0
         for one in self.series:
             cube = []
@@ -134,7 +134,7 @@ def ordinary(
     counts: tuple[int, int] = (0, 0),
     converter: Converter | None = None,
 ) -> Sensor:
-    """A sensor without anything that bias, dark and flat maps do not hold."""
+    """A sensor that bias, dark and flat maps describe completely."""
     ny, nx = shape
     bits, gain, read = (converter or _converter)(rng)
     bias = float(rng.uniform(15, 40) if bits < 12 else rng.uniform(60, 400)) + 4 * read / gain
@@ -165,7 +165,7 @@ def ordinary(
 
 
 def _converter(rng: np.random.Generator) -> tuple[int, float, float]:
-    """Bits, gain (e-/ADU) and read noise (e-) of a camera that somebody could build."""
+    """Bits, gain (e-/ADU) and read noise (e-) of a realistic camera."""
     while True:
         bits = int(rng.integers(8, 17))
         gain, codes = np.exp(rng.uniform(np.log([0.05, 0.4]), np.log([40, 20])))
@@ -190,12 +190,12 @@ class Kind:
     Attributes
     ----------
     change : callable
-        What is changed of an ordinary sensor; returns what was drawn.
+        Changes an ordinary sensor; returns the drawn values.
     cause : str
         Causes to name, joined by " + ", each with its alternatives; empty: none, and no gap; "?":
-        none, for the change is no listed effect.
+        none, as the change is not a listed effect.
     highest : float
-        Highest level of the ladder, of ``top_e``.
+        Highest level of the flats, over ``top_e``.
     converter : callable, optional
     """
 
@@ -211,7 +211,7 @@ KINDS: dict[str, Kind] = {}
 def kind(
     cause: str = "", highest: float = 0.9, converter: Converter | None = None
 ) -> Callable[[Change], Change]:
-    """Enter a kind into `KINDS`."""
+    """Register a kind in `KINDS`."""
 
     def entered(change: Change) -> Change:
         KINDS[change.__name__] = Kind(change, cause, highest, converter)

@@ -1,4 +1,4 @@
-"""Pixels: defects, fixed patterns, what they give to each other and keep."""
+"""Pixels: defects, fixed patterns, crosstalk, lag and response."""
 
 from collections.abc import Callable
 

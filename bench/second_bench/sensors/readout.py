@@ -42,7 +42,7 @@ def amplifiers(sensor: Sensor) -> Drawn:
     sensor.amplified.append(lambda e, _: e * gains)
     offsets = rng.uniform(0.2, 3) * rng.standard_normal(nx) + 5 * (np.arange(nx) >= nx // 2)
     sensor.bias_adu = np.maximum(sensor.bias_adu + offsets, 8)
-    # Electrons are counted with the mean.
+    # Signals in electrons refer to the mean gain.
     sensor.amplified.append(lambda e, _: np.asarray(e / gains.mean()))
     return {"apart": apart, "columns": columns}
 
@@ -66,7 +66,7 @@ def declared_gain(sensor: Sensor) -> Drawn:
 @kind("quantisation")
 def codes(sensor: Sensor) -> Drawn:
     """A tenth of the codes never comes; the next higher one comes instead."""
-    # Noise of many codes hides them.
+    # Read noise of many codes would hide missing ones.
     sensor.read_noise_e = sensor.read_noise_e * min(1, 2 * sensor.gain / sensor.read_noise_e.mean())
     there = sensor.rng.random(2**sensor.bits) >= 0.1
     there[-1] = True
@@ -110,13 +110,13 @@ def rows_and_columns(sensor: Sensor) -> Drawn:
 
 
 def _outputs(sensor: Sensor, at: tuple[float, float]) -> NDArray[np.int_]:
-    """Number (y, x) of the output that reads a pixel; four meet at a place, of the shape."""
+    """Number (y, x) of each pixel's output; four meet at a place, relative to the shape."""
     ny, nx = sensor.shape
     right = np.arange(nx) >= round(at[1] * nx)
     return 2 * (np.arange(ny)[:, None] >= round(at[0] * ny)) + right
 
 
-# Levels of four outputs about their mean, which is that of the frame.
+# Scatter of four outputs' levels about their mean, the frame's level.
 _APART = np.sqrt(3 / 4)
 
 
@@ -167,7 +167,7 @@ def two_amplifiers(sensor: Sensor) -> Drawn:
     right = np.arange(sensor.shape[1]) >= sensor.shape[1] // 2
     apart, noisier = float(rng.uniform(0.05, 0.15)), float(rng.uniform(1.2, 1.6))
     gains = 1 + apart * (right - right.mean())
-    # Of all pixels in electrons of the common gain.
+    # Read noise of all pixels is in electrons of the common gain.
     sensor.read_noise_e = sensor.read_noise_e * np.where(right, noisier, 1.0)
     sensor.collected.append(lambda e, _: np.asarray(e * gains))
     return {"apart": apart, "noisier": noisier}
@@ -194,7 +194,7 @@ def noisy(sensor: Sensor) -> Drawn:
 def binned(sensor: Sensor) -> Drawn:
     """Each sample is the mean of four pixels' codes: whole, or in steps of a quarter."""
     rng, whole = sensor.rng, bool(sensor.rng.integers(2))
-    # Rounding of four codes is not what a program can know of their mean.
+    # Keep read noise above rounding: a program cannot know that four codes were rounded.
     sensor.read_noise_e = sensor.read_noise_e * max(1, 2 * sensor.gain / sensor.read_noise_e.mean())
 
     def means(adu: F64) -> F64:
