@@ -1,9 +1,9 @@
 """Frame parameters of a set, from a few tiles spread over the detector.
 
-The first look takes some hundred frames spread over the run: their samples are a matrix of rank
-three, and any three vectors that span it are turned into (iota, alpha sin psi, alpha cos psi) with
-the help of the fringe vector and the gauge (physics note, sections 2 and 3). With the pixels of
-these tiles known, every frame is then solved by itself, block after block.
+The start uses about a hundred frames spread over the run. Their samples are a matrix of rank three;
+any three vectors that span it are transformed to (iota, alpha sin psi, alpha cos psi) by means of
+the fringe vector and the gauge (physics note, sections 2 and 3). With the pixels of these tiles
+known, every frame is then solved separately, block after block.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,29 +34,29 @@ Pixels = Indices | slice
 Samples = tuple[Indices, U16]
 Each = Callable[[Callable[[int], Any], Sequence[int]], list[Any]]
 
-# pixels that frames are solved with: their noise then adds some 2e-4 to a map's variance
+# pixels used to solve frames: the frames' noise then adds some 2e-4 to a map's variance
 MAX_PIXELS = 20_000
-# interval of these pixels for the start, which only gives weights, and the point about which a
-# moving phase is linearised
+# interval of these pixels for the start, which only gives weights, and the point at which a moving
+# phase is linearised
 FEW = 4
 MIN_FRAMES = 6  # three unknowns per pixel, and as many again to test the fit
 # departure from the visibility of a tile's pixels, over the usual one, above which a pixel is
 # excluded; some 8 standard deviations
 ODD_VISIBILITY = 12.0
 MANY = 3.0  # ratio of mean light to that of most pixels, or inverse, above which one is excluded
-# most of the usual distance of the pixels' phases from smooth ones; random ones have 1.57
+# largest median distance of the pixels' phases from smooth ones; random phases have 1.57
 FOLLOWS_RAD = 0.8
-TURNS, TURNS_MOVING = 3, 8  # most turns of pixels from frames and frames from pixels
-# Change of the frames by a turn, over their errors, after which no other is needed. Each turn
-# halves it: what is left is less than this share of the frames' noise, which is little itself.
+TURNS, TURNS_MOVING = 3, 8  # most iterations of pixels from frames, frames from pixels
+# Change of the frames by an iteration, over their errors, at which it ends. Each iteration halves
+# it, so that the remainder is below this share of the frames' noise, which is small itself.
 SETTLED = 0.02
-# least power of the weakest of three components over the next, which is noise: frames of two phases
-# only have no third component, and noise in its place would pass for the fringes' shape
+# least power of the weakest of three components over the next, which is noise: frames of only two
+# phases have no third component, and noise would be mistaken for the fringes' shape
 ABOVE_NOISE = 1.5
 
 
 def in_turn(function: Callable[[int], Any], numbers: Sequence[int]) -> list[Any]:
-    """Call a function with each of some numbers, one after the other."""
+    """Call a function with each of the numbers, one after the other."""
     return [function(n) for n in numbers]
 
 
@@ -82,7 +82,7 @@ class Scout:
     theta: list[F64] = field(default_factory=list)  # (3, y, x) of each tile
 
     def prime(self, codes: Sequence[U16]) -> FrameParameters:
-        """Learn the pixels of the tiles from frames (t, y, x) spread over the run; parameters.
+        """Fit the tiles' pixels to frames (t, y, x) spread over the run; returns their parameters.
 
         Raises InputError: too few frames or good pixels, no fringes, or a phase that does not
         change.
@@ -99,7 +99,7 @@ class Scout:
         chi2 = self._chi2(codes, frames)
         significance = self._motion_significance(codes, frames) / np.median(chi2)
         self.moving_significance = significance
-        # Six standard deviations of what frames without motion would show.
+        # Six standard deviations above the value of frames without motion.
         self.moving = significance > 1 + 6 / np.sqrt(n_frames)
         if self.moving:
             frames = self._settled(codes, frames, TURNS_MOVING)
@@ -109,28 +109,28 @@ class Scout:
         return frames
 
     def solve(self, codes: Sequence[U16], start: FrameParameters | None = None) -> FrameParameters:
-        """Parameters of further frames (t, y, x), the same for each tile whose pixels are known."""
+        """Parameters of further frames (t, y, x), common to all tiles, whose pixels are known."""
         samples = self._samples(codes)
         frames = self._unweighted(samples) if start is None else start
-        # Weights come from the step before: where the phase is linear one is enough.
+        # Weights come from the previous step; if the model is linear one step is enough.
         for _ in range(3 if self.moving else 1):
             frames, _, _ = self._frame_step(samples, frames, self.moving)
         return frames
 
     def _samples(self, codes: Sequence[U16]) -> list[Samples]:
-        """Of each tile, the samples that frames are solved with."""
+        """Samples of each tile that are used to solve frames."""
 
         def taken(n: int) -> Samples:
             picked, size = self._picked(self.tiles[n]), self.tiles[n].good.size
             if 4 * len(picked) > 3 * size:
-                # Those of no use are zero in theta, and take less time than leaving them out.
+                # Unused pixels have zero theta, which is faster than leaving them out.
                 picked = np.arange(size)
             return picked, _taken(codes[n], picked)
 
         return self.each(taken, range(len(self.tiles)))
 
     def _unweighted(self, samples: Sequence[Samples]) -> FrameParameters:
-        """Frames by plain least squares."""
+        """Frames by unweighted least squares."""
         matrix: F64 = np.zeros((3, 3))
         right: F64 = np.zeros((len(samples[0][1]), 3))
         for theta, (picked, codes) in zip(self.theta, samples, strict=True):
@@ -150,12 +150,12 @@ class Scout:
             )
 
     def _picked(self, tile: Tile) -> Indices:
-        """Flat numbers of the good pixels that frames are solved with."""
+        """Flat numbers of the good pixels that are used to solve frames."""
         good = np.flatnonzero(tile.good)
         return good[_scattered(len(good), max(1, MAX_PIXELS // len(self.tiles)))]
 
     def _electrons(self, codes: U16, picked: Pixels) -> F32:
-        """Samples (t, p), e-; saturated ones, without weight, count as the pixel's brightest."""
+        """Samples (t, p), e-; saturated ones, without weight, get the pixel's highest value."""
         flat = _taken(codes, picked)
         electrons = self.coding.electrons(flat)
         lost = flat == self.coding.fill
@@ -166,7 +166,7 @@ class Scout:
         return np.asarray(electrons, np.float32)
 
     def _drop_odd_levels(self, codes: Sequence[U16]) -> None:
-        """Leave out pixels whose mean light is far from that of most: few would outweigh all."""
+        """Exclude pixels whose mean light is far from the median, which would dominate the fit."""
 
         def drop(n: int) -> None:
             tile = self.tiles[n]
@@ -181,7 +181,7 @@ class Scout:
         self.each(drop, range(len(self.tiles)))
 
     def _subspace(self, codes: Sequence[U16]) -> F64:
-        """First frame parameters: rank three, then turned by means of the fringe vector."""
+        """First frame parameters: three components, transformed by means of the fringe vector."""
 
         def gram_of(n: int) -> F64:
             own: F64 = np.zeros((len(codes[n]), len(codes[n])))
@@ -224,7 +224,7 @@ class Scout:
         return np.asarray(g / self._norm(g))
 
     def _count_fringes(self) -> None:
-        """Refuse what is no fringe, and fringes too wide (their vector is well known by now)."""
+        """Reject false fringes, and too wide ones (the fringe vector is accurate at this point)."""
         tile, theta = self.tiles[0], self.theta[0]
         level = np.where(tile.good, theta[0], 1.0)
         phasor = np.where(tile.good, theta[2] + 1j * theta[1], 0.0) / level
@@ -251,7 +251,7 @@ class Scout:
         return np.array([g[:, 0].mean(), amplitude, amplitude])
 
     def _settled(self, codes: Sequence[U16], frames: FrameParameters, most: int) -> FrameParameters:
-        """Turns until they change the frames no more than their noise allows."""
+        """Iterate until the change of the frames is far below their noise."""
         for _ in range(most):
             before = frames
             frames, normal = self._refine(codes, before)
@@ -263,7 +263,7 @@ class Scout:
         return frames
 
     def _refine(self, codes: Sequence[U16], frames: FrameParameters) -> tuple[FrameParameters, F64]:
-        """One turn: pixels from frames, gauge, frames from pixels; with their normal matrices."""
+        """One iteration: pixels from frames, gauge, frames from pixels; with normal matrices."""
         before: Sequence[F64 | None] = self.theta or [None] * len(self.tiles)
 
         def fit(n: int) -> tuple[F64, C128]:
@@ -293,7 +293,7 @@ class Scout:
     ) -> tuple[FrameParameters, F64, F64]:
         """One Gauss-Newton step of every frame; its size and normal matrices (t, 5, 5) too."""
         n = len(frames.g)
-        # In C order: for another the kernel would be compiled again.
+        # In C order, as another order would compile the kernel again.
         g, dk = frames.g.astype(np.float32, order="C"), frames.dk.astype(np.float32)
 
         def sums_of(number: int) -> tuple[F64, F64]:
@@ -315,14 +315,14 @@ class Scout:
         step[:, :size] = np.einsum(
             "tij,tj->ti", inverse_normal(normal[:, :size, :size], 1e-10), right[:, :size]
         )
-        # The kernel saw float32 parameters: the step is from those.
+        # The kernel used float32 parameters: the step is relative to those.
         moved = FrameParameters(
             g.astype(float) + step[:, :3], dk.astype(float) + step[:, 3:], frames.reference
         )
         return moved, step, normal
 
     def _motion_significance(self, codes: Sequence[U16], frames: FrameParameters) -> float:
-        """Mean of dk' C^-1 dk / 2 over frames: that of the samples' noise without motion."""
+        """Mean of dk' C^-1 dk / 2 over frames; without motion, the reduced chi-square."""
         _, step, normal = self._frame_step(self._samples(codes), frames, moving=True)
         seen = normal[:, 0, 0] > 0
         covariance = inverse_normal(normal[seen], 1e-10)[:, 3:, 3:]
@@ -342,7 +342,7 @@ class Scout:
 
 
 def _like_most(theta: F64, good: Mask) -> Mask:
-    """Pixels (y, x) with about the visibility of the others: the rest have a wrong bias."""
+    """Pixels (y, x) with about the median visibility; others have a wrong bias."""
     visibility = np.hypot(theta[1], theta[2]) / np.where(good, theta[0], 1.0)
     away = np.abs(visibility - np.median(visibility[good])) if good.any() else visibility
     usual = np.median(away[good]) if good.any() else 0.0
@@ -351,19 +351,19 @@ def _like_most(theta: F64, good: Mask) -> Mask:
 
 @lru_cache(maxsize=64)
 def _scattered(n: int, wanted: int) -> Indices:
-    """Some of ``n`` numbers, at random: at even steps pixels may all have the same phase."""
+    """A random subset of ``n`` numbers: at even steps, pixels may all have the same phase."""
     if wanted >= n:
         return np.arange(n)
     return np.sort(np.random.default_rng(n).permutation(n)[:wanted])
 
 
 def _parts(n: int) -> list[slice]:
-    """Of so many pixels a thousand at a time: their samples are many bytes as floating point."""
+    """Slices of a thousand of n pixels, to limit the memory of floating-point samples."""
     return [slice(first, min(first + 1024, n)) for first in range(0, n, 1024)]
 
 
 def _taken(codes: U16, picked: Pixels) -> U16:
-    """Samples (t, p) of some pixels; of all of them no copy."""
+    """Samples (t, p) of given pixels; no copy if these are all."""
     flat = codes.reshape(len(codes), -1)
     if isinstance(picked, slice):
         return flat[:, picked]

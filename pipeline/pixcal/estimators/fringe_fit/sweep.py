@@ -1,4 +1,4 @@
-"""The one pass over the cube: every pixel's parameters, its error, and those of every batch."""
+"""The pass over the cube: parameters and errors of every pixel, also in every batch."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,9 +11,9 @@ from pixcal.estimators.fringe_fit.tile_fit import Coding, PixelSums, Tile, start
 from pixcal.model.arrays import F32, F64, I32, U16
 
 DEFAULT_FRAMES = 500  # frames of a batch in a long run (paper, section 4.3)
-MIN_FRAMES = 16  # fewest frames of a batch: each pixel has three unknowns of its own there
+MIN_FRAMES = 16  # fewest frames of a batch, in which each pixel has three unknowns
 WANTED = 24  # batches wanted of a run too short for `DEFAULT_FRAMES`
-# pixels of a tile for which the Cramér-Rao bound is worked out, where there are few tiles
+# pixels of a tile for which the Cramér-Rao bound is computed, if there are few tiles
 BOUND_PIXELS = 128
 
 
@@ -26,7 +26,7 @@ class FrameBatches:
     # first frame and the one after the last of each batch; empty for a gap
     ranges: tuple[tuple[int, int], ...]
     time: F64  # (batch,) centre of each batch, seconds from the first frame
-    note: str = ""  # what a reader should know, or ""
+    note: str = ""  # note for the reader, or ""
 
     @property
     def count(self) -> I32:
@@ -37,7 +37,7 @@ class FrameBatches:
 def plan_batches(time_s: F64, frames: int | None = None) -> FrameBatches:
     """Divide a run into batches of equal time, by the time (t,) of its frames, gaps included.
 
-    By default of 500 frames, or what leaves some 24 batches of a shorter run.
+    By default of 500 frames, or fewer in a shorter run, for some 24 batches.
     """
     n = len(time_s)
     length = frames or max(MIN_FRAMES, min(DEFAULT_FRAMES, n // WANTED))
@@ -45,7 +45,7 @@ def plan_batches(time_s: F64, frames: int | None = None) -> FrameBatches:
     period = float(np.median(steps)) if n > 1 else 1.0
     note = ""
     if period > 0 and time_s[-1] - time_s[0] < 20 * n * period:
-        # Slots are counted from frame to frame: a period that is off by little does not add up.
+        # Slots are counted from frame to frame, so small errors of the period do not add up.
         slots = np.concatenate([[0], np.cumsum(np.maximum(1, np.rint(steps / period)))])
     else:
         slots, period = np.arange(n, dtype=float), period if period > 0 else 1.0
@@ -53,7 +53,7 @@ def plan_batches(time_s: F64, frames: int | None = None) -> FrameBatches:
     n_batches = int((slots[-1] + 1) // length) if n else 0
     edges = np.searchsorted(slots, np.arange(n_batches + 1) * length)
     ranges = tuple((int(a), int(b)) for a, b in pairwise(edges))
-    # A batch with few frames left has other noise than the rest: it counts as a gap.
+    # A batch with many missing frames has a different noise and counts as a gap.
     ranges = tuple((a, b) if b - a >= 0.75 * length else (a, a) for a, b in ranges)
     centre = np.asarray((np.arange(n_batches) + 0.5) * length * period, dtype=np.float64)
     return FrameBatches(length, period, ranges, centre, note)
@@ -61,7 +61,7 @@ def plan_batches(time_s: F64, frames: int | None = None) -> FrameBatches:
 
 @dataclass(frozen=True)
 class TileMaps:
-    """What the sweep of a tile gives."""
+    """Results of the sweep of a tile."""
 
     iota: F32  # iota, alpha: (y, x) mean and amplitude (e-) at B = A = 1
     alpha: F32
@@ -74,7 +74,7 @@ class TileMaps:
     # frames, and its error (rad); NaN in gaps
     batch_phase: F32
     batch_sigma: F32
-    bound: F64  # (n,) Cramér-Rao bound of the phase (rad) for some of the good pixels
+    bound: F64  # (n,) Cramér-Rao bound of the phase (rad) for a sample of good pixels
 
 
 def frames_to_prime(frames: FrameParameters, block: int) -> int:
@@ -101,7 +101,7 @@ def sweep_tile(
     """Fit a tile, taking its blocks (t, y, x) of stored codes one after the other.
 
     ``k``: carrier (kx, ky), rad/px. ``prime``: first frames held until the start model is made
-    (`frames_to_prime`). ``bound_pixels``: pixels of which the Cramér-Rao bound is worked out.
+    (`frames_to_prime`). ``bound_pixels``: pixels for which the Cramér-Rao bound is computed.
     """
     held: list[U16] = []
     sums: PixelSums | None = None
@@ -154,15 +154,15 @@ def _maps(
 
 
 def _relative(batches: F32, turn: F32) -> F32:
-    """Phases of batches (batch, y, x) relative to those of the run (y, x); the former change."""
+    """Phases of batches (batch, y, x) relative to the run's (y, x); the former are overwritten."""
     batches -= turn
-    # Most are near: to wrap them all would take longer than to look.
+    # Most are within ±pi, and wrapping them takes longer than this check.
     near = not len(batches) or np.abs(batches).max() < np.pi
     return batches if near else wrapped(batches)
 
 
 def phase_bound(tile: Tile, theta: F64, frames: FrameParameters, number: int = BOUND_PIXELS) -> F64:
-    """Cramér-Rao bound of the phase (rad) for some pixels of a tile, frames being known.
+    """Cramér-Rao bound of the phase (rad) for a sample of pixels of a tile, for known frames.
 
     For Gaussian noise of the pixel's own fitted variance (physics note, section 3).
     """

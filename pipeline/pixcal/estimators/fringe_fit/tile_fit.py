@@ -1,4 +1,4 @@
-"""Pixels of a tile by weighted least squares, the frames being known."""
+"""Pixels of a tile by weighted least squares, for known frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ class Tile:
     x: tuple[int, int]
     read: F32  # read, shot: (y, x) variance of a sample: `shot * model + read` (e-²)
     shot: F32
-    good: Mask  # (y, x) pixels to learn from
+    good: Mask  # (y, x) pixels to use
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -75,13 +75,13 @@ class PixelSums:
         ny, nx = tile.shape
         self.model, self.position = model, 0
         read, shot = variance or (tile.read, tile.shot)
-        # The first pixel relative to the tile's centre, at which the frames' parameters hold.
+        # The first pixel relative to the tile's centre, where the frames' parameters hold.
         self._fixed = (-(ny - 1) / 2, -(nx - 1) / 2, model, read, shot)
         self._coding = coding
         self._g, self._dk = (f.astype(np.float32) for f in (frames.at(*tile.centre), frames.dk))
         self._part, self._total = np.zeros((2, ny, N_SUMS, nx))
         self.turn, self.sigma = np.full((2, len(ranges), ny, nx), np.nan, np.float32)
-        # Where sums are cut: at the ends of batches, and where one begins after a gap.
+        # Sums are cut at the ends of batches, and where one begins after a gap.
         self._cuts = {a: GAP for a, b in ranges if b > a}
         self._cuts |= {b: n for n, (a, b) in enumerate(ranges) if b > a}
 
@@ -99,7 +99,7 @@ class PixelSums:
 
     @property
     def sums(self) -> F64:
-        """Of all frames so far (N_SUMS, y, x), as `solve_pixels` takes them."""
+        """Sums of all frames so far (N_SUMS, y, x), for `solve_pixels`."""
         return np.moveaxis(self._total + self._part, 1, 0)
 
     def finish(self) -> tuple[F64, F64, F64, F64]:
@@ -172,7 +172,7 @@ def start_model(
 def _unweighted_pixels(
     tile: Tile, blocks: Sequence[U16], coding: Coding, frames: FrameParameters
 ) -> F64:
-    """Pixels (3, y, x) by least squares in which all samples count alike."""
+    """Pixels (3, y, x) by unweighted least squares."""
     nothing = np.zeros((3, *tile.shape), np.float32)
     even = (np.ones(tile.shape, np.float32), np.zeros(tile.shape, np.float32))
     return solve_pixels(accumulate(tile, blocks, coding, frames, nothing, variance=even))[0]

@@ -1,8 +1,8 @@
-"""Planes through tiles' phases, and sums from which every shape of the fringes can be fitted.
+"""Planes through tiles' phases, and sums to fit any shape of the fringes.
 
-Over a tile, any shape of the fringes is a polynomial of low degree about its centre, to far below
-the noise. Sums over pixels are made once with these polynomials; every shape then needs a few
-numbers per tile, and no map is read again to fit another.
+Over a tile, any shape of the fringes is a polynomial of low degree about its centre, with an error
+far below the noise. Sums over pixels with these polynomials are computed once; every shape then
+needs a few numbers per tile, without reading a map again.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,12 +15,12 @@ from pixcal.estimators.fringe_fit.fringes import grid, monomials, plane_wave, po
 from pixcal.estimators.fringe_fit.gauge import FRINGE_MODES
 from pixcal.model.arrays import F32, F64, Mask
 
-MAX_PIXELS = 1024  # pixels that a tile's plane is laid through
-# as the polynomial that shapes are judged by, which a window of one tile must hold as well
+MAX_PIXELS = 1024  # pixels to which a tile's plane is fitted
+# that of the polynomial for tests of shapes, which a window of one tile must also represent
 DEGREE = 5
-SCALE_PX = 64.0  # coordinates from the tile's centre are counted in these: half a tile
+SCALE_PX = 64.0  # unit of coordinates from the tile's centre: half a tile
 POWERS = powers(DEGREE)
-NODES = 6  # points along each axis at which functions are looked at
+NODES = 6  # points along each axis at which functions are evaluated
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def tile_plane(
     slope: tuple[float, float],
     centre: tuple[float, float],
 ) -> TilePlane:
-    """Plane through a tile's phases (through a thousand of them, when there are more).
+    """Plane through a tile's phases (at most a thousand of them).
 
     phase, sigma, ratio : (y, x) relative to the carrier and its error, rad; iota / alpha
     slope, centre : of the phase along x and y, rad/px, to within a turn; (y, x) of the tile, px
@@ -78,9 +78,9 @@ def tile_plane(
 
 
 def unwrap(planes: Sequence[TilePlane], grid_shape: tuple[int, int]) -> list[TilePlane]:
-    """Add whole turns to planes, outwards from the middle, so that neighbouring tiles agree.
+    """Add multiples of 2π to planes, outwards from the centre, so that neighbouring tiles agree.
 
-    Tiles that no neighbour joins are joined to the nearest tile across the gap.
+    Tiles without a joined neighbour are joined to the nearest tile across the gap.
     """
     rows, columns = grid_shape
     table = np.array(planes, dtype=object).reshape(rows, columns)
@@ -115,7 +115,7 @@ def unwrap(planes: Sequence[TilePlane], grid_shape: tuple[int, int]) -> list[Til
 
 
 def _joined(here: TilePlane, there: TilePlane) -> TilePlane:
-    """A plane on the turn that another, unwrapped, leads to."""
+    """A plane plus a multiple of 2π, to continue an unwrapped one."""
     dy, dx = there.centre[0] - here.centre[0], there.centre[1] - here.centre[1]
     expected = here.phase + (here.kx + there.kx) / 2 * dx + (here.ky + there.ky) / 2 * dy
     turns = np.rint((expected - there.phase) / (2 * np.pi))
@@ -145,32 +145,32 @@ def expand(function: Callable[[F64, F64], F64], centres: F64) -> F64:
     values = np.asarray(function(at_y, at_x))
     values = values.reshape(*values.shape[:-1], len(centres), len(y))
     terms = values @ fit.T
-    # Rounding must not pass for a term: on a single row a mode along y is exactly nothing.
+    # Rounding must not count as a term: on a single row, a mode along y is exactly zero.
     terms[np.abs(terms) < 1e-13 * np.abs(terms).max(axis=-1, keepdims=True)] = 0.0
     return np.moveaxis(terms, -2, 0)
 
 
-# modes of a tile: the polynomials, then the fringes that free intensities leave open
+# modes of a tile: the polynomials, then fringes degenerate with free intensities
 N_LOCAL = len(POWERS) + len(FRINGE_MODES)
 _PLANE = 7
 
 
 @dataclass(frozen=True)
 class Carrier:
-    """The plane wave that phases are relative to: ``k . (r - reference)``."""
+    """The reference plane wave of phases: ``k . (r - reference)``."""
 
     k: tuple[float, float]  # (kx, ky), rad/px
     reference: tuple[float, float]  # (y, x), px
 
     def phase(self, y: F64, x: F64) -> F64:
-        """Phase (rad) at coordinates that broadcast."""
+        """Phase (rad) at coordinates, which broadcast."""
         ry, rx = self.reference
         return np.asarray(self.k[0] * (x - rx) + self.k[1] * (y - ry))
 
 
 @dataclass(frozen=True)
 class TileSums:
-    """Least squares of the modes of tiles, one entry a tile; phases are relative to the planes."""
+    """Least squares of tiles' modes, one entry per tile; phases are relative to the planes."""
 
     planes: list[TilePlane]
     normal: F64  # (tile, mode, mode)
@@ -198,7 +198,7 @@ class TileSums:
         return cls(planes, normal, right, square, pixels)
 
     def with_planes(self, planes: Sequence[TilePlane]) -> "TileSums":
-        """The same with planes on other turns."""
+        """The same sums with planes that differ by multiples of 2π."""
         return TileSums(list(planes), self.normal, self.right, self.square, self.pixels)
 
 
@@ -232,7 +232,7 @@ def sum_row(
     modes *= root
     normal, right = modes @ modes.T, np.empty((N_LOCAL, 1 + len(batches)))
     right[:, 0] = modes @ (root * rest)
-    # Small numbers, all of them noise: float32 is enough, and takes a third of the time.
+    # Small numbers, mainly noise: float32 is enough, and takes a third of the time.
     several = np.where(usable, batches.reshape(len(batches), phase.size), np.float32(0))
     several[np.isnan(several)] = 0
     right[:, 1:] = (modes.astype(np.float32) * root.astype(np.float32)) @ several.T
