@@ -12,7 +12,6 @@ where it stopped.
 """
 
 import argparse
-import json
 import tempfile
 from collections.abc import Sequence
 from functools import partial
@@ -27,10 +26,10 @@ import pixcal
 from blind_examination.parameters import check_parameters
 from blind_examination.strengths import VARIANTS
 from pixcal.effects import known_effects
-from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.config import to_plain
 from pixcal.stages.evidence import load_evidence
 from power import bench
+from study import run_study
 
 PAGE = Path(__file__).parents[1] / "docs/appendix/errors.md"
 # words in the names of parameters that are roots of measured variances
@@ -120,19 +119,9 @@ def main() -> None:
         for n, variant in enumerate(VARIANTS)
         if not options.effects or variant.effect in options.effects
     ]
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.touch()
-    results = [json.loads(line) for line in options.out.read_text("utf-8").splitlines()]
-    known = {(r["variant"], r["times"], r["draw"]) for r in results}
-    pending = [case for case in cases if case not in known]
-    with options.out.open("a", encoding="utf-8") as lines:
-
-        def keep(_: int, result: dict[str, Any]) -> None:
-            results.append(result)
-            print(json.dumps(result), file=lines, flush=True)
-
-        runtime = Runtime(cluster="processes", quiet=False)
-        run_tasks(examine, pending, runtime, label="acquisitions", done=keep)
+    results = run_study(
+        examine, cases, lambda r: (r["variant"], r["times"], r["draw"]), options.out
+    )
     print(table(results))
     if options.write:
         text = PAGE.read_text(encoding="utf-8")

@@ -23,8 +23,8 @@ from numpy.random import default_rng
 
 import pixcal
 from blind_examination.strengths import variants_of
-from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.bench import SCHEMA
+from study import run_study
 
 STRENGTHS = (0.3, 1.0, 3.0, 10.0)  # times the threshold
 Case = tuple[str, float, int]  # effect ("" for none), strength, number of the draw
@@ -126,19 +126,9 @@ def main() -> None:
     names = options.effects or sorted(variants_of())
     cases: list[Case] = [("", 0.0, draw) for draw in range(options.nominal)]
     cases += [(n, s, d) for d in range(options.draws) for s in options.strengths for n in names]
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.touch()
-    results = [json.loads(line) for line in options.out.read_text("utf-8").splitlines()]
-    known = {(r["effect"], r["strength"], r["draw"]) for r in results}
-    pending = [case for case in cases if case not in known]
-    with options.out.open("a", encoding="utf-8") as lines:
-
-        def keep(_: int, result: dict[str, Any]) -> None:
-            results.append(result)
-            print(json.dumps(result), file=lines, flush=True)
-
-        runtime = Runtime(cluster="processes", quiet=False)
-        run_tasks(examine, pending, runtime, label="acquisitions", done=keep)
+    results = run_study(
+        examine, cases, lambda r: (r["effect"], r["strength"], r["draw"]), options.out
+    )
     print(table(results))
 
 

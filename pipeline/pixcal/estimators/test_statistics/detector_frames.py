@@ -143,10 +143,13 @@ def bias_change(evidence: Evidence) -> Curve | None:
 KINDS = (("bias",), ("dark",), ("flat",))
 
 
-def _neighbours(evidence: Evidence, kind: str) -> F64 | None:
-    """Correlation (step,) in the differences of two frames of a kind."""
+def _neighbours(evidence: Evidence, kind: str, steps: slice) -> Curve | None:
+    """Correlation in the differences of two frames of a kind, of some of `STEPS`."""
     stacks = repeated(evidence, kind)
-    return _correlation(evidence, stacks) if stacks else None
+    if not stacks:
+        return None
+    every = np.arange(len(STEPS), dtype=float)
+    return Curve(every[steps], _correlation(evidence, stacks)[steps])
 
 
 @family(
@@ -154,9 +157,8 @@ def _neighbours(evidence: Evidence, kind: str) -> F64 | None:
     "correlation", x="neighbour", sets=False,
 )  # fmt: skip
 def neighbours(kind: str, evidence: Evidence) -> Curve | None:
-    """Of pixels that touch: by itself, for most crosstalk is there."""
-    value = _neighbours(evidence, kind)
-    return None if value is None else Curve.numbered(value[:ADJACENT])
+    """Correlation of pixels that touch, where most crosstalk is."""
+    return _neighbours(evidence, kind, slice(ADJACENT))
 
 
 @family(
@@ -164,11 +166,8 @@ def neighbours(kind: str, evidence: Evidence) -> Curve | None:
     "correlation", x="far neighbour", sets=False,
 )  # fmt: skip
 def far_neighbours(kind: str, evidence: Evidence) -> Curve | None:
-    """Of pixels two to four rows or columns apart."""
-    value = _neighbours(evidence, kind)
-    if value is None:
-        return None
-    return Curve(np.arange(ADJACENT, len(STEPS), dtype=float), value[ADJACENT:])
+    """Correlation of pixels two to four rows or columns apart."""
+    return _neighbours(evidence, kind, slice(ADJACENT, None))
 
 
 @family(
