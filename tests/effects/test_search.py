@@ -311,6 +311,27 @@ def test_a_stand_in_for_an_unknown_cause_is_not_claimed(size: float) -> None:
     assert "stays unexplained" in found.candidates["little"].reason
 
 
+def test_where_all_candidates_close_little_the_search_ends_with_the_first_round() -> None:
+    """Beside a large unknown cause no set of them could be claimed, so none is confirmed."""
+    asked: list[str] = []
+
+    def noted(
+        benches: Sequence[Sequence[Effect]], seeds: int, label: str, names: Sequence[str]
+    ) -> list[list[dict[Key, Curve]] | str]:
+        asked.extend([label] * len(benches))
+        return simulate(benches, seeds, label, names)
+
+    small = {"left": 0.005, "little": 0.006, "right": 0.0}
+    data = REFERENCE.on_scale(curves((), 500, small | {"unknown": 0.05}))
+    named = {label: candidate(label, size or 0.001) for label, size in small.items()}
+    found = Search(REFERENCE, data, noted, lambda *_: {}).run(named)
+    assert not found.accepted
+    assert set(asked) == {"candidates, round 1"}
+    assert "stays unexplained" in found.candidates["left"].reason
+    assert all(one.reason for one in found.candidates.values())
+    assert all(one.alone is not None for one in found.candidates.values())
+
+
 @pytest.mark.parametrize(("unknown", "claimed"), [(0.012, True), (0.06, False)])
 def test_no_cause_is_claimed_where_what_differs_most_stays(unknown: float, claimed: bool) -> None:
     """However much of the rest it closes: the main cause is another."""

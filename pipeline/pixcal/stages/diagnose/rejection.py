@@ -5,7 +5,7 @@ measured as a curve can absorb the joint effect of two others; neither then impr
 pairs of the strongest other candidates are tried in its place.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -19,6 +19,7 @@ MIN_LOGLIK_GAIN_WEAK = 12.0
 OPEN = 0.15  # residual gap above which an unknown cause is assumed
 LITTLE = 0.1  # fraction of the gap that a doubtful cause must close,
 BESIDE_OPEN = 0.25  # and every cause, as a fraction of the residual gap
+TOGETHER = 0.5  # fraction that all candidates must close for a search beyond the first round
 
 UNTRIED = ("not decided", "not tested", "cannot be simulated")  # how such reasons begin
 
@@ -64,6 +65,34 @@ def redundant(
     return least, "the other causes explain the data as well without it"
 
 
+def stands_in(closed: float, still_open: float) -> str:
+    """Why a cause is rejected that closes little of a large gap."""
+    return (
+        f"closes only {max(closed, 0):.1%} of the gap while {still_open:.0%} stays unexplained; it "
+        "may stand in for an unknown cause"
+    )
+
+
+def none_closes_enough(
+    comparison: Comparison, alone: Iterable[tuple[str, Trial]]
+) -> dict[str, float]:
+    """Fraction of the gap that each candidate closes, if `doubtful` would reject any set of them.
+
+    So it is if all together close less than `TOGETHER`, and each less than `BESIDE_OPEN` of what
+    is left then. Otherwise the result is empty. ``alone``: names of candidates, and benches with
+    this one only.
+    """
+    if not comparison.differs(comparison.nominal):
+        return {}
+    trials = list(alone)
+    where = comparison.gap_of(*(trial for _, trial in trials))
+    closed: dict[str, float] = {}
+    for name, trial in trials:
+        closed[name] = max(1 - comparison.residual(trial, where), closed.get(name, 0.0))
+    little = all(one < BESIDE_OPEN * (1 - TOGETHER) for one in closed.values())
+    return closed if little and sum(closed.values()) < TOGETHER else {}
+
+
 def doubtful(
     comparison: Comparison,
     current: Trial,
@@ -103,19 +132,16 @@ def doubtful(
         return least, "the largest difference remains; it may stand in for an unknown cause"
     if least is None:
         return None
-    closes = f"closes only {max(closed[least], 0):.1%} of the gap"
     if open_still > OPEN or least not in imitated:
-        return least, (
-            f"{closes} while {open_still:.0%} stays unexplained; it may stand in for an unknown "
-            "cause"
-        )
+        return least, stands_in(closed[least], open_still)
     sigmas, mimicked = candidates[least].significance, 1 - candidates[least].share
     why = f"the other causes produce {mimicked:.0%} of its significance"
     if sigmas < SIGNIFICANT:
         why = f"it is not significant ({sigmas:.1f} sigma) in the frames that it was fitted to"
     return (
         least,
-        f"{closes}, and {why}; it may only describe how the other causes deviate from their laws",
+        f"closes only {max(closed[least], 0):.1%} of the gap, and {why}; it may only describe how "
+        "the other causes deviate from their laws",
     )
 
 

@@ -30,8 +30,10 @@ from pixcal.stages.diagnose.rejection import (
     exchanges,
     explained_by_other_law,
     needed_gain,
+    none_closes_enough,
     redundant,
     similar_to,
+    stands_in,
     too_little,
 )
 from pixcal.stages.diagnose.trial import Curves, Effects
@@ -109,8 +111,9 @@ class Search:
         self._reject_undecided()
         if not remaining:
             return False
-        gains, effect, best = self._favoured(*self._tried())
-        if effect is None:
+        laws, replays = self._tried()
+        gains, effect, best = self._favoured(laws, replays)
+        if effect is None or self._none_closes_enough(laws, replays):
             return False
         del remaining[best]
         confirmed = self._confirmed((*causes.bench, effect), asked=[*remaining])
@@ -125,6 +128,22 @@ class Search:
         causes.alike[best] = tuple(n for n, g in gains.items() if n != best and g > enough)
         self._leave_explained(best)
         return True
+
+    def _none_closes_enough(self, laws: Additions, replays: Additions) -> bool:
+        """Reject all candidates if they leave most of the gap, whichever are accepted."""
+        if self._causes.effects:
+            return False
+        alone = [(one.name, one.trial) for one in (*laws.values(), *replays.values())]
+        # One simulation was enough for candidates without promise.
+        once = self._remaining.keys() - laws.keys() - replays.keys()
+        alone += [
+            (name, one) for name in sorted(once) if (one := self._remaining[name].alone) is not None
+        ]
+        closed = none_closes_enough(self.comparison, alone)
+        for name, share in closed.items():
+            candidate = self._candidates[name]
+            candidate.reason = candidate.reason or stands_in(share, 1 - share)
+        return bool(closed)
 
     def _leave_explained(self, cause: str) -> None:
         """Leave out candidates whose significance comes mostly from the causes."""
