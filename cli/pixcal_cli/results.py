@@ -192,7 +192,7 @@ def show_diagnosis(run: Path) -> None:
     else:
         click.echo(
             "  gap: sum of all significant differences between frames and simulation, each "
-            "weighted by its significance squared"
+            "squared, in units of the scatter of nominal simulations"
         )
     columns: Columns = {
         "gap closed": lambda c: _closed(c["gap_closed"], c["gap_closed_interval"]),
@@ -209,6 +209,7 @@ def show_diagnosis(run: Path) -> None:
         "measured": lambda e: f"{number(e['measured'], 3)} {e['unit']}".strip(),
         "nominal": lambda e: number(e["simulated"], 3),
         "with causes": lambda e: number(e["after"], 3),
+        "difference/scatter": lambda e: f"{abs(e['size']):.{0 if abs(e['size']) > 10 else 1}f}",
         "significance σ": lambda e: f"{e['significance']:.1f}",
     }
     told = [e for e in gap["where"] if e["significance"] > 0]

@@ -53,8 +53,8 @@ def a_curve(
         "measured": list(1 + 0.01 * sigma * last), "nominal": band(0.0),
         "with_effects": band(sigma - after), "z": list(sigma * last),
         "z_after": list(after * last), "in_gap": sigma > NOTICED, "weight": sigma**2,
-        "left": min(1.0, (after / sigma) ** 2) if after > 2 else 0.0, "significance": sigma,
-        "significance_after": after if after > 1 else -37.0,
+        "left": min(1.0, (after / sigma) ** 2) if after > 2 else 0.0, "size": sigma,
+        "significance": sigma, "significance_after": after if after > 1 else -37.0,
     } | changes  # fmt: skip
 
 

@@ -159,9 +159,9 @@ def largest(curves: Sequence[Facts]) -> list[Facts]:
 
 
 def differing(result: DiagnosisContents) -> list[Facts]:
-    """Statistics that differ, the most significant first."""
+    """Statistics that differ, the largest effect first."""
     told = (c for c in result.curves if c["in_gap"] and c["significance"] > 0)
-    return sorted(told, key=lambda c: -c["significance"])
+    return sorted(told, key=lambda c: -c["size"])
 
 
 def still_differing(result: DiagnosisContents) -> list[Facts]:
@@ -185,7 +185,8 @@ def worst_of_each_domain(curves: Sequence[Facts]) -> tuple[list[Facts], list[Fac
 def statistics(title: str, curves: Sequence[Facts], causes: Any) -> Table:
     """A row for each statistic: its worst value, measured and simulated."""
     after = ["with causes", "significance (σ)", "residual"] if causes else []
-    header = ["domain", "statistic", "where", "measured", "nominal", "significance (σ)", *after]
+    header = ["domain", "statistic", "where", "measured", "nominal", "difference/scatter"]
+    header += ["significance (σ)", *after]
     return Table(title, header, [_row(c, bool(causes)) for c in curves])
 
 
@@ -196,7 +197,7 @@ def _row(curve: Facts, causes: bool) -> list[str]:
     digits = digits_apart(measured, nominal)
     value = f"{number(measured, digits)} {unit(curve['unit'])}".strip()
     row = [curve["domain"], curve["title"], of + place(curve, at), value]
-    row += [number(nominal, digits), f"{curve['significance']:.1f}"]
+    row += [number(nominal, digits), number(curve["size"], 2), f"{curve['significance']:.1f}"]
     if causes:
         left = percent(curve["left"]) if curve["in_gap"] else "new"
         after = number(curve["with_effects"]["value"][at], digits)

@@ -32,7 +32,7 @@ STAGES = {
         ArtefactKind("fit", 1, "fit RUN"),
         ArtefactKind("allan", 1, "allan RUN", products="allan.json"),
         ArtefactKind("crests", 1, "crests RUN", products="crests*.*"),
-        ArtefactKind("diagnose", 6, "diagnose RUN", of_fringes=False, products="diagnosis.json"),
+        ArtefactKind("diagnose", 7, "diagnose RUN", of_fringes=False, products="diagnosis.json"),
         ArtefactKind("corrected", 3, "fit RUN --with-diagnosis"),
         ArtefactKind("astrometry", 1, "astrometry RUN", products="astrometry.*"),
         ArtefactKind("report", 2, "report RUN", of_fringes=False, products="report.html"),

@@ -31,6 +31,15 @@ def signature_curve(significance: float) -> Curve:
     return Curve.numbered([float(np.copysign(size, significance))])
 
 
+def straight_significance(key: Key, values: F64) -> F64:
+    """Values of a signature without the logarithm of `signature_curve`; others as they are."""
+    if not key[0].startswith(_PREFIX):
+        return values
+    size = np.maximum(np.abs(values), STRAIGHT)
+    far = np.copysign(STRAIGHT * np.exp(size / STRAIGHT - 1), values)
+    return np.asarray(np.where(np.abs(values) > STRAIGHT, far, values))
+
+
 def statistic_named(name: str) -> Statistic:
     """A statistic of the test statistics, or the signature of an effect."""
     if name in known_statistics():

@@ -68,8 +68,8 @@ def redundant(
 def stands_in(closed: float, still_open: float) -> str:
     """Why a cause is rejected that closes little of a large gap."""
     return (
-        f"closes only {max(closed, 0):.1%} of the gap while {still_open:.0%} stays unexplained; it "
-        "may stand in for an unknown cause"
+        f"accounts for only {max(closed, 0):.1%} of the significant differences while "
+        f"{still_open:.0%} stays unexplained; it may stand in for an unknown cause"
     )
 
 
@@ -140,8 +140,8 @@ def doubtful(
         why = f"it is not significant ({sigmas:.1f} sigma) in the frames that it was fitted to"
     return (
         least,
-        f"closes only {max(closed[least], 0):.1%} of the gap, and {why}; it may only describe how "
-        "the other causes deviate from their laws",
+        f"accounts for only {max(closed[least], 0):.1%} of the significant differences, and {why}; "
+        "it may only describe how the other causes deviate from their laws",
     )
 
 

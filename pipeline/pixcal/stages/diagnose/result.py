@@ -143,7 +143,7 @@ class _Description:
             return "no gap"
         if not self.found.accepted:
             return "unexplained"
-        gap, after = self.final.gap, self.final.after
+        gap, after = self.final.significant, self.final.after
         still = [
             key
             for key in flagged(after)
@@ -245,6 +245,7 @@ class _Description:
                 "in_gap": key in self.where,
                 "weight": gap.weights.get(key, 0.0),
                 "left": gap.left.get(key, 0.0),
+                "size": self.final.sizes[key].largest,
                 "significance": sigmas_of(before.log_chance),
                 "significance_after": sigmas_of(after.log_chance),
             }
@@ -258,9 +259,9 @@ class _Description:
         return {name: _natural(values, usual).tolist() for name, values in ends}
 
     def _where(self) -> list[Json]:
-        """Statistics that differ, most significant first; then those only with effects."""
-        before, after = self.final.before, self.final.after
-        keys = sorted(self.where, key=lambda k: before[k].log_chance)
+        """Statistics that differ, the largest effect first; then those only with effects."""
+        before, after, sizes = self.final.before, self.final.after, self.final.sizes
+        keys = sorted(self.where, key=lambda k: -sizes[k].largest)
         keys += sorted(flagged(after) - self.where, key=lambda k: after[k].log_chance)
         return [self._entry(key, before[key], after[key]) for key in keys]
 
@@ -278,6 +279,7 @@ class _Description:
             "after": curve["with_effects"]["value"][at],
             "z": _rounded(float(before.sigmas[at])),
             "z_after": _rounded(float(after.sigmas[at])),
+            "size": _rounded(float(self.final.sizes[key].sizes[at])),
             "significance": _rounded(sigmas_among(before.log_chance, len(self.final.before))),
             "left": _rounded(self.final.gap.left.get(key, 0.0)),
             "place": set_name + place(curve, at),

@@ -1,0 +1,95 @@
+"""Effect sizes of the gap, on curves drawn with known distributions."""
+
+import numpy as np
+import pytest
+
+from pixcal.estimators.test_statistics import Curve, Key
+from pixcal.estimators.test_statistics.effect_size import effect_sizes, gap_of_sizes
+from pixcal.estimators.test_statistics.expectation import (
+    FLOOR,
+    STRAIGHT,
+    Reference,
+    expect_nominal,
+    expect_with,
+    signature_curve,
+    signature_key,
+    straight_significance,
+)
+from pixcal.estimators.test_statistics.gap import compare, flagged, sigmas_of
+
+LINEAR: Key = ("harmonics", "a")
+POWER: Key = ("contrast_of_frames", "a")
+SIGNATURE = signature_key("lag", "time")
+
+
+def drawn(seed: int, shift: float = 0.0, power: float = 1.0, sigmas: float = 0) -> dict[Key, Curve]:
+    rng = np.random.default_rng(seed)
+    x = np.arange(5.0)
+    return {
+        LINEAR: Curve(x, 3e-6 * (rng.standard_normal(5) + shift)),
+        POWER: Curve(x, 1e-9 * power * rng.chisquare(200, 5) / 200),
+        SIGNATURE: signature_curve(sigmas + rng.standard_normal()),
+    }
+
+
+REFERENCE = Reference.of([drawn(seed) for seed in range(100, 116)])
+NOMINAL = expect_nominal(REFERENCE)
+
+
+def sizes_of(**effect: float) -> dict[Key, float]:
+    data = REFERENCE.on_scale(drawn(7, **effect))
+    return {key: one.largest for key, one in effect_sizes(data, NOMINAL, NOMINAL).items()}
+
+
+def test_a_size_grows_with_the_strength_where_a_significance_saturates() -> None:
+    weak, strong = sizes_of(shift=40), sizes_of(shift=4000)
+    assert strong[LINEAR] / weak[LINEAR] == pytest.approx(100, rel=0.1)
+    data = [REFERENCE.on_scale(drawn(7, shift=shift)) for shift in (40, 4000)]
+    limited = [sigmas_of(compare(one, NOMINAL)[LINEAR].log_chance) for one in data]
+    assert limited[1] < 3 * limited[0]
+
+
+def test_powers_count_as_amplitudes() -> None:
+    weak, strong = sizes_of(power=4.0), sizes_of(power=1e6)
+    assert strong[POWER] / weak[POWER] == pytest.approx(999, rel=0.3)
+
+
+@pytest.mark.parametrize("sigmas", [50.0, 3000.0])
+def test_a_significance_counts_in_full(sigmas: float) -> None:
+    assert sizes_of(sigmas=sigmas)[SIGNATURE] == pytest.approx(sigmas, rel=0.5)
+    values = np.array([-sigmas, -3.0, 0.0, STRAIGHT, sigmas])
+    on_scale = np.array([signature_curve(v).value[0] for v in values])
+    np.testing.assert_allclose(straight_significance(SIGNATURE, on_scale), values, rtol=1e-12)
+    assert straight_significance(LINEAR, on_scale) is on_scale
+
+
+def test_nothing_differs_beyond_two_standard_deviations_from_itself() -> None:
+    found = effect_sizes(NOMINAL.mean, NOMINAL, NOMINAL)
+    assert all(one.largest == 0 and one.beyond == 0 for one in found.values())
+    inside = {key: NOMINAL.mean[key] + 1.9 * np.sqrt(NOMINAL.variance[key]) for key in NOMINAL.mean}
+    found = effect_sizes(inside, NOMINAL, NOMINAL)
+    assert all(one.largest > 0.5 and one.beyond == 0 for one in found.values())
+
+
+def test_the_strong_effect_is_the_gap_and_what_it_opens_counts() -> None:
+    data = REFERENCE.on_scale(drawn(7, shift=4000, power=2.0))
+    before = effect_sizes(data, NOMINAL, NOMINAL)
+    where = flagged(compare(data, NOMINAL))
+    assert where == {LINEAR, POWER}
+
+    def left_with(**effect: float) -> float:
+        expected = expect_with(REFERENCE, [drawn(s, **effect) for s in range(100, 108)])
+        after = effect_sizes(data, expected, NOMINAL)
+        return gap_of_sizes(before, after, where, flagged(compare(data, expected))).total
+
+    assert left_with() == pytest.approx(1, abs=0.01)
+    assert left_with(shift=4000) < 1e-3
+    assert left_with(power=2.0) > 0.99
+    assert left_with(shift=4000, power=2.0, sigmas=4000.0) > 0.5
+
+
+def test_the_least_scatter_of_a_significance_is_its_floor() -> None:
+    alike = Reference.of([{SIGNATURE: signature_curve(0.0)} for _ in range(16)])
+    nominal = expect_nominal(alike)
+    data = alike.on_scale({SIGNATURE: signature_curve(5.0)})
+    assert effect_sizes(data, nominal, nominal)[SIGNATURE].largest == pytest.approx(5 / FLOOR)
