@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from pixcal.report.text import chance, not_tested, share_by_law
+from pixcal.report.text import chance, not_tested, share_by_law, times
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.manifest import MANIFEST, read_json
 from pixcal_cli.printing import Columns, number, show_notes, show_records, show_table, with_error
@@ -191,8 +191,8 @@ def show_diagnosis(run: Path) -> None:
         show_notes(list(filter(None, [not_tested(diagnosis)])))
     else:
         click.echo(
-            "  gap: sum of all significant differences between frames and simulation, each "
-            "squared, in units of the scatter of nominal simulations"
+            "  gap: sum of the squares of all significant differences between frames and "
+            "simulation, in units of the scatter of nominal simulations"
         )
     columns: Columns = {
         "gap closed": lambda c: _closed(c["gap_closed"], c["gap_closed_interval"]),
@@ -209,7 +209,7 @@ def show_diagnosis(run: Path) -> None:
         "measured": lambda e: f"{number(e['measured'], 3)} {e['unit']}".strip(),
         "nominal": lambda e: number(e["simulated"], 3),
         "with causes": lambda e: number(e["after"], 3),
-        "difference/scatter": lambda e: f"{abs(e['size']):.{0 if abs(e['size']) > 10 else 1}f}",
+        "difference/scatter": lambda e: times(e["size"]),
         "significance σ": lambda e: f"{e['significance']:.1f}",
     }
     told = [e for e in gap["where"] if e["significance"] > 0]

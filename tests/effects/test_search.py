@@ -308,7 +308,7 @@ def test_a_stand_in_for_an_unknown_cause_is_not_claimed(size: float) -> None:
     found, left = search({"unknown": 0.05, "little": 0.004}, [candidate("little", size)])
     assert not found.accepted
     assert left == pytest.approx(1, abs=0.02)
-    assert "stays unexplained" in found.candidates["little"].reason
+    assert "stays open" in found.candidates["little"].reason
 
 
 def test_where_all_candidates_close_little_the_search_ends_with_the_first_round() -> None:
@@ -326,10 +326,33 @@ def test_where_all_candidates_close_little_the_search_ends_with_the_first_round(
     named = {label: candidate(label, size or 0.001) for label, size in small.items()}
     found = Search(REFERENCE, data, noted, lambda *_: {}).run(named)
     assert not found.accepted
-    assert set(asked) == {"candidates, round 1"}
-    assert "stays unexplained" in found.candidates["left"].reason
+    assert set(asked) == {"candidates, round 1", "all candidates"}
+    assert asked.count("all candidates") == 1
+    assert "stays open" in found.candidates["left"].reason
     assert all(one.reason for one in found.candidates.values())
     assert all(one.alone is not None for one in found.candidates.values())
+
+
+def test_candidates_that_close_much_together_are_sought_further(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each alone closes little, as when it only undoes what another one opens."""
+    asked: list[str] = []
+
+    def noted(
+        benches: Sequence[Sequence[Effect]], seeds: int, label: str, names: Sequence[str]
+    ) -> list[list[dict[Key, Curve]] | str]:
+        asked.extend([label] * len(benches))
+        return simulate(benches, seeds, label, names)
+
+    monkeypatch.setattr(
+        Comparison, "residual", lambda _, trial, __: 0.1 if len(trial.effects) == 2 else 0.95
+    )
+    truth = {"left": 0.03, "right": 0.03}
+    named = {label: candidate(label, size) for label, size in truth.items()}
+    Search(REFERENCE, REFERENCE.on_scale(curves((), 500, truth)), noted, lambda *_: {}).run(named)
+    assert "all candidates" in asked
+    assert "candidates, round 2" in asked
 
 
 @pytest.mark.parametrize(("unknown", "claimed"), [(0.012, True), (0.06, False)])
@@ -374,7 +397,7 @@ def test_a_cause_that_closes_much_less_than_stays_open_is_not_claimed(
     monkeypatch.setattr(comparison, "residual", lambda trial, _: left[trial.log_likelihood])
     rejected = doubtful(comparison, both, {"little": without}, {"little": candidate("little", 1.0)})
     assert (rejected is None) == claimed
-    assert claimed or "stays unexplained" in rejected[1]
+    assert claimed or "stays open" in rejected[1]
 
 
 @pytest.mark.parametrize(

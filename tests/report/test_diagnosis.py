@@ -53,7 +53,7 @@ def a_curve(
         "measured": list(1 + 0.01 * sigma * last), "nominal": band(0.0),
         "with_effects": band(sigma - after), "z": list(sigma * last),
         "z_after": list(after * last), "in_gap": sigma > NOTICED, "weight": sigma**2,
-        "left": min(1.0, (after / sigma) ** 2) if after > 2 else 0.0, "size": sigma,
+        "left": min(1.0, (after / sigma) ** 2) if after > 2 else 0.0, "size": -2 * sigma,
         "significance": sigma, "significance_after": after if after > 1 else -37.0,
     } | changes  # fmt: skip
 
@@ -326,8 +326,8 @@ def test_every_difference_is_listed_once_the_worst_of_each_domain_first() -> Non
         order = [row[0] for row in rows]
         assert order == sorted(order, key=list(dict.fromkeys(order)).index)
         for domain in set(order):
-            sigmas = [float(row[5]) for row in rows if row[0] == domain]
-            assert sigmas == sorted(sigmas, reverse=True)
+            sizes = [float(row[5]) for row in rows if row[0] == domain]
+            assert sizes == sorted(sizes, reverse=True)
     listed = [row[1] for row in (*first.rows, *rest.rows)]
     assert sorted(listed) == sorted(c["title"] for c in curves)
 
@@ -339,7 +339,7 @@ def test_values_that_hardly_differ_are_shown_with_the_digits_that_tell() -> None
     shown = diagnosis(contents(a_diagnosis(curves=(curve,))))
     (row,) = table(shown, "Statistics that differ").rows
     assert row[3:5] == ["1.0012 px", "1.0007"]
-    assert row[5] == "9.0"
+    assert row[5:7] == ["18", "9.0"]
 
 
 @pytest.mark.usefixtures("without_figures")

@@ -201,7 +201,8 @@ def write_diagnose(run: Path, verdict: str = "explained", effects: tuple[str, ..
         "kind": "linear", "domain": "time", "quantity": "slope", "unit": "",
         "x_label": "frames before", "x": [1.0, 2.0],
         "measured": [2.0, 1.0], "nominal": band, "with_effects": band, "z": [9.0, 0.0],
-        "z_after": [0.5, 0.0], "in_gap": True, "left": 0.0, "weight": 81.0, "significance": 9.0,
+        "z_after": [0.5, 0.0], "in_gap": True, "left": 0.0, "weight": 81.0, "size": 9.0,
+        "significance": 9.0,
         "significance_after": -37.0,
     }  # fmt: skip
     cause = {

@@ -23,6 +23,7 @@ from pixcal.report.text import (
     number,
     share_by_law,
     sigmas,
+    times,
     unit,
     with_error,
 )
@@ -161,7 +162,7 @@ def largest(curves: Sequence[Facts]) -> list[Facts]:
 def differing(result: DiagnosisContents) -> list[Facts]:
     """Statistics that differ, the largest effect first."""
     told = (c for c in result.curves if c["in_gap"] and c["significance"] > 0)
-    return sorted(told, key=lambda c: -c["size"])
+    return sorted(told, key=lambda c: -abs(c["size"]))
 
 
 def still_differing(result: DiagnosisContents) -> list[Facts]:
@@ -197,7 +198,7 @@ def _row(curve: Facts, causes: bool) -> list[str]:
     digits = digits_apart(measured, nominal)
     value = f"{number(measured, digits)} {unit(curve['unit'])}".strip()
     row = [curve["domain"], curve["title"], of + place(curve, at), value]
-    row += [number(nominal, digits), number(curve["size"], 2), f"{curve['significance']:.1f}"]
+    row += [number(nominal, digits), times(curve["size"]), f"{curve['significance']:.1f}"]
     if causes:
         left = percent(curve["left"]) if curve["in_gap"] else "new"
         after = number(curve["with_effects"]["value"][at], digits)

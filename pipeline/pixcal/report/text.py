@@ -62,6 +62,11 @@ def number(value: Any, digits: int = 3) -> str:
     return f"{mantissa} × 10{str(exponent).translate(_SUPERSCRIPT)}".replace("-", "−")
 
 
+def times(size: float) -> str:
+    """A size in units of a scatter, whichever its sign: one decimal below ten, else none."""
+    return _grouped(f"{abs(size):,.{0 if abs(size) >= 9.95 else 1}f}")
+
+
 def exact(value: Any) -> str:
     """A number with up to six digits, as many as it needs."""
     text = number(value, 6)

@@ -10,6 +10,7 @@ from pixcal.estimators.test_statistics import DETECTOR, Curve, Key, Statistic, k
 from pixcal.model.arrays import F64
 
 STRAIGHT = 10.0  # standard deviations beyond which they count by their logarithm
+_FARTHEST = 30.0  # largest value of a signature, over `STRAIGHT`, whose logarithm is undone
 _PREFIX, _INFIX = "estimate_of_", "_in_"
 Curves = Mapping[Key, Curve]
 
@@ -31,11 +32,14 @@ def signature_curve(significance: float) -> Curve:
     return Curve.numbered([float(np.copysign(size, significance))])
 
 
-def straight_significance(key: Key, values: F64) -> F64:
-    """Values of a signature without the logarithm of `signature_curve`; others as they are."""
-    if not key[0].startswith(_PREFIX):
-        return values
-    size = np.maximum(np.abs(values), STRAIGHT)
+def is_signature(key: Key) -> bool:
+    """Whether a curve is the detection significance of an effect."""
+    return key[0].startswith(_PREFIX)
+
+
+def straight_significance(values: F64) -> F64:
+    """Significances of signatures without the logarithm of `signature_curve`."""
+    size = np.clip(np.abs(values), STRAIGHT, _FARTHEST * STRAIGHT)
     far = np.copysign(STRAIGHT * np.exp(size / STRAIGHT - 1), values)
     return np.asarray(np.where(np.abs(values) > STRAIGHT, far, values))
 

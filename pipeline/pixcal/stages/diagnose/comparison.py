@@ -6,11 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixcal.estimators.test_statistics import Key
-from pixcal.estimators.test_statistics.effect_size import (
-    EffectSize,
-    effect_sizes,
-    gap_of_sizes,
-)
+from pixcal.estimators.test_statistics.effect_size import EffectSizes, SizeScale, gap_of_sizes
 from pixcal.estimators.test_statistics.expectation import (
     Expectation,
     Reference,
@@ -50,34 +46,28 @@ class Trial:
 class Shrinkage:
     """How much of the gap effects close."""
 
-    nominal: Trial
     # before, after: differences of the curves
     before: Mapping[Key, Difference]
     after: Mapping[Key, Difference]
-    sizes: Mapping[Key, EffectSize]  # of the curves before
+    scale: SizeScale
+    sizes: EffectSizes  # before
     where: set[Key]  # curves that make up the gap
     gap: Gap  # by effect sizes
     significant: Gap  # by significances
+
+    def with_expectation(self, data: Mapping[Key, F64], expected: Expectation) -> Gap:
+        """The gap, by effect sizes, with another expectation of the curves."""
+        new = flagged(compare(data, expected))
+        return gap_of_sizes(self.sizes, self.scale.compared(expected), self.where, new)
 
 
 def shrinkage(data: Mapping[Key, F64], nominal: Trial, other: Trial, where: set[Key]) -> Shrinkage:
     """The gap with the effects of a bench, relative to that of the nominal bench."""
     before, after = (compare(data, trial.expected) for trial in (nominal, other))
-    sizes = effect_sizes(data, nominal.expected, nominal.expected)
-    gap = _gap_with(data, sizes, other.expected, nominal.expected, where)
-    significant = remaining(before, after, where)
-    return Shrinkage(nominal, before, after, sizes, where, gap, significant)
-
-
-def _gap_with(
-    data: Mapping[Key, F64],
-    sizes: Mapping[Key, EffectSize],
-    expected: Expectation,
-    nominal: Expectation,
-    where: set[Key],
-) -> Gap:
-    after = effect_sizes(data, expected, nominal)
-    return gap_of_sizes(sizes, after, where, flagged(compare(data, expected)))
+    scale = SizeScale(data, nominal.expected)
+    sizes = scale.compared(nominal.expected)
+    gap = gap_of_sizes(sizes, scale.compared(other.expected), where, flagged(after))
+    return Shrinkage(before, after, scale, sizes, where, gap, remaining(before, after, where))
 
 
 def gap_interval(data: Mapping[Key, F64], shrunk: Shrinkage, other: Trial) -> tuple[float, float]:
@@ -94,8 +84,7 @@ def gap_interval(data: Mapping[Key, F64], shrunk: Shrinkage, other: Trial) -> tu
         shifts = np.split(error * rng.standard_normal(len(error)), ends)
         mean = {k: m + own for (k, m), own in zip(expected.mean.items(), shifts, strict=True)}
         shifted = replace(wider, mean=mean)
-        drawn = _gap_with(data, shrunk.sizes, shifted, shrunk.nominal.expected, shrunk.where)
-        draws.append(drawn.total)
+        draws.append(shrunk.with_expectation(data, shifted).total)
     low, high = np.quantile(draws, (0.05, 0.95))
     return min(float(low), total), max(float(high), total)
 

@@ -68,19 +68,23 @@ def redundant(
 def stands_in(closed: float, still_open: float) -> str:
     """Why a cause is rejected that closes little of a large gap."""
     return (
-        f"accounts for only {max(closed, 0):.1%} of the significant differences while "
-        f"{still_open:.0%} stays unexplained; it may stand in for an unknown cause"
+        f"closes only {_weighted(closed)} while {still_open:.0%} of it stays open; it may stand in "
+        "for an unknown cause"
     )
 
 
-def none_closes_enough(
+def _weighted(closed: float) -> str:
+    return f"{max(closed, 0):.1%} of the gap weighted by significance"
+
+
+def all_close_little(
     comparison: Comparison, alone: Iterable[tuple[str, Trial]]
 ) -> dict[str, float]:
-    """Fraction of the gap that each candidate closes, if `doubtful` would reject any set of them.
+    """Fraction of the gap that each candidate closes alone; empty unless all close little.
 
-    So it is if all together close less than `TOGETHER`, and each less than `BESIDE_OPEN` of what
-    is left then. Otherwise the result is empty. ``alone``: names of candidates, and benches with
-    this one only.
+    So it is if together they close less than `TOGETHER`, and each less than `BESIDE_OPEN` of what
+    is left then. If the fractions add up, `doubtful` would reject any set of these candidates.
+    ``alone``: names of candidates, and benches with this one only.
     """
     if not comparison.differs(comparison.nominal):
         return {}
@@ -140,8 +144,8 @@ def doubtful(
         why = f"it is not significant ({sigmas:.1f} sigma) in the frames that it was fitted to"
     return (
         least,
-        f"accounts for only {max(closed[least], 0):.1%} of the significant differences, and {why}; "
-        "it may only describe how the other causes deviate from their laws",
+        f"closes only {_weighted(closed[least])}, and {why}; it may only describe how the other "
+        "causes deviate from their laws",
     )
 
 

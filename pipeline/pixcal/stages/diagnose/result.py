@@ -245,7 +245,7 @@ class _Description:
                 "in_gap": key in self.where,
                 "weight": gap.weights.get(key, 0.0),
                 "left": gap.left.get(key, 0.0),
-                "size": self.final.sizes[key].largest,
+                "size": self.final.sizes.size[key],
                 "significance": sigmas_of(before.log_chance),
                 "significance_after": sigmas_of(after.log_chance),
             }
@@ -260,8 +260,8 @@ class _Description:
 
     def _where(self) -> list[Json]:
         """Statistics that differ, the largest effect first; then those only with effects."""
-        before, after, sizes = self.final.before, self.final.after, self.final.sizes
-        keys = sorted(self.where, key=lambda k: -sizes[k].largest)
+        before, after, size = self.final.before, self.final.after, self.final.sizes.size
+        keys = sorted(self.where, key=lambda k: (-abs(size[k]), k))
         keys += sorted(flagged(after) - self.where, key=lambda k: after[k].log_chance)
         return [self._entry(key, before[key], after[key]) for key in keys]
 
@@ -279,7 +279,7 @@ class _Description:
             "after": curve["with_effects"]["value"][at],
             "z": _rounded(float(before.sigmas[at])),
             "z_after": _rounded(float(after.sigmas[at])),
-            "size": _rounded(float(self.final.sizes[key].sizes[at])),
+            "size": _rounded(self.final.sizes.size[key]),
             "significance": _rounded(sigmas_among(before.log_chance, len(self.final.before))),
             "left": _rounded(self.final.gap.left.get(key, 0.0)),
             "place": set_name + place(curve, at),

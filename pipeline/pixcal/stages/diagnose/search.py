@@ -26,11 +26,12 @@ from pixcal.stages.diagnose.candidates import (
 from pixcal.stages.diagnose.comparison import MIN_LOGLIK_GAIN, Comparison, Trial
 from pixcal.stages.diagnose.rejection import (
     MIN_LOGLIK_GAIN_WEAK,
+    TOGETHER,
+    all_close_little,
     doubtful,
     exchanges,
     explained_by_other_law,
     needed_gain,
-    none_closes_enough,
     redundant,
     similar_to,
     stands_in,
@@ -113,7 +114,7 @@ class Search:
             return False
         laws, replays = self._tried()
         gains, effect, best = self._favoured(laws, replays)
-        if effect is None or self._none_closes_enough(laws, replays):
+        if effect is None or self._unexplainable(laws, replays):
             return False
         del remaining[best]
         confirmed = self._confirmed((*causes.bench, effect), asked=[*remaining])
@@ -129,8 +130,8 @@ class Search:
         self._leave_explained(best)
         return True
 
-    def _none_closes_enough(self, laws: Additions, replays: Additions) -> bool:
-        """Reject all candidates if they leave most of the gap, whichever are accepted."""
+    def _unexplainable(self, laws: Additions, replays: Additions) -> bool:
+        """Reject all candidates if they leave most of the gap, each alone and all together."""
         if self._causes.effects:
             return False
         alone = [(one.name, one.trial) for one in (*laws.values(), *replays.values())]
@@ -139,11 +140,24 @@ class Search:
         alone += [
             (name, one) for name in sorted(once) if (one := self._remaining[name].alone) is not None
         ]
-        closed = none_closes_enough(self.comparison, alone)
+        closed = all_close_little(self.comparison, alone)
+        if not closed or self._close_much_together(tuple(one.effect for one in laws.values())):
+            return False
         for name, share in closed.items():
             candidate = self._candidates[name]
             candidate.reason = candidate.reason or stands_in(share, 1 - share)
-        return bool(closed)
+        return True
+
+    def _close_much_together(self, effects: Effects) -> bool:
+        """Whether effects that close little alone compensate each other."""
+        if len(effects) < 2:
+            return False
+        (curves,) = self._simulate([effects], 1, "all candidates", ())
+        if isinstance(curves, str):
+            return False
+        trial = self.comparison.trial(effects, curves)
+        left = self.comparison.residual(trial, self.comparison.gap_of(trial))
+        return left < 1 - TOGETHER
 
     def _leave_explained(self, cause: str) -> None:
         """Leave out candidates whose significance comes mostly from the causes."""
