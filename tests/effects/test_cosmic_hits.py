@@ -186,6 +186,7 @@ def test_what_comes_again_in_a_pixel_is_no_hit(acquired: Callable[..., Evidence]
     assert found.significance < 4
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("places", [12, 400])
 def test_hits_that_come_back_to_the_same_pixels_are_none(
     acquired: Callable[..., Evidence], places: int

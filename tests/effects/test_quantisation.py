@@ -321,6 +321,7 @@ def test_single_wide_codes_are_measured_whatever_the_converter_does() -> None:
     assert np.abs(measured[even]).max() < 4.5 * (4_000_000 / 3000) ** -0.5  # chance of the counts
 
 
+@pytest.mark.long
 def test_widths_of_a_converter_of_sixteen_bits_are_measured() -> None:
     rng = np.random.default_rng(5)
     true = np.zeros(60_001)

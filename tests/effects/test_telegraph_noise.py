@@ -206,6 +206,7 @@ def test_what_looks_like_it_is_not_taken_for_it(
     assert found.significance < 4
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("steps", [0.5, 0.73])
 def test_it_is_found_in_noise_of_less_than_a_step_of_the_converter(
     acquired: Callable[..., Evidence], steps: float
