@@ -431,6 +431,25 @@ def test_the_rows_of_an_allan_deviation(tmp_path: Path, capsys: pytest.CaptureFi
     assert note == "note: c: too short"
 
 
+def test_a_diagnosis_tells_how_large_a_difference_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    large = {
+        "domain": "noise", "title": "tone", "place": "all frames", "measured": 0.5, "unit": "σ",
+        "simulated": 0.1, "after": 0.4, "size": -1506.4, "significance": 7.34,
+    }  # fmt: skip
+    where = [large, large | {"size": 8.34}, large | {"significance": 0.0}]
+    gap = {"after": 1.0, "interval": [0.9, 1.0], "where": where}
+    found = {"verdict": "unexplained", "causes": [], "gap": gap, "more_would_tell": []}
+    (tmp_path / "diagnose").mkdir()
+    (tmp_path / "diagnose/diagnosis.json").write_text(json.dumps(found))
+    results.show_diagnosis(tmp_path)
+    *_, header, first, second = cells(capsys.readouterr().out)
+    assert header[-3:] == ["difference/scatter", "significance", "σ"]
+    assert first[-2:] == ["1506", "7.3"]
+    assert second[-2:] == ["8.3", "7.3"]
+
+
 def test_a_diagnosis_names_frames_that_would_decide(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

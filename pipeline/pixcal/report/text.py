@@ -64,7 +64,7 @@ def number(value: Any, digits: int = 3) -> str:
 
 def times(size: float) -> str:
     """A size in units of a scatter, whichever its sign: one decimal below ten, else none."""
-    return _grouped(f"{abs(size):,.{0 if abs(size) >= 9.95 else 1}f}")
+    return f"{abs(size):.{0 if abs(size) >= 9.95 else 1}f}"
 
 
 def exact(value: Any) -> str:
