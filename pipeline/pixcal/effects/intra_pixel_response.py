@@ -25,6 +25,7 @@ SHARED = "the visibility scatters alike in sets of crossed fringes, which pixel 
 _MIN_PIXELS = 200
 _APART = 1.1
 _TURNS = 60
+_STEP = 1e-3  # change of the width for derivatives, px
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,8 @@ class IntraPixelResponse(Effect):
         width, width_error = map(float, root_with_error(min(square, 9.0), error))
         scatter, its_error, shared = _scatter(sets, max(width, 0.5), _bias_variance(evidence))
         rms, rms_error = map(float, root_with_error(scatter, its_error))
+        # A wider response changes the visibility more for the same scatter of its width.
+        rms_error = float(np.hypot(rms_error, rms * width_error / max(width, 0.5)))
         return Estimate(
             cls((width, width), min(rms, 0.5)),
             {
@@ -189,7 +192,11 @@ def _of_pixels(one: F64, other: F64, kept: Mask) -> tuple[float, float]:
 
 def _gain(one: FringeEvidence, other: FringeEvidence, width: float) -> float:
     """Covariance of the visibilities of two sets for a width scatter of one pixel."""
-    return float((np.square(one.k) * np.square(other.k)).sum() * (width / 12) ** 2)
+    # Change of the logarithm of the visibility per pixel of width, along each axis.
+    k = np.array([one.k, other.k])
+    wide, narrow = (np.log(np.abs(transfer(k, width + step))) for step in (_STEP, -_STEP))
+    ours, theirs = (wide - narrow) / (2 * _STEP)
+    return float(ours @ theirs)
 
 
 def _light(found: FringeEvidence) -> float:
