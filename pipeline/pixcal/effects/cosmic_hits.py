@@ -186,8 +186,8 @@ def _rates(counts: F64, chances: F64, exposures: F64) -> tuple[list[float], list
     gain = 2 * float((counts * np.log(both / one) - both + one).sum())
     used = 1 + (gain > SIGNIFICANT**2) if len(exposures) > 1 else 1
     rates, expected = found[used - 1]
-    # One hit at least: none leaves the rate unknown too.
-    normal = exposures[:used] @ (exposures[:used] / np.maximum(expected, 1 / len(counts))).T
+    # The posterior of a rate, without prior, has one hit more: few hits do not tell it well.
+    normal = exposures[:used] @ (exposures[:used] / (expected + 1 / len(counts))).T
     errors = np.sqrt(np.diag(np.linalg.inv(normal)))
     return [*rates.tolist(), 0.0][: len(exposures)], errors.tolist()
 

@@ -126,7 +126,8 @@ def _hops(
     # Hops may scatter by more than the noise.
     excess = float(weight @ (size - hop) ** 2) / max(len(jumps) - 1, 1)
     own_error = float(np.sqrt(max(excess, 1.0) / weight.sum()))
-    found = Hopping(hop, own_error, rate, float(np.sqrt(len(jumps))) / seconds)
+    # The posterior of a rate, without prior: few jumps do not tell it well.
+    found = Hopping(hop, own_error, rate, float(np.sqrt(len(jumps) + 1)) / seconds)
     colours, bases = [colour_of(s) for s in motion.raw], [colour_of(s) for s in motion.series]
     times = [s.time_s for s in motion.raw]
     slopes = [float(np.polyfit(t - t[0], b, 1)[0]) for t, b in zip(times, bases, strict=True)]

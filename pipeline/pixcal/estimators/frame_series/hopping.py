@@ -99,10 +99,13 @@ def find_hopping(
         return sum(s.weighed(size, rate * np.exp(step)).likelihood for s in every)
 
     step = STEP * min(s.noise for s in every) / size
+    # The posterior of a rate, without prior, has one hop more: few hops do not tell it well.
+    relative = _error(of_rate, STEP)
+    rate_error = rate * float(np.hypot(relative, relative**2))
     ramps, errors = np.array([s.ramp(size) for s in every]).T
     weight = errors**-2
     return Hopping(
-        size, abs(size) * _error(of_size, step), rate, rate * _error(of_rate, STEP),
+        size, abs(size) * _error(of_size, step), rate, rate_error,
         tuple(s.noise for s in every), float(ramps @ weight / weight.sum()), weight.sum() ** -0.5,
     )  # fmt: skip
 
