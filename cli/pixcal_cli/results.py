@@ -187,6 +187,10 @@ def show_diagnosis(run: Path) -> None:
         f"  {diagnosis['verdict']}; residual gap: {100 * gap['after']:.0f} % "
         f"(90 % interval {low:.0f} to {high:.0f} %)"
     )
+    staying = [f"{e['title']}, {e['place']}" for e in gap["where"] if e.get("stays")]
+    if diagnosis["verdict"] == "partly explained" and staying:
+        more = f"; and {len(staying) - MAX_NAMED} more" if len(staying) > MAX_NAMED else ""
+        click.echo(f"  still different with all causes: {'; '.join(staying[:MAX_NAMED])}{more}")
     if diagnosis["verdict"] == "no gap":
         show_notes(list(filter(None, [not_tested(diagnosis)])))
     else:
@@ -237,6 +241,7 @@ def _show_cause(cause: Mapping[str, Any]) -> None:
         click.echo(f"  recommended frames to distinguish {cause['effect']} from {others}: {frames}")
 
 
+MAX_NAMED = 3  # most statistics in a line
 MAX_ROWS = 8
 """Largest number of differences that are printed."""
 

@@ -468,20 +468,22 @@ def test_a_diagnosis_names_frames_that_would_decide(
         "law": "white", "gap_closed_by_law": 0.9,
         "effect": "row_noise", "p_value": 1.1e-12, "not_told_apart_from": [], "would_decide": [],
     }  # fmt: skip
+    stays = {"title": "tone", "place": "all frames", "stays": True, "significance": 0.0}
     found = {
         "verdict": "partly explained",
         "causes": [cause, sure],
-        "gap": {"after": 0.5, "interval": [0.4, 0.6], "where": []},
+        "gap": {"after": 0.5, "interval": [0.4, 0.6], "where": [stays]},
         "more_would_tell": ["flat frames", "a fringe set along another axis"],
     }
     (tmp_path / "diagnose").mkdir()
     file = tmp_path / "diagnose/diagnosis.json"
     file.write_text(json.dumps(found))
     results.show_diagnosis(tmp_path)
-    verdict, gap, _, lag, row_noise, *frames = (
+    verdict, still, gap, _, lag, row_noise, *frames = (
         " ".join(row) for row in cells(capsys.readouterr().out)
     )
     assert verdict == "partly explained; residual gap: 50 % (90 % interval 40 to 60 %)"
+    assert still == "still different with all causes: tone, all frames"
     assert gap.startswith("gap: sum of the squares of all significant differences")
     assert lag == "lag 90.0 % (80.0 to 95.0 %) 90.0 % < 10⁻¹² ipc, glow"
     assert row_noise == "row_noise 90.0 % (80.0 to 95.0 %) 90.0 % 1.1 × 10⁻¹² -"

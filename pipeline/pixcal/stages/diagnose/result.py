@@ -143,13 +143,18 @@ class _Description:
             return "no gap"
         if not self.found.accepted:
             return "unexplained"
-        gap, after = self.final.significant, self.final.after
-        still = [
+        closed = self.final.significant.total <= EXPLAINED
+        return "explained" if closed and not self.staying else "partly explained"
+
+    @cached_property
+    def staying(self) -> set[Key]:
+        """Curves that deviate with all causes, and keep more than `LEFT` of their deviation."""
+        left, after = self.final.significant.left, self.final.after
+        return {
             key
             for key in flagged(after)
-            if gap.left.get(key, 1.0) > LEFT and sigmas_of(after[key].log_chance) > STILL
-        ]
-        return "explained" if gap.total <= EXPLAINED and not still else "partly explained"
+            if left.get(key, 1.0) > LEFT and sigmas_of(after[key].log_chance) > STILL
+        }
 
     def _cause(self, name: str) -> Json:
         found, candidate = self.found, self.found.candidates[name]
@@ -282,6 +287,7 @@ class _Description:
             "size": _rounded(self.final.sizes.size[key]),
             "significance": _rounded(sigmas_among(before.log_chance, len(self.final.before))),
             "left": _rounded(self.final.gap.left.get(key, 0.0)),
+            "stays": key in self.staying,
             "place": set_name + place(curve, at),
         }
 
