@@ -40,6 +40,9 @@ R = TypeVar("R")
 REFERENCES = 16  # simulations of the nominal bench
 LEARN_SEED = 900_000
 CLEAR = 20.0  # significance above which a slow estimate is no test statistic
+# significance over that of the strongest candidate below which a score test, which takes a fifth of
+# a simulation, is none: the strongest effect is likely to produce it
+FAINT = 0.05
 
 
 @dataclass(frozen=True)
@@ -213,7 +216,10 @@ def _again(candidate: Candidate) -> Again | None:
 def weakly_seen(
     candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]], *, slow: bool = True
 ) -> tuple[Signature, ...]:
-    """Candidates significant in the fitted frames; a slow one only if weak and the strongest."""
+    """Candidates significant in the fitted frames; a slow one only if weak and the strongest.
+
+    A score test that is faint beside the strongest candidate is left out.
+    """
     # Flats and darks alone show the effects that slow estimates search for in fringes.
     seen = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
     most = max((e.significance for e in seen.values()), default=0.0)
@@ -222,6 +228,7 @@ def weakly_seen(
         estimate.again or kinds[name]
         for name, estimate in sorted(seen.items())
         if estimate.significance >= SIGNIFICANT
+        and (estimate.again is None or estimate.significance >= FAINT * most)
         and (kinds[name].quick or (slow and estimate.significance == most < CLEAR))
     )
 
