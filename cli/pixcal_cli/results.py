@@ -195,8 +195,8 @@ def show_diagnosis(run: Path) -> None:
         show_notes(list(filter(None, [not_tested(diagnosis)])))
     else:
         click.echo(
-            "  gap: sum of the squares of all significant differences between frames and "
-            "simulation, in units of the scatter of nominal simulations"
+            "  gap: sum of all significant differences between frames and simulation, in units of "
+            "the scatter of nominal simulations"
         )
     columns: Columns = {
         "gap closed": lambda c: _closed(c["gap_closed"], c["gap_closed_interval"]),

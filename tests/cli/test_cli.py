@@ -484,7 +484,7 @@ def test_a_diagnosis_names_frames_that_would_decide(
     )
     assert verdict == "partly explained; residual gap: 50 % (90 % interval 40 to 60 %)"
     assert still == "still different with all causes: tone, all frames"
-    assert gap.startswith("gap: sum of the squares of all significant differences")
+    assert gap.startswith("gap: sum of all significant differences")
     assert lag == "lag 90.0 % (80.0 to 95.0 %) 90.0 % < 10⁻¹² ipc, glow"
     assert row_noise == "row_noise 90.0 % (80.0 to 95.0 %) 90.0 % 1.1 × 10⁻¹² -"
     assert frames == [

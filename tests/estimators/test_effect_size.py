@@ -117,9 +117,11 @@ def test_the_strong_effect_is_the_gap_and_what_it_opens_counts() -> None:
         after = sizes(data, expected)
         return gap_of_sizes(before, after, where, flagged(compare(data, expected))).total
 
+    weak, strong = (abs(before.size[key]) for key in (POWER, LINEAR))
+    assert strong > 100 * weak
     assert left_with() == pytest.approx(1, abs=0.01)
-    assert left_with(shift=4000) < 1e-3
-    assert left_with(power=2.0) > 0.99
+    assert left_with(shift=4000) == pytest.approx(weak / (weak + strong), rel=0.1)
+    assert left_with(power=2.0) == pytest.approx(strong / (weak + strong), rel=1e-3)
     assert left_with(shift=4000, power=2.0, sigmas=4000.0) > 0.5
 
 

@@ -88,14 +88,14 @@ class SizeScale:
 
 
 def gap_of_sizes(before: EffectSizes, after: EffectSizes, where: Set[Key], new: Set[Key]) -> Gap:
-    """Remaining gap: curves ``where`` weighted by their squared size, ``new`` ones in full."""
+    """Remaining gap: curves ``where`` weighted by their size, ``new`` ones in full."""
     # A statistic that identified a cause may itself deviate by no more than its scatter.
-    weights = {key: max(abs(before.size[key]), 1.0) ** 2 for key in sorted(where)}
+    weights = {key: max(abs(before.size[key]), 1.0) for key in sorted(where)}
     whole = sum(weights.values())
     left = {key: min(after.beyond[key] / max(before.beyond[key], 1e-12), _LEFT) for key in weights}
     total = sum(weights[key] * left[key] for key in left)
     for key in sorted(new - where):
-        own = after.size[key] ** 2
+        own = abs(after.size[key])
         total += own
         left[key] = own / max(whole, 1e-12)
     return Gap(total / whole if whole else 0.0, weights, left)
