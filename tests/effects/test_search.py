@@ -9,6 +9,7 @@ import pytest
 from pixcal.estimators.test_statistics import Curve, Key
 from pixcal.estimators.test_statistics.expectation import Reference, signature_key
 from pixcal.estimators.test_statistics.gap import compare, flagged
+from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
@@ -110,6 +111,21 @@ def search(
     )
     where = differing(found.nominal, found.final, data)
     return found, shrinkage(data, found.nominal, found.final, where).gap.total
+
+
+def noted(
+    data: Mapping[Key, F64], candidates: Mapping[str, Candidate]
+) -> tuple[SearchResult, list[str]]:
+    """Result of a search, and the label of each bench that it simulated."""
+    labels: list[str] = []
+
+    def noting(
+        benches: Sequence[Sequence[Effect]], seeds: int, label: str, asked: Sequence[str]
+    ) -> list[list[dict[Key, Curve]] | str]:
+        labels.extend([label] * len(benches))
+        return simulate(benches, seeds, label, asked)
+
+    return Search(REFERENCE, data, noting, lambda *_: {}).run(candidates), labels
 
 
 def test_what_is_there_is_taken_and_what_is_not_is_left() -> None:
@@ -313,18 +329,10 @@ def test_a_stand_in_for_an_unknown_cause_is_not_claimed(size: float) -> None:
 
 def test_where_all_candidates_close_little_the_search_ends_with_the_first_round() -> None:
     """Beside a large unknown cause no set of them could be claimed, so none is confirmed."""
-    asked: list[str] = []
-
-    def noted(
-        benches: Sequence[Sequence[Effect]], seeds: int, label: str, names: Sequence[str]
-    ) -> list[list[dict[Key, Curve]] | str]:
-        asked.extend([label] * len(benches))
-        return simulate(benches, seeds, label, names)
-
     small = {"left": 0.005, "little": 0.006, "right": 0.0}
     data = REFERENCE.on_scale(curves((), 500, small | {"unknown": 0.05}))
     named = {label: candidate(label, size or 0.001) for label, size in small.items()}
-    found = Search(REFERENCE, data, noted, lambda *_: {}).run(named)
+    found, asked = noted(data, named)
     assert not found.accepted
     assert set(asked) == {"candidates, round 1", "all candidates"}
     assert asked.count("all candidates") == 1
@@ -337,20 +345,12 @@ def test_candidates_that_close_much_together_are_sought_further(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Each alone closes little, as when it only undoes what another one opens."""
-    asked: list[str] = []
-
-    def noted(
-        benches: Sequence[Sequence[Effect]], seeds: int, label: str, names: Sequence[str]
-    ) -> list[list[dict[Key, Curve]] | str]:
-        asked.extend([label] * len(benches))
-        return simulate(benches, seeds, label, names)
-
     monkeypatch.setattr(
         Comparison, "residual", lambda _, trial, __: 0.1 if len(trial.effects) == 2 else 0.95
     )
     truth = {"left": 0.03, "right": 0.03}
     named = {label: candidate(label, size) for label, size in truth.items()}
-    Search(REFERENCE, REFERENCE.on_scale(curves((), 500, truth)), noted, lambda *_: {}).run(named)
+    _, asked = noted(REFERENCE.on_scale(curves((), 500, truth)), named)
     assert "all candidates" in asked
     assert "candidates, round 2" in asked
 
