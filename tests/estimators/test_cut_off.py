@@ -68,3 +68,11 @@ def test_codes_in_steps() -> None:
 def test_frames_well_above_zero_stay_as_they_are() -> None:
     found = combined(samples_of(np.random.default_rng(3), 50.0, 8.0), 8.0)
     assert without_cut_off(found, FRAMES, 1.0) == (found, 1.0)
+
+
+def test_any_lowest_code_is_as_good_as_zero() -> None:
+    codes = samples_of(np.random.default_rng(2), 30.0, 20.0)
+    at_zero, factor = without_cut_off(combined(codes, 20.0), FRAMES, 1.0)
+    raised, same = without_cut_off(combined(codes + 64, 20.0), FRAMES, 1.0, 64.0)
+    assert same == pytest.approx(factor, rel=1e-4)
+    np.testing.assert_allclose(raised.mean - 64, at_zero.mean, atol=1e-3)

@@ -133,13 +133,15 @@ def test_samples_are_rounded_and_clipped() -> None:
     read = rng.uniform(3, 7, SHAPE).astype(np.float32)
     gain = rng.uniform(2, 3, SHAPE).astype(np.float32)
     synthesis.amplify(electrons, bias, noise, read, 1 / gain, adu)
-    synthesis.convert(adu, 1, 200, out)
+    synthesis.convert(adu, 1, 0, 200, out)
     exact = (electrons + read * noise.astype(np.float64)) / gain + bias
     assert np.abs(out - np.clip(exact, 0, 200)).max() <= 0.5 + 1e-4
     assert out.max() == 200
     assert out.min() == 0
     assert (out[exact > 200] == 200).all()
     assert (out[exact < 0] == 0).all()
-    synthesis.convert(adu, 16, 192, out)
+    synthesis.convert(adu, 16, 0, 192, out)
     assert np.abs(out - np.clip(exact, 0, 192)).max() <= 8 + 1e-4
     assert set(np.unique(out)) == set(range(0, 193, 16))
+    synthesis.convert(adu, 16, 32, 192, out)
+    assert set(np.unique(out)) == set(range(32, 193, 16))

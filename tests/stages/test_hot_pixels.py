@@ -33,3 +33,10 @@ def test_each_simulation_draws_its_own() -> None:
     one, same, other = (uncoupled(dark, np.random.default_rng(seed)) for seed in (3, 3, 4))
     np.testing.assert_array_equal(one, same)
     assert np.count_nonzero(one != other) == 24
+
+
+def test_a_map_without_spread_stays() -> None:
+    """Dark frames that a camera clips at zero; one map has more bright pixels than others."""
+    dark = np.zeros((30, 40))
+    dark[::3, ::3] = 1.0
+    np.testing.assert_array_equal(uncoupled(dark, np.random.default_rng(5)), dark)

@@ -247,6 +247,8 @@ def _by_law(evidence: Evidence, far: bool = False) -> _ByLaw | None:
     step, step_error = step_of(counts)
     step = max(step, float(evidence.step_adu))
     noise, first = evidence.read_noise / evidence.gain / step, 0.0
+    if evidence.lowest_adu is not None:
+        first = evidence.lowest_adu / step + 1
     lit = lit or [s.adu for s in evidence.of_kind("flat")]
     if noise < MIN_NOISE and lit:
         counts = histogram(lit, evidence.good)

@@ -9,7 +9,9 @@ remaining uncertainty of the curve is in its error.
 
 A camera that reads bright pixels with another amplifier (dual gain) has a step in the curve, which
 no such term describes. Points that leave the curve by far more than their noise are therefore
-fitted up to lower levels too, and the gain is that of the best-determined range.
+fitted up to lower levels too, and the gain is that of the best-determined range. Where frames
+without light have other noise than flats (a camera that clips black, or reads darks in another
+way), the same holds for a curve without them.
 """
 
 import math
@@ -56,6 +58,8 @@ class GainFit:
     # chance of points as far off the curve
     chance: float = 1.0
     step: bool = False  # whether the curve has a step above the levels used, as of a dual gain
+    # whether the curve leaves out the noise without light, which is not on it
+    without_dark: bool = False
 
 
 def fit_gain(
@@ -87,15 +91,23 @@ def fit_gain(
         amplifiers do
     """
 
-    def fit(highest: float) -> GainFit | None:
-        found = _fit_range(sums, read_variance, highest, level_error, uneven, straight)
+    def fit(highest: float, known: tuple[float, float] = read_variance) -> GainFit | None:
+        found = _fit_range(sums, known, highest, level_error, uneven, straight)
         return found and replace(found, error=math.hypot(found.error, common * found.gain))
 
     whole = fit(highest)
     if whole is None or straight or whole.chance > _OFF_CURVE:
         return whole
+
+    def points(top: float) -> int:
+        return int(np.count_nonzero((sums[:, 1] > 0) & (sums[:, 1] <= top * sums[:, 0])))
+
     best, top = whole, whole.levels[1] / _SHORTER
-    while np.count_nonzero((sums[:, 1] > 0) & (sums[:, 1] <= top * sums[:, 0])) >= _SPARE:
+    if points(whole.levels[1]) >= 2 * _SPARE:
+        found = fit(highest, (read_variance[0], max(read_variance)))
+        if found is not None and found.chance > _OFF_CURVE and found.error < best.error:
+            best = replace(found, without_dark=True)
+    while points(top) >= _SPARE:
         found = fit(top)
         if found is not None and found.chance > _OFF_CURVE and found.error < best.error:
             best = replace(found, step=True)

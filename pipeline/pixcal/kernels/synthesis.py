@@ -190,9 +190,9 @@ def amplify(signal: F32, bias: F32, normal: F32, read_noise: F32, adu_per_e: F32
 
 
 @kernel()
-def convert(adu: F32, step: int, top: int, out: U16) -> None:
-    """Codes of the converter, rounded to multiples of ``step``, clipped to 0 and ``top`` (ADU)."""
-    low, high, half = np.float32(0), np.float32(top // step), np.float32(0.5)
+def convert(adu: F32, step: int, lowest: int, top: int, out: U16) -> None:
+    """Codes of the converter: multiples of ``step`` from ``lowest`` to ``top`` (ADU)."""
+    low, high, half = np.float32(lowest), np.float32(top // step), np.float32(0.5)
     codes = np.float32(1 / step)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):

@@ -52,6 +52,9 @@ class SimulatedDetector:
     saturation_adu: float | None = quantity(
         None, unit="ADU", above=0, doc="samples are clipped here; default: highest code"
     )
+    lowest_adu: int = quantity(
+        0, unit="ADU", low=0, high=65535, doc="lowest code: lower samples are read as this"
+    )
     full_well_e: float | None = quantity(
         None, unit="e-", low=1, high=1e7, doc="charge is clipped here; default: never"
     )
@@ -102,6 +105,10 @@ class SimulatedDetector:
             raise InputError(
                 f"saturation_adu: {self.saturation_adu:g} ADU is above the largest code of "
                 f"{self.bits} bits, {(1 << self.bits) - 1}; give less, or more bits"
+            )
+        if self.lowest_adu >= self.top_adu:
+            raise InputError(
+                f"lowest_adu: {self.lowest_adu} ADU leaves no code below saturation; give less"
             )
         if self.bias_adu >= self.top_adu:
             raise InputError(f"bias_adu: {self.bias_adu:g} ADU leaves no room below saturation")

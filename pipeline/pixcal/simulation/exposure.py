@@ -197,7 +197,7 @@ class _Chain:
     def samples(self, frame: int) -> U16:
         """Codes of a frame."""
         d = self.camera.bench.detector
-        synthesis.convert(self.adu(frame), d.step_adu, d.top_adu, self._samples)
+        synthesis.convert(self.adu(frame), d.step_adu, d.lowest_adu, d.top_adu, self._samples)
         return self._samples
 
     def adu(self, frame: int) -> F32:

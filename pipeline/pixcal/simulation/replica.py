@@ -214,6 +214,7 @@ def _bench(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Bench:
             chip=sets[0].window if sets else None,
             origin_px=evidence.origin if sets else None,
             saturation_adu=min(evidence.saturation_adu, TOP_ADU),
+            lowest_adu=int(evidence.lowest_adu or 0),
             bias_adu=0.0,
         ),
         float(np.mean(contrast)) if contrast else 1.0,

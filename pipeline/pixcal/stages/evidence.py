@@ -67,6 +67,7 @@ def evidence_of(
         dark_rate=maps["dark_rate"].astype(float),
         flat=maps["flat"].astype(float),
         good=maps["mask"] == 0,
+        lowest_adu=ingested.lowest_adu,
         saturation_adu=min(map(ingested.saturation, ingested.arrays)),
         pitch_um=acquisition.detector.pitch_um,
         wavelength_nm=acquisition.fibres.wavelength_nm,

@@ -1,6 +1,6 @@
-"""Frames whose noise is clipped at code zero: level and noise without clipping.
+"""Frames whose noise is clipped at the lowest code: level and noise without clipping.
 
-A sample is a normal number rounded to a code; negative values are read as zero. Mean and variance
+A sample is a normal number rounded to a code; lower values are read as the lowest code. Mean and variance
 of such samples give level and noise of the normal (censored: Cohen 1959, *Technometrics* 1, 217).
 Each pixel has its own level; most have the same noise, which is fitted to the mean of their
 variances. Maximum likelihood with a level per pixel would bias the noise low, by about the loss of
@@ -25,13 +25,16 @@ _RANGE = 0.3, 5.0  # least and largest noise over that of the samples as they ar
 _HOT, _NOISY = 6.0, 10.0
 
 
-def without_cut_off(found: Combined, frames: int, step: float) -> tuple[Combined, float]:
-    """Frames without light, corrected for clipping at code zero.
+def without_cut_off(
+    found: Combined, frames: int, step: float, lowest: float = 0.0
+) -> tuple[Combined, float]:
+    """Frames without light, corrected for clipping at their lowest code.
 
     Parameters
     ----------
     found : of some pixels, ADU
     step : of the samples (ADU)
+    lowest : code at which they are clipped (ADU)
 
     Returns
     -------
@@ -40,6 +43,10 @@ def without_cut_off(found: Combined, frames: int, step: float) -> tuple[Combined
     factor : float
         Variance of a sample over that of the samples as they are.
     """
+    if lowest:
+        above_lowest = replace(found, mean=found.mean - lowest)
+        corrected, factor = without_cut_off(above_lowest, frames, step)
+        return replace(corrected, mean=corrected.mean + lowest), factor
     known = np.isfinite(found.mean) & np.isfinite(found.variance)
     if not known.any():
         return found, 1.0

@@ -155,6 +155,7 @@ class Evidence:
     photon_transfer: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     # lags (rows, columns) whose covariance that gain includes
     neighbours: tuple[tuple[int, int], ...] = ()
+    lowest_adu: float | None = None  # code at which noise is cut off; None: it is not
     step_adu: int = 1  # all calibration samples are multiples of it
     # flats that saturate in the data with which a simulation is compared; None for the data
     full: frozenset[Level] | None = None

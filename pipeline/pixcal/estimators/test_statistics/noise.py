@@ -24,7 +24,6 @@ of_noise = partial(statistic, "noise")
 of_noise_power = partial(statistic, "noise", power=True)
 
 MIN_DARKS = 5
-CUT_OFF = 1e-3  # share of samples at code zero above which noise is clipped
 # Read noise, in steps of the converter, below which the variance of a pixel depends on where its
 # level lies between two codes.
 COARSE = 0.65
@@ -187,8 +186,8 @@ def read_noise(evidence: Evidence) -> Curve | None:
     rounded = evidence.read_noise > evidence.amplifier_noise
     if rounded and evidence.amplifier_noise < COARSE * evidence.gain * evidence.step_adu:
         return None
-    # Where noise is clipped at code zero, its size depends on the level of a pixel.
-    if (stacks[0].adu[:, evidence.good] == 0).mean() > CUT_OFF:
+    # Where noise is clipped at the lowest code, its size depends on the level of a pixel.
+    if evidence.lowest_adu is not None:
         return None
     # A median of integers jumps by a code.
     level = frame_means(stacks[0].adu, evidence.good).astype(np.float32)

@@ -48,6 +48,7 @@ def bench_of(
         chip=whole,
         origin_px=evidence.origin,
         saturation_adu=_top(acquisition, evidence, sets, dtypes),
+        lowest_adu=int(evidence.lowest_adu or 0),
         bias_adu=0.0,
         full_well_e=d.full_well_e,
     )
@@ -74,6 +75,7 @@ def pedestal_of(
             "detector.gain_e_per_adu by the same factor"
         )
     signed = all(dtype.kind != "u" for dtype in dtypes.values())
+    signed &= all(e.lowest_adu is None for e in evidence)
     lifted = _LIFTED * noise - low if signed and low < _LIFTED * noise else 0.0
     return math.ceil(lifted / step) * step
 

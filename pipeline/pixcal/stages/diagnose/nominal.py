@@ -248,6 +248,7 @@ def uncoupled(dark: Dark, rng: np.random.Generator) -> Dark:
     brightest = maximum_filter(rest, size=2 * HOT_REACH + 1, mode="nearest")
     beside = (brightest > HOT * spread) & (rest < SHARED * brightest)
     found = dark.copy()
-    if not beside.all():
-        found[beside] = rng.choice(dark[~beside & (rest <= HOT * spread)], np.count_nonzero(beside))
+    usual = dark[~beside & (rest <= HOT * spread)]
+    if usual.size:
+        found[beside] = rng.choice(usual, np.count_nonzero(beside))
     return found

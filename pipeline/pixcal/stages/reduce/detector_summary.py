@@ -137,7 +137,7 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
         shot = charge / (job.gain if gain is None else gain.gain)
         noise, own = read_noise(sums[0], lost, shot, folder, job)
         gain = _gain(sums, own, lost[0], wander, top, job)
-    if gain is not None and is_cut_off(job):
+    if gain is not None and (is_cut_off(job) or gain.without_dark):
         noise, own = of_variance(gain.read_variance, job.quantum)
     return Summary(
         declared, job.quantum or 1.0, medians, light, noise, own, gain, levels, usable, full,

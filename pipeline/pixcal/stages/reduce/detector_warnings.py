@@ -66,6 +66,12 @@ def _of_gain(fit: GainFit, summary: Summary, used: float) -> list[str]:
             "camera that reads bright pixels at another gain (dual gain, HDR): the gain given is "
             "that below this level; gain and noise of brighter pixels are not measured"
         )
+    if fit.without_dark:
+        found.append(
+            "frames without light have another noise than the photon-transfer curve at level zero: "
+            "gain and read noise are those of the flats alone; possible causes: the camera clips "
+            "its black level, or reads dark frames in another way"
+        )
     clear = [lag for lag, sigmas in fit.neighbours.items() if sigmas > SHARED]
     if clear:
         lags = ", ".join(f"({y}, {x})" for y, x in clear)

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from pixcal.model.arrays import F64, I64
 from pixcal.model.errors import InputError
@@ -140,18 +139,6 @@ def of_several_levels(frames: Reader) -> bool:
         return False
     noise = float(np.nanstd(some[1] - some[0])) / math.sqrt(2)
     return bool(steps[1:-1].max() > max(JUMP * float(np.median(steps)), NOTABLE * noise))
-
-
-def share_at_zero(frames: Reader) -> float:
-    """Share of zero samples in the first frame, if no sample is negative."""
-    samples = middle_rows(frames, 0, 1)
-    return 0.0 if samples.min() < 0 else float((samples == 0).mean())
-
-
-def noise_above(frames: Reader) -> float:
-    """Noise of the first frame (ADU) from its upper half: the lower may be cut off."""
-    lower, upper = np.quantile(middle_rows(frames, 0, 1), ndtr([1.0, 2.0]))
-    return float(upper - lower)
 
 
 def of_whole_numbers(frames: Reader) -> bool:

@@ -32,6 +32,7 @@ from pixcal.kernels.rounding import SHEPPARD
 from pixcal.model.arrays import F32, F64
 from pixcal.model.flags import PixelFlag
 from pixcal.model.options import Reduce
+from pixcal.stages.reduce.black_cut_off import CutOff
 from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.ingested import MOST_ADU
 from pixcal.stages.tiles import (
@@ -82,7 +83,7 @@ class Measuring:
     saturation: float
     full: float
     quantum: float  # step of the samples (ADU), 0 for real numbers
-    cut_off: Mapping[str, float]  # rough noise (ADU) of arrays whose noise is cut off at code zero
+    cut_off: Mapping[str, CutOff]  # arrays whose noise is cut off at their lowest code
     gain: float  # gain, read_noise: rough values (e-/ADU, ADU)
     read_noise: float
     options: Reduce  # limits of outliers and flags
@@ -165,11 +166,12 @@ def _measured(job: Measuring, strip: Strip) -> list[_Column]:
 
 
 def _combine_dark(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[Combined]:
-    """Combine frames without light in each column, corrected for noise cut off at zero."""
+    """Combine frames without light in each column, corrected for noise that is cut off."""
     every = _combine(job, group, columns)
     if group.array not in job.cut_off:
         return every
-    made = [without_cut_off(one, len(group.frames), job.quantum) for one in every]
+    lowest = job.cut_off[group.array].code
+    made = [without_cut_off(one, len(group.frames), job.quantum, lowest) for one in every]
     if group == job.read_series:
         for column, (_, factor) in zip(columns, made, strict=True):
             column.pairs[0, :, 2:] *= factor
@@ -253,7 +255,8 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
     """Robust combination of a group in each column; statistics of its pairs are added there."""
     lamp = group.array == "flat"
     # The median deviation of noise that is cut off may be zero.
-    step = max(job.quantum, job.cut_off.get(group.array, 0.0))
+    cut = job.cut_off.get(group.array)
+    step = max(job.quantum, cut.noise if cut else 0.0)
     every = [Combination(clip=job.options.clip_sigma, lamp=lamp, quantum=step) for _ in columns]
     pedestals: list[F32 | None] = [None] * len(columns)
     if lamp:

@@ -11,6 +11,7 @@ import numpy as np
 
 from pixcal.model.acquisition import Detector
 from pixcal.model.errors import InputError
+from pixcal.stages.reduce.black_cut_off import CutOff, cut_offs
 from pixcal.stages.reduce.exposures import Exposures, group_exposures
 from pixcal.stages.reduce.flat_survey import (
     FlatSurvey,
@@ -184,6 +185,16 @@ class Ingested:
     def saturation_found(self) -> float | None:
         """Level (ADU) at which flats pile up; None if they do not."""
         return None if self.survey is None else self.survey.saturation
+
+    @cached_property
+    def cut_off(self) -> dict[str, CutOff]:
+        """Arrays of frames without light whose noise is cut off at their lowest code."""
+        return cut_offs(self.arrays, self.quantum or 1.0)
+
+    @property
+    def lowest_adu(self) -> float | None:
+        """Code (ADU) at which noise is cut off; None if it is not."""
+        return max((one.code for one in self.cut_off.values()), default=None)
 
     def lowest(self, name: str) -> float:
         """Least sample (ADU) that an array can hold."""

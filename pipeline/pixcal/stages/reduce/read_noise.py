@@ -19,7 +19,7 @@ from pixcal.stages.reduce.flat_survey import middle_rows
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.storage.place import Place
 
-# Relative error of noise that is cut off at code zero: a constant, and a factor on the cube of step
+# Relative error of noise that is cut off at the lowest code: a constant, and a factor on the cube of step
 # over noise. It is the largest error if pixels that differ by 10 % rms are treated as alike.
 _CUT_OFF, _COARSE_CUT_OFF = 0.006, 0.004
 _LEAST = 0.05  # smallest measurable noise, in steps
@@ -87,7 +87,7 @@ def read_noise(
 
 
 def is_cut_off(job: Measuring) -> bool:
-    """Whether the noise of the read-noise series is cut off at code zero."""
+    """Whether the noise of the read-noise series is cut off at its lowest code."""
     return job.read_series is not None and job.read_series.array in job.cut_off
 
 

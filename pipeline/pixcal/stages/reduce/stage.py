@@ -20,13 +20,14 @@ from pixcal.model.config import result_options
 from pixcal.model.errors import InputError
 from pixcal.model.flags import PixelFlag
 from pixcal.model.options import Reduce
+from pixcal.stages.reduce.black_cut_off import cut_off_warnings
 from pixcal.stages.reduce.calibration import Finishing, calibration_writers, finish
 from pixcal.stages.reduce.columns import run_noted, strip_width
 from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
 from pixcal.stages.reduce.detector_warnings import detector_warnings
 from pixcal.stages.reduce.electrons import convert_bytes
 from pixcal.stages.reduce.figures_of_merit import characterise
-from pixcal.stages.reduce.flat_survey import noise_above, rough_gain, share_at_zero
+from pixcal.stages.reduce.flat_survey import rough_gain
 from pixcal.stages.reduce.frame_statistics import (
     Measuring,
     measure,
@@ -50,7 +51,6 @@ SCHEMA = "pixcal/reduce/1"
 _MIN_READ_FRAMES = 8  # fewest to measure the noise of each pixel
 _SHARED_BYTES = 64 << 20
 _LINES = 4  # fewest neighbouring rows or columns without light to report
-_CUT_OFF = 1e-3  # share of samples at code zero above which noise is cut off
 
 
 Config = Reduce
@@ -170,7 +170,7 @@ def _measuring(source: Ingested, config: Config, folder: Place) -> Measuring:
         saturation=source.saturation("flat") if exposures.flat else math.inf,
         full=min(map(source.saturation, source.tables)),
         quantum=source.quantum,
-        cut_off={name: noise_above(source.arrays[name]) for name in _cut_off(source)},
+        cut_off=source.cut_off,
         gain=gain,
         read_noise=max(detector.read_noise_e / gain, ROUNDING_ADU),
         options=config,
@@ -226,7 +226,7 @@ def _report(
 ) -> None:
     job, summary, sets = found.job, found.summary, found.sets
     piled = source.saturation_found if source.detector.saturation_adu is None else None
-    warnings = [*source.exposures.warnings, *_of_cut_off(_cut_off(source))]
+    warnings = [*source.exposures.warnings, *cut_off_warnings(source.cut_off)]
     warnings += detector_warnings(summary, found.gain, piled)
     declared = source.detector.saturation_adu is not None
     warnings += _dark_lines(ArrayReader(made.folder / "calibration.zarr" / "mask"), source.shape)
@@ -258,25 +258,6 @@ def _report(
     report["figures_of_merit"] = characterise(made, source, job, summary, report, runtime)
     write_json(made.folder / "reduce.json", report)
     made.summary.update({key: report[key] for key in ("gain_e_per_adu", "flags", "warnings")})
-
-
-def _cut_off(source: Ingested) -> dict[str, float]:
-    """Share of samples at code zero, of arrays whose low black level cuts off the noise."""
-    shares = {
-        name: share_at_zero(source.arrays[name])
-        for name in ("bias", "dark")
-        if name in source.arrays
-    }
-    return {name: share for name, share in shares.items() if share > _CUT_OFF}
-
-
-def _of_cut_off(shares: Mapping[str, float]) -> list[str]:
-    return [
-        f"{name} frames are cut off at code 0, where {100 * share:.2g} % of their samples lie: "
-        "level and noise are estimated from a normal distribution cut off there; raise the black "
-        "level (offset) of the camera"
-        for name, share in shares.items()
-    ]
 
 
 def _dark_lines(mask: ArrayReader, shape: tuple[int, int]) -> list[str]:

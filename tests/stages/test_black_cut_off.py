@@ -1,0 +1,70 @@
+"""Frames whose noise is cut off at the lowest code, told from frames that merely have one."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pixcal.stages.reduce.black_cut_off import CutOff
+
+SHAPE = (2, 61, 409)
+
+
+class Frames:
+    """Frames in memory."""
+
+    def __init__(self, samples: NDArray[Any]) -> None:
+        self.samples = samples
+        self.shape = samples.shape
+        self.dtype = samples.dtype
+
+    def read(self, *spans: tuple[int, int]) -> NDArray[Any]:
+        """Part of the samples."""
+        return self.samples[tuple(slice(*span) for span in spans)]
+
+
+def frames(noise: float, level: float, lowest: int, step: int = 1) -> NDArray[Any]:
+    """Samples of a camera that ends at a code."""
+    analogue = np.random.default_rng(5).normal(level, noise, SHAPE)
+    return np.maximum(step * np.rint(analogue / step), lowest).astype(np.uint16)
+
+
+@pytest.mark.parametrize("step", [1, 16])
+@pytest.mark.parametrize("lowest", [0, 4, 64])
+@pytest.mark.parametrize("above", [-0.5, 0.3, 2.0, 2.8])
+@pytest.mark.parametrize("noise", [2.5, 30.0])
+def test_lowest_code_and_noise_are_found(
+    noise: float, above: float, lowest: int, step: int
+) -> None:
+    samples = frames(step * noise, step * (lowest + above * noise), step * lowest, step)
+    found = CutOff.of(Frames(samples), step)
+    assert found is not None
+    assert found.code == step * lowest
+    assert found.share == (samples == step * lowest).mean()
+    assert found.noise == pytest.approx(step * noise, rel=0.35)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2, 0.5, 1.0, 1.2, 1.6, 2.5, 8.0, 200.0])
+@pytest.mark.parametrize("level", [1000.0, 1000.3, 1000.5])
+def test_noise_above_the_lowest_code_is_whole(noise: float, level: float) -> None:
+    assert CutOff.of(Frames(frames(noise, level, 0)), 1.0) is None
+
+
+@pytest.mark.parametrize("lowest", [4.1, 31.75, 63.6])
+@pytest.mark.parametrize("above", [0.0, 1.0, 2.0])
+def test_a_pile_may_lie_on_two_codes(lowest: float, above: float) -> None:
+    rng = np.random.default_rng(3)
+    cut = np.maximum(rng.normal(lowest + above * 8, 8.0, SHAPE), lowest)
+    samples = np.rint(cut + rng.uniform(-0.5, 0.5, SHAPE)).astype(np.uint16)
+    found = CutOff.of(Frames(samples), 1.0)
+    assert found is not None
+    assert abs(found.code - lowest) <= 0.6
+
+
+def test_broken_columns_are_no_lowest_code() -> None:
+    samples = frames(3.0, 100.0, 0)
+    samples[:, :, 17] = 80
+    samples[:, 5] = 0
+    samples[:, :, 300] = 99
+    assert CutOff.of(Frames(samples), 1.0) is None
