@@ -1,9 +1,9 @@
 """Frames whose noise is clipped at the lowest code: level and noise without clipping.
 
-A sample is a normal number rounded to a code; lower values are read as the lowest code. Mean and variance
-of such samples give level and noise of the normal (censored: Cohen 1959, *Technometrics* 1, 217).
-Each pixel has its own level; most have the same noise, which is fitted to the mean of their
-variances. Maximum likelihood with a level per pixel would bias the noise low, by about the loss of
+A sample is a normal number rounded to a code; lower values are read as the lowest code. Mean and
+variance of such samples give level and noise of the normal (censored: Cohen 1959, *Technometrics*
+1, 217). Each pixel has its own level; most have the same noise, which is fitted to the mean of
+their variances. Maximum likelihood with a level per pixel would bias the noise low, by about the loss of
 one frame (Neyman and Scott 1948, *Econometrica* 16, 1).
 """
 

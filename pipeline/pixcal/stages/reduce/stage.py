@@ -6,7 +6,6 @@ and verifies their checksums.
 
 import math
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
