@@ -3,8 +3,8 @@
 A sample is a normal number rounded to a code; lower values are read as the lowest code. Mean and
 variance of such samples give level and noise of the normal (censored: Cohen 1959, *Technometrics*
 1, 217). Each pixel has its own level; most have the same noise, which is fitted to the mean of
-their variances. Maximum likelihood with a level per pixel would bias the noise low, by about the loss of
-one frame (Neyman and Scott 1948, *Econometrica* 16, 1).
+their variances. Maximum likelihood with a level per pixel would bias the noise low, by about the
+loss of one frame (Neyman and Scott 1948, *Econometrica* 16, 1).
 """
 
 import math
@@ -70,12 +70,12 @@ def without_cut_off(
     noise = float(brentq(excess, low, high, rtol=1e-4))
     means, variances = _of_cut_off(_LEVELS * noise, noise, step)
     above = found.mean > means[-1]
-    seen = np.interp(found.mean, means, variances)
     whole = noise**2 + SHEPPARD * step**2
     # Means of usual pixels in few frames are shrunk towards that of all: a pixel that is always
     # zero has no other information.
     true = max(1 - sample**2 / frames / float(mean.var()), 0.0) if mean.var() > 0 else 0.0
     likely = np.where(usual, mean.mean() + true * (found.mean - mean.mean()), found.mean)
+    seen = np.interp(likely, means, variances)
     corrected = replace(
         found,
         mean=np.where(above, found.mean, np.interp(likely, means, _LEVELS * noise)),

@@ -19,8 +19,9 @@ from pixcal.stages.reduce.flat_survey import middle_rows
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.storage.place import Place
 
-# Relative error of noise that is cut off at the lowest code: a constant, and a factor on the cube of
-# step over noise. It is the largest error if pixels that differ by 10 % rms are treated as alike.
+# Relative error of noise that is cut off at the lowest code: a constant, and a factor on the cube
+# of step over noise. It is the largest error if pixels that differ by 10 % rms are treated as
+# alike.
 _CUT_OFF, _COARSE_CUT_OFF = 0.006, 0.004
 _LEAST = 0.05  # smallest measurable noise, in steps
 _PAIRS, _SAMPLES = 16, 1 << 20  # pairs, and samples of each frame, that measure block noise
