@@ -137,6 +137,13 @@ def saturated_flats(taken: dict[str, NDArray[Any]]) -> None:
     taken["flat"][:6] //= 10
 
 
+def full_wells(taken: dict[str, NDArray[Any]]) -> None:
+    """Full wells are read as one of two codes; the last row happens to hold one of them."""
+    taken["flat"][6:] = 3277 + (np.random.default_rng(4).random(taken["flat"][6:].shape) < 0.02)
+    taken["flat"][7, -1] = 3277
+    taken["flat"][:6] //= 10
+
+
 def bright_crests(taken: dict[str, NDArray[Any]]) -> None:
     """Crests saturate, in some frames on the last rows."""
     cube = np.minimum(taken["fringes"], 4090)
@@ -145,7 +152,7 @@ def bright_crests(taken: dict[str, NDArray[Any]]) -> None:
 
 
 @pytest.mark.parametrize(
-    "spoil", [dark_rows, filled_rows, cut_noise, saturated_flats, bright_crests]
+    "spoil", [dark_rows, filled_rows, cut_noise, saturated_flats, full_wells, bright_crests]
 )
 def test_ordinary_frames_are_not_taken_for_cut_ones(tmp_path: Path, spoil: Any) -> None:
     taken = frames((33, 47))

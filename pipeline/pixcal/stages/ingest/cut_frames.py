@@ -9,6 +9,7 @@ from pixcal.storage.fits_rows import BAND
 from pixcal.storage.frames import Frame
 
 _NAMED = 3
+_FULL = 0.98  # least share of a flat's largest sample in a saturated row
 
 
 def cut_from(array: str, facts: Mapping[str, F64], rows: int) -> list[int | None]:
@@ -24,8 +25,12 @@ def cut_from(array: str, facts: Mapping[str, F64], rows: int) -> list[int | None
         return [None] * len(share)
     largest, level = np.fmax.reduce(facts["largest"], axis=1), facts["last"][:, -1]
     usual = np.median(largest)
-    # At a saturated step, all flats reach the converter's end; in other arrays, most frames do.
-    full = (level == largest) & ((level >= usual) if array == "flat" else (level == usual))
+    # At a saturated step, all flats reach the converter's end, or full wells, which vary by a few
+    # codes; in other arrays, most frames do.
+    if array == "flat":
+        full = (level >= usual) & (level >= _FULL * largest)
+    else:
+        full = (level == largest) & (level == usual)
     cut = (share == 1) & ~full
     return [
         _first_row(facts["last"][n], facts["constant"][n], rows) if cut[n] else None

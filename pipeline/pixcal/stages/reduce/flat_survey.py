@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from pixcal.model.arrays import F64, I64
 from pixcal.model.errors import InputError
@@ -31,6 +32,8 @@ MIN_DARKS = 5  # fewest steps between levels of darks to separate groups
 JUMP, NOTABLE = 20.0, 0.1
 OUTLIER = 9.0  # median deviations above which a difference of two frames is not noise
 PILED = 4  # least ratio of samples at a pile to those at any of these codes
+WIDE = 4.0  # codes between one sigma below and above in flats that are not full, to know full ones
+_ONE_SIGMA = tuple(ndtr([-1.0, 1.0]))
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,8 @@ class FlatSurvey:
         pedestal = 0.0 if dark is None else float(np.nanmean(middle_rows(dark, 0, 1)))
         flats = arrays["flat"]
         whole = of_whole_numbers(flats)
-        levels, tops = [], []
+        levels: list[float] = []
+        tops: list[_Top] = []
         for number in range(flats.shape[0]):
             if number % TOGETHER == 0:
                 several = middle_rows(flats, number, number + TOGETHER)
@@ -58,7 +62,8 @@ class FlatSurvey:
                 top = int(samples.max())
                 below = top - samples[samples >= top - NEIGHBOURS].astype(np.int64)
                 counts = np.bincount(below.ravel(), minlength=NEIGHBOURS + 1)
-                tops.append((top, counts, float(counts[0] / samples.size)))
+                low, high = np.quantile(samples, _ONE_SIGMA)
+                tops.append(_Top(top, counts, float(counts[0] / samples.size), float(high - low)))
         return cls(np.array(levels), _pile(tops))
 
     def steps(self, exposures: Sequence[float | None]) -> list[int]:
@@ -166,12 +171,27 @@ def middle_rows(frames: Reader, begin: int, end: int) -> NDArray[Any]:
     return read
 
 
-def _pile(tops: Sequence[tuple[int, I64, float]]) -> float | None:
-    """Highest code, if it has far more samples than the codes just below."""
+@dataclass(frozen=True)
+class _Top:
+    """Highest samples of a frame."""
+
+    code: int  # the highest
+    counts: I64  # samples at each code from there down
+    share: float  # of the samples at the highest
+    spread: float  # codes between the quantiles at one sigma below and above the median
+
+
+def _pile(tops: Sequence[_Top]) -> float | None:
+    """Highest code, or the one below, if it has far more samples than the codes below these."""
     if not tops:
         return None
-    highest = max(top for top, _, _ in tops)
-    own = [(counts, share) for top, counts, share in tops if top == highest]
-    counts = np.sum([c for c, _ in own], axis=0)
+    highest = max(top.code for top in tops)
+    own = [top for top in tops if top.code == highest]
+    counts = np.sum([top.counts for top in own], axis=0)
     piled = counts[0] >= MIN_SAMPLES and counts[0] > PILED * counts[1:].max()
-    return float(highest) if piled and max(s for _, s in own) >= MIN_SHARE else None
+    if piled and max(top.share for top in own) >= MIN_SHARE:
+        return float(highest)
+    # Full wells are read as one of two codes. Flats that are not full vary more if brighter.
+    narrow = min(top.spread for top in own) <= 1 and max(top.spread for top in tops) >= WIDE
+    double = counts[:2].min() >= MIN_SAMPLES and counts[:2].sum() > PILED * counts[2:].max()
+    return float(highest - 1) if narrow and double else None

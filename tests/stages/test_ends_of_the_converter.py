@@ -1,4 +1,4 @@
-"""Frames whose noise is cut off at the lowest code, told from frames that merely have one."""
+"""Samples that pile up at the lowest and the highest code, told from noise that ends there."""
 
 from typing import Any
 
@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pixcal.stages.reduce.black_cut_off import CutOff
+from pixcal.stages.reduce.flat_survey import FlatSurvey
 
 SHAPE = (2, 61, 409)
 
@@ -68,3 +69,23 @@ def test_broken_columns_are_no_lowest_code() -> None:
     samples[:, 5] = 0
     samples[:, :, 300] = 99
     assert CutOff.of(Frames(samples), 1.0) is None
+
+
+def flats(noise: float, well: float, scatter: float) -> NDArray[Any]:
+    """Flats of a ladder that may end in full wells, whose codes scatter."""
+    rng = np.random.default_rng(8)
+    levels = np.repeat(np.linspace(300, 3600, 7), 2)[:, None, None]
+    shot = levels + noise * np.sqrt(levels / 3000) * rng.standard_normal((14, *SHAPE[1:]))
+    return np.rint(np.minimum(shot, well) + scatter * rng.uniform(-1, 1, shot.shape))
+
+
+@pytest.mark.parametrize(("scatter", "well"), [(0.0, 3277.0), (0.5, 3277.03), (0.5, 3277.4)])
+def test_full_wells_may_be_read_as_one_of_two_codes(scatter: float, well: float) -> None:
+    samples = flats(20.0, well, scatter).astype(np.uint16)
+    assert FlatSurvey.of({"flat": Frames(samples)}).saturation == 3277
+
+
+@pytest.mark.parametrize("noise", [0.2, 0.5, 1.0, 20.0])
+def test_the_highest_codes_of_flats_that_are_not_full_are_no_saturation(noise: float) -> None:
+    samples = flats(noise, 1e5, 0.0).astype(np.uint16)
+    assert FlatSurvey.of({"flat": Frames(samples)}).saturation is None
