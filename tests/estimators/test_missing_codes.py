@@ -58,6 +58,16 @@ def test_a_whole_converter_of_two_amplifiers_misses_nothing() -> None:
     assert not len(missing_codes(np.bincount(codes.ravel(), minlength=200).astype(float)))
 
 
+@pytest.mark.parametrize("apart", [5, 6, 8, 11, 14, 20])
+@pytest.mark.parametrize("sigma", [0.5, 0.8, 1.1, 1.5, 2.0])
+def test_no_code_is_missing_between_the_colours_of_a_camera(sigma: float, apart: int) -> None:
+    rng = np.random.default_rng([int(10 * sigma), apart])
+    for level in np.linspace(40, 41, 7):
+        colours = rng.normal([[level], [level + apart], [level + 2.3 * apart]], sigma, (3, 80_000))
+        counts = np.bincount(np.rint(colours).astype(int).ravel()).astype(float)
+        assert not len(missing_codes(counts))
+
+
 @pytest.mark.parametrize("step", [1.3, 1.6, 2.4])
 @pytest.mark.parametrize("sigma", [1.1, 1.5])
 def test_noise_before_a_digital_gain_is_found_within_a_per_cent(sigma: float, step: float) -> None:

@@ -224,6 +224,11 @@ class Effect(ForwardModel):
         found = cls.estimate(evidence)
         return None if found is None else found.significance
 
+    @property
+    def read_variance(self) -> float:
+        """Variance (e-²) that it adds to every sample, where this is part of the read noise."""
+        return 0.0
+
     @classmethod
     def starts(cls, evidence: Evidence) -> Sequence[LightStart]:
         """Starting points of a fit to the maps, if it acts only on the light of the fringes.

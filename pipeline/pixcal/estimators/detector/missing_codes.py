@@ -27,12 +27,23 @@ _STANDS_IN = (0.5, -0.5, 0.0)  # next code, code before, nearest: thresholds rel
 
 
 def missing_codes(counts: F64) -> I64:
-    """Codes that never occur in ``counts`` (code,) though some just below and just above do."""
-    padded = np.pad(counts, _NEAR)
-    count = len(padded) - _NEAR + 1
-    beside = np.maximum.reduce([padded[n : n + count] for n in range(_NEAR)])
-    below, above = beside[: len(counts)], beside[_NEAR + 1 :]
-    return np.flatnonzero((counts == 0) & (np.minimum(below, above) > POPULATED))
+    """Codes that never occur in ``counts`` (code,) though some just below and just above do.
+
+    Between the noise of two levels, as of the colours of a camera, no code is missing: counts fall
+    off towards the gap so steeply that none is expected there.
+    """
+    empty, there = np.flatnonzero(counts == 0), np.flatnonzero(counts > 0)
+    if len(there) < 2:
+        return empty[:0]
+    above = np.clip(np.searchsorted(there, empty), 1, len(there) - 1)
+    missing = np.ones(len(empty), np.bool_)
+    for at, step in ((above - 1, -1), (above, 1)):
+        near, next_on = there[at], there[np.clip(at + step, 0, len(there) - 1)]
+        # Counts of a normal distribution fall off ever more steeply.
+        expected = counts[near] * np.minimum(counts[near] / counts[next_on], 1.0)
+        missing &= (0 < (near - empty) * step) & ((near - empty) * step <= _NEAR)
+        missing &= expected > POPULATED
+    return empty[missing]
 
 
 def step_noise(counts: F64) -> tuple[float, float]:

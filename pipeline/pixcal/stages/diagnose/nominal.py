@@ -34,6 +34,7 @@ from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_c
 from pixcal.stages.diagnose.parts import Half, Raw, Table, select
 
 _GAIN, _NOISE, _DARK = 101, 102, 103  # keys of random numbers
+_WHITE = 1e-3  # least share of the variance of the read noise that effects leave
 HOT = 40.0  # robust standard deviations of the dark current above which a pixel is hot
 # pixels around a hot one that may have received some of its charge: at most a share of `SHARED`
 HOT_REACH = 2
@@ -147,7 +148,8 @@ class NominalBench:
         change = photon_transfer_change(
             bench, measured, effects, self.recordings, self.gain.neighbours, measured.maps
         )
-        measured = self._electronics(measured, seed, own_seed, change)
+        added = sum(effect.read_variance for effect in effects)
+        measured = self._electronics(measured, (seed, own_seed), change, added)
         camera = Camera(bench, rows, [measured, *effects], maps=measured.maps)
         arrays = {
             name: np.empty((len(frames), *bench.detector.shape), self.dtypes[name])
@@ -197,12 +199,19 @@ class NominalBench:
                 sets[n] = replace(found, psi=found.psi - tilt, k=(kx - dkx, ky - dky))
         return replace(measured, sets=tuple(sets))
 
-    def _electronics(self, measured: Measured, seed: int, own_seed: int, change: float) -> Measured:
-        """With gain and read noise drawn within their errors; samples keep their level."""
+    def _electronics(
+        self, measured: Measured, seeds: tuple[int, int], change: float, added: float
+    ) -> Measured:
+        """With gain and read noise drawn within their errors; samples keep their level.
+
+        ``added``: variance (e-²) of the measured read noise that effects add.
+        """
+        seed, own_seed = seeds
         gain = self.gain.drawn(np.random.default_rng([seed, _GAIN]), change)
         m = measured.maps
         m = replace(m, bias=m.bias + np.float32(self.pedestal))
-        noise = m.read_noise * gain
+        square = m.read_noise**2
+        noise = np.sqrt(np.maximum(square - np.float32(added), _WHITE * square)) * gain
         if self.noise is not None:
             noise = noise * self.noise.drawn(np.random.default_rng([own_seed, _NOISE]))
         maps = replace(

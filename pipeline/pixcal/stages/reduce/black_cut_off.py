@@ -18,7 +18,7 @@ _SHARE = 1e-3  # least share of samples at the lowest code
 # A pile: most samples below its code, over those at it (a normal distribution of this noise, in
 # steps, has three times as many or more).
 _BELOW, _NOISE = 0.01, 1.5
-_HIGHER = 1.2  # samples at a pile over those at the next code
+_SECOND = 0.4  # least share of a pile at a second code over that at the first
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,9 @@ def _pile(samples: NDArray[Any], most: float) -> int:
     if not piled.any():
         return 0
     at = int(np.flatnonzero(piled)[-1])
-    # Rounding after the cut may spread the pile over two codes.
-    if codes[at] < most and counts[at] < counts[at + 1] > _HIGHER * counts[at + 2]:
+    # Rounding after the cut may spread the pile over two codes. Noise alone is log-concave.
+    after = counts[at + 1 : at + 4].astype(float)
+    if len(after) == 3 and after[0] - after[1] ** 2 / after[2] > _SECOND * counts[at]:
         at += 1
     return int(codes[at])
 
