@@ -14,8 +14,10 @@ from scipy.optimize import minimize
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_largest
+from pixcal.kernels.synthesis import add_waves, turns
 from pixcal.model.arrays import C128, F32, F64, Mask
 from pixcal.model.config import quantity
+from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
@@ -24,7 +26,7 @@ _FRAMES = 8  # most differences of frames that are searched
 _WILD = 8.0  # standard deviations above which a sample is no noise
 _MOST = 48  # tones
 _AT_ONCE, _NEARLY = 8, 0.25  # tones found in one search, and their least power over the strongest
-_STRONG = 30.0  # power over that of white noise from which a frequency is refined
+_STRONG = 5.0  # power over that of white noise from which a frequency is refined
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,10 @@ class Pickup(Effect):
         (0.125, -0.31), unit="1/px", low=-0.5, high=0.5, doc="its cycles per row"
     )
 
+    def __post_init__(self) -> None:
+        if not len(self.rms) == len(self.columns) == len(self.rows):
+            raise InputError("rms, columns and rows: give as many numbers of each, one for a tone")
+
     @property
     def read_variance(self) -> float:
         return float(np.square(self.rms).sum())
@@ -68,12 +74,10 @@ class Pickup(Effect):
         y, x = np.arange(*shot.rows), np.arange(adu.shape[1])
         phases = shot.rng(self.name).uniform(0, 2 * np.pi, len(self.rms))
         size = np.sqrt(2) * np.array(self.rms) / shot.bench.detector.gain_e_per_adu
+        down = y[:, None] * (2 * np.pi * np.array(self.rows)) + phases
+        along = np.array(self.columns)[:, None] * (2 * np.pi * x)
         found = adu.copy()
-        # One by one: sums of a matrix product depend on the number of rows.
-        for a, phase, fy, fx in zip(size, phases, self.rows, self.columns, strict=False):
-            down, along = _wave(fy, y) * (a * np.exp(1j * phase)), _wave(fx, x)
-            found += np.outer(down.real, along.real).astype(np.float32)
-            found -= np.outer(down.imag, along.imag).astype(np.float32)
+        add_waves(turns(down) * size.astype(np.float32), turns(along), found)
         return found
 
     @classmethod
@@ -180,8 +184,8 @@ def _search(frames: F32, good: Mask, *, refine: bool = True) -> _Found:
     sigmas = sigmas_of_largest(float(own), (ny - 1) * (nx // 2))
     tones = np.stack([np.fft.fftfreq(ny)[at[:, 0]], at[:, 1] / nx], axis=1)
     if refine:
-        strong = power[*at.T] > _STRONG
-        tones[strong] = [_refined(frames, tone) for tone in tones[strong]]
+        for n in np.flatnonzero(power[*at.T] > _STRONG):
+            tones[n] = _refined(frames, tones[n])
     return _Found(tones, sigmas)
 
 
@@ -213,7 +217,5 @@ def _sizes(frames: F32, good: Mask, tones: F64) -> C128:
 
 def _drawn(size: C128, tones: F64, shape: tuple[int, ...]) -> F32:
     """Frames (t, y, x) of tones of these amplitudes."""
-    down, along = (
-        _wave(f[:, None], np.arange(n)) for f, n in zip(tones.T, shape[1:], strict=True)
-    )
+    down, along = (_wave(f[:, None], np.arange(n)) for f, n in zip(tones.T, shape[1:], strict=True))
     return np.asarray(((size[:, None] * down.T) @ along).real, np.float32)

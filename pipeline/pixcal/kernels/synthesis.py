@@ -190,6 +190,16 @@ def amplify(signal: F32, bias: F32, normal: F32, read_noise: F32, adu_per_e: F32
 
 
 @kernel()
+def add_waves(down: F32, along: F32, out: F32) -> None:
+    """Add waves to an array (y, x): products of cos and sin, (2, y, n) times (2, n, x)."""
+    for i in range(out.shape[0]):
+        for n in range(along.shape[1]):
+            c, s = down[0, i, n], down[1, i, n]
+            for j in range(out.shape[1]):
+                out[i, j] += c * along[0, n, j] - s * along[1, n, j]
+
+
+@kernel()
 def convert(adu: F32, step: int, lowest: int, top: int, out: U16) -> None:
     """Codes of the converter: multiples of ``step`` from ``lowest`` to ``top`` (ADU)."""
     low, high, half = np.float32(lowest), np.float32(top // step), np.float32(0.5)
@@ -201,8 +211,8 @@ def convert(adu: F32, step: int, lowest: int, top: int, out: U16) -> None:
 
 
 def turns(angles: NDArray[Any]) -> F32:
-    """cos and sin of angles (rad) for `illuminate`, shape (2, n)."""
-    found = np.empty((2, len(angles)), np.float32)
+    """cos and sin of angles (rad), shape (2, *angles.shape)."""
+    found = np.empty((2, *angles.shape), np.float32)
     np.cos(angles, out=found[0])
     np.sin(angles, out=found[1])
     return found

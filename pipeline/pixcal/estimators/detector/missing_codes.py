@@ -41,7 +41,8 @@ def missing_codes(counts: F64) -> I64:
         near, next_on = there[at], there[np.clip(at + step, 0, len(there) - 1)]
         # Counts of a normal distribution fall off ever more steeply.
         expected = counts[near] * np.minimum(counts[near] / counts[next_on], 1.0)
-        missing &= (0 < (near - empty) * step) & ((near - empty) * step <= _NEAR)
+        away = (near - empty) * step
+        missing &= (away > 0) & (away <= _NEAR)
         missing &= expected > POPULATED
     return empty[missing]
 

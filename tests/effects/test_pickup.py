@@ -1,0 +1,119 @@
+"""Tones in the noise: frequencies and sizes are found, and other noise is not taken for them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pixcal.effects.bias_drift import BiasDrift
+from pixcal.effects.output_jitter import OutputJitter
+from pixcal.effects.pickup import Pickup
+from pixcal.effects.row_noise import RowNoise
+from pixcal.effects.telegraph_noise import TelegraphNoise
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.model.arrays import F64
+from pixcal.model.bench import Bench
+from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect
+from pixcal.simulation.exposure import frames_of
+from pixcal.simulation.recording import recordings
+
+
+def in_the_dark(evidence: Evidence, bench: Bench, *on: Effect) -> Evidence:
+    made = {r.kind: r for r in recordings(bench)}
+    stacks = [s for s in evidence.stacks if s.kind in ("bias", "dark")]
+    frames = [frames_of(bench, made[s.kind], on).astype(np.float32) for s in stacks]
+    remade = tuple(replace(s, adu=a) for s, a in zip(stacks, frames, strict=True))
+    return replace(evidence, stacks=remade, fringes={})
+
+
+def test_a_tone_is_a_wave_of_another_phase_in_each_frame(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    bench = make_effect_bench()
+    bias = next(r for r in recordings(bench) if r.kind == "bias")
+    change = frames_of(bench, bias, [Pickup((40.0,), (0.21,), (-0.13,))]).astype(float)
+    change -= frames_of(bench, bias)
+    change *= bench.detector.gain_e_per_adu
+    _, ny, nx = change.shape
+    y, x = np.arange(ny)[:, None], np.arange(nx)
+    wave = np.exp(-2j * np.pi * (0.21 * x - 0.13 * y))
+    size = 2 * (change * wave).mean(axis=(1, 2))
+    # Waves of half periods that do not fit the frame leave some hundredths.
+    np.testing.assert_allclose(np.abs(size), 40 * np.sqrt(2), rtol=0.05)
+    rest = change - (size[:, None, None] * wave.conj()).real
+    assert rest.std() < 0.05 * 40
+    assert np.abs(np.exp(1j * np.angle(size)).mean()) < 3 / np.sqrt(len(size))
+
+
+@pytest.mark.parametrize(
+    ("rms", "columns", "rows"),
+    [((3.0,), (0.297,), (0.125,)), ((5.0, 2.0), (0.242, 0.137), (-0.31, 0.3)),
+     ((4.0, 3.0, 2.0), (0.297, 0.297, 0.45), (0.125, -0.125, 0.02))],
+)  # fmt: skip
+def test_tones_are_found(
+    acquired: Callable[..., Evidence],
+    make_effect_bench: Callable[..., Bench],
+    rms: tuple[float, ...],
+    columns: tuple[float, ...],
+    rows: tuple[float, ...],
+) -> None:
+    effect = Pickup(rms, columns, rows)
+    found = Pickup.estimate(in_the_dark(acquired(), make_effect_bench(), effect))
+    assert found is not None
+    assert isinstance(found.effect, Pickup)
+    assert found.significance > 5
+    assert len(found.effect.rms) == len(rms)
+    for at, values in enumerate(zip(rms, columns, rows, strict=True)):
+        size, x, y = values
+        near = np.hypot(np.array(found.effect.columns) - x, np.array(found.effect.rows) - y)
+        n = int(near.argmin())
+        assert near[n] < 2e-3, at
+        assert found.effect.rms[n] == pytest.approx(size, abs=4 * found.errors[f"rms[{n}]"])
+    assert found.size["value"] == pytest.approx(effect.read_variance**0.5, rel=0.4)
+
+
+def test_sizes_are_within_their_errors() -> None:
+    rng = np.random.default_rng(5)
+    shape, effect = (6, 90, 110), Pickup((1.5, 0.8), (0.31, 0.12), (-0.2, 0.33))
+    y, x = np.arange(shape[1])[:, None], np.arange(shape[2])
+    pulls = []
+    for _ in range(60):
+        frames = 5 * rng.standard_normal(shape)
+        for a, fx, fy in zip(effect.rms, effect.columns, effect.rows, strict=True):
+            phase = rng.uniform(0, 2 * np.pi, (shape[0], 1, 1))
+            frames += 2**0.5 * a * np.cos(2 * np.pi * (fx * x + fy * y) + phase)
+        found = Pickup.estimate(_evidence(frames))
+        assert found is not None
+        pulls.append((found.effect.rms[0] - 1.5) / found.errors["rms[0]"])
+    assert np.mean(pulls) == pytest.approx(0, abs=0.6)
+    assert 0.6 < np.std(pulls) < 1.5
+
+
+@pytest.mark.parametrize(
+    "other",
+    [RowNoise(6.0, 3.0, 2.0, 4.0), BiasDrift(3.0), TelegraphNoise(), OutputJitter()],
+    ids=lambda effect: effect.name,
+)
+def test_other_noise_is_no_tone(
+    acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench], other: Effect
+) -> None:
+    evidence = in_the_dark(acquired(), make_effect_bench(), other)
+    found = Pickup.detect(evidence)
+    assert found is not None
+    assert found < 5
+
+
+def test_each_tone_needs_its_frequencies() -> None:
+    with pytest.raises(InputError, match="rms, columns and rows"):
+        Pickup((1.0, 2.0), (0.1,), (0.2, 0.3))
+
+
+def _evidence(frames: F64) -> Evidence:
+    number, maps = np.arange(len(frames)), np.zeros(frames.shape[1:])
+    stack = Stack("bias", 0.0, number, 1.0 * number, frames.astype(np.float32))
+    return Evidence(
+        {}, (stack,), 1.0, 5.0, 5.0, maps, maps, maps + 1, maps == 0,
+        saturation_adu=65535, pitch_um=5.0, wavelength_nm=600.0, distance_mm=400.0,
+    )  # fmt: skip
