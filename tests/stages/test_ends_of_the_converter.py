@@ -52,6 +52,16 @@ def test_noise_above_the_lowest_code_is_whole(noise: float, level: float) -> Non
     assert CutOff.of(Frames(frames(noise, level, 0)), 1.0) is None
 
 
+@pytest.mark.parametrize("lowest", [1, 4, 64])
+@pytest.mark.parametrize("above", [-0.3, 0.4, 1.3, 2.0])
+@pytest.mark.parametrize("noise", [0.9, 1.2, 1.5])
+def test_noise_of_about_a_step_has_an_edge(noise: float, above: float, lowest: int) -> None:
+    samples = frames(noise, lowest + above * noise, lowest)
+    found = CutOff.of(Frames(samples), 1.0)
+    assert found is not None
+    assert found.code == lowest
+
+
 @pytest.mark.parametrize("lowest", [4.1, 31.75, 63.6])
 @pytest.mark.parametrize("above", [0.0, 1.0, 2.0])
 def test_a_pile_may_lie_on_two_codes(lowest: float, above: float) -> None:

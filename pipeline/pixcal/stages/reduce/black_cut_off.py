@@ -18,6 +18,9 @@ _SHARE = 1e-3  # least share of samples at the lowest code
 # A pile: most samples below its code, over those at it (a normal distribution of this noise, in
 # steps, has three times as many or more).
 _BELOW, _NOISE = 0.01, 1.5
+# An edge: least samples lacking at the code below it, over all; least samples at it over the
+# expected ones.
+_LACKING, _EDGE = 5e-3, 1.05
 _SECOND = 0.4  # least share of a pile at a second code over that at the first
 
 
@@ -37,8 +40,9 @@ class CutOff:
             return None
         lower, upper = np.quantile(samples, ndtr([1.0, 2.0]))
         noise = float(upper - lower)
-        fine = noise > _NOISE * step and of_whole_numbers(frames)
-        code = _pile(samples, lower) if fine else 0
+        code = 0
+        if of_whole_numbers(frames):
+            code = _pile(samples, lower) if noise > _NOISE * step else _edge(samples, step)
         share = float((samples <= code).mean())
         return cls(float(code), share, noise) if _changing(samples, code) > _SHARE else None
 
@@ -56,6 +60,23 @@ def _pile(samples: NDArray[Any], most: float) -> int:
     if len(after) == 3 and after[0] - after[1] ** 2 / after[2] > _SECOND * counts[at]:
         at += 1
     return int(codes[at])
+
+
+def _edge(samples: NDArray[Any], step: float) -> int:
+    """Lowest code of noise of about a step, if many lower samples are lacking; else 0.
+
+    The logarithms of the counts of normal noise lie on a parabola, which the codes above continue.
+    """
+    codes, counts = np.unique(samples, return_counts=True)
+    at = int(np.argmax(counts > _SHARE * samples.size))
+    near = counts[at : at + 4].astype(float)
+    if len(near) < 4 or near.min() < _SHARE * samples.size or codes[at + 3] - codes[at] > 3 * step:
+        return 0
+    one, two, three = np.log(near[1:])
+    lacking = np.exp(6 * one - 8 * two + 3 * three)
+    there = near[0] > _EDGE * np.exp(3 * one - 3 * two + three)
+    lost = counts[:at].sum() < _BELOW * lacking and lacking > _LACKING * samples.size
+    return int(codes[at]) if there and lost else 0
 
 
 def _changing(samples: NDArray[Any], code: int) -> float:
