@@ -63,10 +63,12 @@ def test_noise_of_about_a_step_has_an_edge(noise: float, above: float, lowest: i
 
 
 @pytest.mark.parametrize("lowest", [4.1, 31.75, 63.6])
-@pytest.mark.parametrize("above", [0.0, 1.0, 2.0])
-def test_a_pile_may_lie_on_two_codes(lowest: float, above: float) -> None:
+@pytest.mark.parametrize(
+    ("noise", "above"), [(1.2, 0.0), (1.2, 1.0), (8.0, 0.0), (8.0, 1.0), (8.0, 2.0)]
+)
+def test_a_pile_may_lie_on_two_codes(lowest: float, above: float, noise: float) -> None:
     rng = np.random.default_rng(3)
-    cut = np.maximum(rng.normal(lowest + above * 8, 8.0, SHAPE), lowest)
+    cut = np.maximum(rng.normal(lowest + above * noise, noise, SHAPE), lowest)
     samples = np.rint(cut + rng.uniform(-0.5, 0.5, SHAPE)).astype(np.uint16)
     found = CutOff.of(Frames(samples), 1.0)
     assert found is not None

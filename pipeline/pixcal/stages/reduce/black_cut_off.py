@@ -3,6 +3,7 @@
 Most converters end at code 0. A camera that subtracts black and then adds an offset ends at that.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -68,15 +69,19 @@ def _edge(samples: NDArray[Any], step: float) -> int:
     The logarithms of the counts of normal noise lie on a parabola, which the codes above continue.
     """
     codes, counts = np.unique(samples, return_counts=True)
-    at = int(np.argmax(counts > _SHARE * samples.size))
-    near = counts[at : at + 4].astype(float)
-    if len(near) < 4 or near.min() < _SHARE * samples.size or codes[at + 3] - codes[at] > 3 * step:
-        return 0
-    one, two, three = np.log(near[1:])
-    lacking = np.exp(6 * one - 8 * two + 3 * three)
-    there = near[0] > _EDGE * np.exp(3 * one - 3 * two + three)
-    lost = counts[:at].sum() < _BELOW * lacking and lacking > _LACKING * samples.size
-    return int(codes[at]) if there and lost else 0
+    first = int(np.argmax(counts > _SHARE * samples.size))
+    # Rounding after the cut may spread the pile over two codes.
+    for at, below in ((first, (6, -8, 3)), (first + 1, (10, -15, 6))):
+        near = counts[at : at + 4].astype(float)
+        even = len(near) == 4 and codes[at + 3] - codes[first] == (at + 3 - first) * step
+        if not even or near.min() < _SHARE * samples.size:
+            return 0
+        above = np.log(near[1:])
+        lacking = math.exp(above @ below)  # expected at the code below the first
+        lost = lacking > max(_LACKING * samples.size, counts[:first].sum() / _BELOW)
+        if lost and near[0] > _EDGE * math.exp(above @ (3, -3, 1)):
+            return int(codes[at])
+    return 0
 
 
 def _changing(samples: NDArray[Any], code: int) -> float:
