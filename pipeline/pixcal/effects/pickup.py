@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_largest
 from pixcal.kernels.synthesis import add_waves, turns
-from pixcal.model.arrays import C128, F32, F64, Mask
+from pixcal.model.arrays import C128, F32, F64, I64, Mask
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate, Stage
@@ -133,8 +133,8 @@ class _Found(NamedTuple):
     sigmas: float  # significance of the strongest
 
 
-def _wave(frequency: float, at: F64) -> C128:
-    return np.exp(2j * np.pi * frequency * at)
+def _wave(frequency: float | F64, at: I64) -> C128:
+    return np.asarray(np.exp(2j * np.pi * frequency * at))
 
 
 def _dark(evidence: Evidence) -> bool:
