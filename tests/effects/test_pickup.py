@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.signal
 
 from pixcal.effects.bias_drift import BiasDrift
 from pixcal.effects.output_jitter import OutputJitter
@@ -50,7 +51,7 @@ def test_a_tone_is_a_wave_of_another_phase_in_each_frame(
 @pytest.mark.parametrize(
     ("rms", "columns", "rows"),
     [((3.0,), (0.297,), (0.125,)), ((5.0, 2.0), (0.242, 0.137), (-0.31, 0.3)),
-     ((4.0, 3.0, 2.0), (0.297, 0.297, 0.45), (0.125, -0.125, 0.02))],
+     ((4.0, 3.0, 2.0), (0.297, 0.297, 0.5), (0.125, -0.125, 0.06))],
 )  # fmt: skip
 def test_tones_are_found(
     acquired: Callable[..., Evidence],
@@ -89,6 +90,69 @@ def test_sizes_are_within_their_errors() -> None:
         pulls.append((found.effect.rms[0] - 1.5) / found.errors["rms[0]"])
     assert np.mean(pulls) == pytest.approx(0, abs=0.6)
     assert 0.6 < np.std(pulls) < 1.5
+
+
+def test_a_weak_tone_is_one() -> None:
+    rng = np.random.default_rng(7)
+    shape = (6, 128, 150)
+    y, x = np.arange(shape[1])[:, None], np.arange(shape[2])
+    for _ in range(8):
+        phase = rng.uniform(0, 2 * np.pi, (shape[0], 1, 1))
+        wave = np.cos(2 * np.pi * (0.31 * x - 0.2 * y) + phase)
+        found = Pickup.estimate(_evidence(5 * rng.standard_normal(shape) + 0.22 * wave))
+        assert found is not None
+        assert len(found.effect.rms) == 1
+
+
+def _coupled(frames: F64) -> F64:
+    """Neighbours share noise."""
+    return frames + 0.2 * np.roll(frames, 1, axis=2) + 0.2 * np.roll(frames, 1, axis=1)
+
+
+def _of_a_slow_amplifier(frames: F64) -> F64:
+    """Each pixel keeps half of the noise of the one before."""
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -0.5], frames, axis=2))
+
+
+def _flicker(frames: F64) -> F64:
+    """1/f noise in the order of the pixels."""
+    size = frames[0].size
+    spectrum = np.fft.rfft(frames.reshape(len(frames), -1), axis=1)
+    spectrum /= np.sqrt(np.maximum(np.arange(spectrum.shape[1]) / size, 1e-4))
+    return np.fft.irfft(spectrum, size, axis=1).reshape(frames.shape)
+
+
+def _unequal(frames: F64) -> F64:
+    """Some frames are much noisier."""
+    return frames * np.where(np.arange(len(frames)) < 2, 3.5, 1.0)[:, None, None]
+
+
+def _of_outputs(frames: F64) -> F64:
+    """The levels of quadrants part by half of the noise."""
+    levels = 0.5 * np.random.default_rng(1).standard_normal((len(frames), 2, 2))
+    ny, nx = frames.shape[1] // 2, frames.shape[2] // 2
+    return frames + np.kron(levels, np.ones((1, ny, nx)))
+
+
+@pytest.mark.parametrize(
+    "change", [_coupled, _of_a_slow_amplifier, _flicker, _unequal, _of_outputs]
+)
+@pytest.mark.parametrize("shape", [(8, 128, 128), (4, 256, 190), (12, 64, 300)])
+def test_noise_that_is_not_white_is_no_tone(
+    change: Callable[[F64], F64], shape: tuple[int, int, int]
+) -> None:
+    rng, found = np.random.default_rng(9), []
+    for _ in range(12):
+        sigmas = Pickup.detect(_evidence(5 * change(rng.standard_normal(shape))))
+        assert sigmas is not None
+        found.append(sigmas)
+    assert max(found) < 4
+    assert np.mean(found) < 1.5
+
+
+def test_frames_without_noise_tell_nothing() -> None:
+    assert Pickup.detect(_evidence(np.zeros((4, 64, 64)))) is None
+    assert Pickup.estimate(_evidence(np.random.default_rng(1).random((1, 64, 64)))) is None
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,11 @@
 """Tones that the electronics pick up while a frame is read, of another phase in each frame.
 
-The differences of two frames hold no fixed pattern. Their strongest tones are found in the mean
-periodogram, taken off, and the rest searched again (CLEAN: Högbom 1974, A&AS 15, 417).
+The differences of two frames hold no fixed pattern. Tones stand out of the mean periodogram's
+surroundings, which noise of any smooth spectrum fills evenly. The strongest are taken off, and the
+rest is searched again (CLEAN: Högbom 1974, A&AS 15, 417).
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from scipy.fft import rfft2
@@ -22,11 +22,15 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 _SIDE = 512  # most rows and columns that are searched
+_LEAST = 32  # fewest rows and columns
 _FRAMES = 8  # most differences of frames that are searched
 _WILD = 8.0  # standard deviations above which a sample is no noise
 _MOST = 48  # tones
 _AT_ONCE, _NEARLY = 8, 0.25  # tones found in one search, and their least power over the strongest
-_STRONG = 5.0  # power over that of white noise from which a frequency is refined
+_DISTINCT = 0.7  # least distance of two tones, modes
+_AROUND = 8  # modes along each axis whose median is the noise about a tone
+# Fewer cycles along rows and along columns are steps between outputs, drifts and 1/f noise.
+_SLOW = 4, 8
 
 
 @dataclass(frozen=True)
@@ -82,115 +86,123 @@ class Pickup(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Tones of the frames without light, one after another; of the residuals without any."""
+        """Tones of differences of frames without light, one after another."""
         noise = _noise(evidence)
         if noise is None:
             return None
         frames, good = noise
-        significance, tones, rest = 0.0, np.zeros((0, 2)), frames
-        while len(tones) < _MOST:
-            found = _search(rest, good)
-            if not len(tones):
-                significance, first = found.sigmas, found.tones[:1]
-            if found.sigmas < SIGNIFICANT:
+        rest, tones = frames, np.zeros((0, 2))
+        ordinates, sigmas = _search(frames)
+        first, significance = ordinates[:1], float(sigmas[0])
+        while sigmas[0] > SIGNIFICANT and len(tones) < _MOST:
+            before = len(tones)
+            for tone in ordinates[sigmas > SIGNIFICANT][: _MOST - before]:
+                new = _refined(rest, tone)
+                if _apart(new, tones, frames.shape):
+                    tones = np.concatenate([tones, new[None]])
+            if len(tones) == before:
                 break
-            tones = np.concatenate([tones, found.tones])[:_MOST]
-            rest = frames - _drawn(_sizes(frames, good, tones), tones, frames.shape)
-            rest *= good
+            rest = (frames - _drawn(_sizes(frames, good, tones), tones, frames.shape)) * good
+            ordinates, sigmas = _search(rest)
         tones = tones if len(tones) else first
-        size = _sizes(frames, good, tones)
-        number = np.count_nonzero(good)
-        white = float(np.square(rest).sum()) / len(frames) / number
-        power = np.maximum((np.abs(size) ** 2).mean(axis=0) / 2 - 2 * white / number, 0.0)
-        # Two waves of random phases add up by chance.
-        error = np.sqrt((power**2 / 2 + (2 * white / number) ** 2) / len(frames))
+        size, number = _sizes(frames, good, tones), np.count_nonzero(good)
+        white = 2 * float(np.square(rest).sum()) / len(frames) / number**2
+        power = np.maximum((np.abs(size) ** 2).mean(axis=0) / 2 - white, 0.0)
+        # Two waves of random phases, whose difference this is, add up by chance.
+        variance = (power**2 / 2 + 2 * power * white + white**2) / len(frames)
         order = np.argsort(-power)
-        rms, tones, error = np.sqrt(power[order]), tones[order], error[order]
-        errors = error / (2 * np.maximum(rms, np.sqrt(error) / 2))
+        rms, tones, variance = np.sqrt(power[order]), tones[order], variance[order]
+        errors = np.sqrt(variance) / np.maximum(2 * rms, variance**0.25)
         total = float(np.sqrt(power.sum()))
+        many = "a tone" if len(rms) == 1 else f"{len(rms)} tones, the strongest"
         return Estimate(
             cls(*(tuple(map(float, values)) for values in (rms, tones[:, 1], tones[:, 0]))),
             {f"rms[{n}]": float(e) for n, e in enumerate(errors)},
             significance,
-            "tones in differences of frames"
-            + ("" if _dark(evidence) else ", beside fringes and light"),
+            "tones in the differences of two frames",
             size={
                 "value": total,
-                "error": float(np.sqrt((error**2).sum())) / (2 * max(total, 1e-9)),
+                "error": float(np.sqrt(variance.sum())) / max(2 * total, float(errors[0])),
                 "unit": "e-",
-                "of": f"rms in {len(rms)} tones, the strongest of {1 / np.hypot(*tones[0]):.3g} px",
+                "of": f"rms in {many} of period {1 / np.hypot(*tones[0]):.3g} px",
             },
         )
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
         noise = _noise(evidence)
-        return None if noise is None else _search(*noise, refine=False).sigmas
-
-
-class _Found(NamedTuple):
-    tones: F64  # (n, 2) cycles per row and per column, the strongest first
-    sigmas: float  # significance of the strongest
-
-
-def _wave(frequency: float | F64, at: I64) -> C128:
-    return np.asarray(np.exp(2j * np.pi * frequency * at))
-
-
-def _dark(evidence: Evidence) -> bool:
-    return any(s.kind in ("bias", "dark") and len(s.adu) > 1 for s in evidence.stacks)
+        return None if noise is None else float(_search(noise[0])[1][0])
 
 
 def _noise(evidence: Evidence) -> tuple[F32, Mask] | None:
-    """Differences of frames (t, y, x), of the noise of one frame (e-), zero in bad pixels."""
+    """Differences of frames (t, y, x) over root two, e-, without what rows and columns share.
+
+    Zero in bad pixels. None without two frames of a kind whose noise spans a step.
+    """
     middle = tuple(slice(max((n - _SIDE) // 2, 0), (n + _SIDE) // 2) for n in evidence.good.shape)
     good = evidence.good[middle]
+    if min(good.shape) < _LEAST or not evidence.dithered:
+        return None
     some: list[F32] = []
     for stack in evidence.stacks:
-        if stack.kind in ("bias", "dark") and evidence.dithered:
+        if stack.kind in ("bias", "dark"):
             adu = stack.adu[:, *middle].astype(np.float32)
             count = len(adu) // 2 * 2
-            some += list((adu[1:count:2] - adu[:count:2]) * np.float32(evidence.gain / 2**0.5))
-    if not some:
-        some = [
-            change[middle]
-            for found in evidence.fringes.values()
-            for change in found.residual[:_FRAMES]
-        ]
-    if not some or not good.any():
-        return None
-    frames = np.stack(some[:_FRAMES])
-    frames -= np.nanmean(frames[:, good], axis=1)[:, None, None]
-    limit = _WILD * np.sqrt(np.nanmean(frames[:, good] ** 2))
-    return np.where(good & (np.abs(frames) < limit), frames, np.float32(0)), good
+            for step in (adu[1:count:2] - adu[:count:2]) * np.float32(evidence.gain / 2**0.5):
+                own = _without_lines(step, good)
+                # Root mean squares, as medians of integers are quantised.
+                own[np.abs(own) > _WILD * np.sqrt(np.square(own).mean())] = 0
+                if own.any():
+                    some.append(own)
+    return (np.stack(some[:_FRAMES]), good) if some else None
 
 
-def _search(frames: F32, good: Mask, *, refine: bool = True) -> _Found:
-    """Strongest tones of the mean periodogram, beside rows and columns."""
+def _without_lines(frame: F32, good: Mask) -> F32:
+    """A frame without the means of its columns and rows; zero in bad pixels."""
+    for axis in (0, 1):
+        count = np.maximum(good.sum(axis=axis, keepdims=True), 1)
+        mean = np.where(good, frame, 0).sum(axis=axis, keepdims=True) / count
+        frame = frame - mean.astype(np.float32)
+    return np.where(good, frame, np.float32(0))
+
+
+def _search(frames: F32) -> tuple[F64, F64]:
+    """Strongest modes (n, 2), cycles per row and column, and the significance of each, falling."""
     count, ny, nx = frames.shape
     spectra = rfft2(frames)
-    power = (spectra.real**2 + spectra.imag**2).mean(axis=0, dtype=float)
-    power /= max(float(np.square(frames).sum()) / count, 1e-30)
-    # Noise of whole rows or columns has its own effects.
-    power[0] = power[:, 0] = 0
+    power = spectra.real**2 + spectra.imag**2
+    power = (power / np.square(frames).sum(axis=(1, 2), keepdims=True)).mean(axis=0, dtype=float)
+    power /= _surroundings(power)
+    power[np.abs(np.fft.fftfreq(ny)) * ny < _SLOW[0]] = 0
+    power[:, : _SLOW[1]] = 0
+    if nx % 2 == 0:
+        # The two halves of this column are the same.
+        power[ny // 2 + 1 :, -1] = 0
     peaks = power == maximum_filter(power, 3, mode=("wrap", "nearest"))
     peaks &= power > _NEARLY * power.max()
     at = np.argwhere(peaks)
     at = at[np.argsort(-power[*at.T])][:_AT_ONCE]
-    strongest = float(power[*at[0]])
-    # An ordinate has Wilson and Hilferty's distribution (1931), of two degrees per frame.
+    # An ordinate over its median has Wilson and Hilferty's distribution (1931).
     ninth = 1 / (9 * count)
-    own = (np.cbrt(strongest) - (1 - ninth)) / np.sqrt(ninth)
-    sigmas = sigmas_of_largest(float(own), (ny - 1) * (nx // 2))
-    tones = np.stack([np.fft.fftfreq(ny)[at[:, 0]], at[:, 1] / nx], axis=1)
-    if refine:
-        for n in np.flatnonzero(power[*at.T] > _STRONG):
-            tones[n] = _refined(frames, tones[n])
-    return _Found(tones, sigmas)
+    own = (np.cbrt(power[*at.T]) - 1) * (1 - ninth) / np.sqrt(ninth)
+    sigmas = [sigmas_of_largest(float(z), (ny - 1) * (nx // 2)) for z in own]
+    return np.stack([np.fft.fftfreq(ny)[at[:, 0]], at[:, 1] / nx], axis=1), np.array(sigmas)
+
+
+def _surroundings(power: F64) -> F64:
+    """Median of the modes (y, x) of each block, at every mode."""
+    blocks = [n // _AROUND for n in power.shape]
+    inside = power[: blocks[0] * _AROUND, : blocks[1] * _AROUND]
+    medians = np.median(inside.reshape(blocks[0], _AROUND, blocks[1], _AROUND), axis=(1, 3))
+    # The last modes belong to the last whole block.
+    at = [
+        np.minimum(np.arange(n) // _AROUND, m - 1) for n, m in zip(power.shape, blocks, strict=True)
+    ]
+    return np.asarray(np.maximum(medians, 1e-30)[np.ix_(*at)])
 
 
 def _refined(frames: F32, tone: F64) -> F64:
-    """Frequency of the highest power about a tone."""
+    """Frequencies of the highest power about a mode."""
     _, ny, nx = frames.shape
     bins = np.array([1 / ny, 1 / nx])
 
@@ -200,19 +212,41 @@ def _refined(frames: F32, tone: F64) -> F64:
         return -float((np.abs(along @ _wave(-fy, np.arange(ny))) ** 2).sum())
 
     start = np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.3]])
-    options = {"initial_simplex": start, "xatol": 0.01, "fatol": 1e-4, "maxiter": 40}
+    options = {"initial_simplex": start, "xatol": 0.01, "fatol": np.inf, "maxiter": 40}
     shift = minimize(loss, start[0], method="Nelder-Mead", options=options).x
-    return np.asarray(tone + np.clip(shift, -1, 1) * bins)
+    fy, fx = tone + np.clip(shift, -1, 1) * bins
+    # The wave is the same with both frequencies of opposite sign, or whole cycles more.
+    fy, fx = (fy, fx) if fx <= 0.5 else (-fy, 1 - fx)
+    return np.array([(fy + 0.5) % 1 - 0.5, fx])
+
+
+def _apart(tone: F64, others: F64, shape: tuple[int, ...]) -> bool:
+    """Whether a tone is so far from others, and from the same waves in reverse, as to differ."""
+    reverse = others * [-1, -1] + [0, 1]
+    away = np.hypot(*((np.concatenate([others, reverse]) - tone) * shape[1:]).T)
+    return bool((away > _DISTINCT).all())
+
+
+def _wave(frequency: float | F64, at: I64) -> C128:
+    return np.asarray(np.exp(2j * np.pi * frequency * at))
 
 
 def _sizes(frames: F32, good: Mask, tones: F64) -> C128:
-    """Amplitudes (t, n) of tones in each frame, by least squares."""
+    """Amplitudes (t, n) of tones in each frame, least squares for evenly spread bad pixels."""
     _, ny, nx = frames.shape
     down, along = (_wave(f[:, None], np.arange(n)) for f, n in zip(tones.T, (ny, nx), strict=True))
-    products = np.einsum("tyn,ny->tn", frames @ along.conj().T, down.conj())
-    overlap = (down.conj() @ down.T) * (along.conj() @ along.T)
-    overlap *= np.count_nonzero(good) / good.size
-    return np.asarray(2 * np.linalg.lstsq(overlap, products.T)[0].T)
+    products = np.einsum("tyn,ny->nt", frames @ along.conj().T, down.conj())
+    share = np.count_nonzero(good) / good.size / 2
+    same = share * (down.conj() @ down.T) * (along.conj() @ along.T)
+    opposite = share * ((down @ down.T) * (along @ along.T)).conj()
+    real = np.block(
+        [
+            [same.real + opposite.real, opposite.imag - same.imag],
+            [same.imag + opposite.imag, same.real - opposite.real],
+        ]
+    )
+    found = np.linalg.lstsq(real, np.concatenate([products.real, products.imag]))[0]
+    return np.asarray((found[: len(tones)] + 1j * found[len(tones) :]).T)
 
 
 def _drawn(size: C128, tones: F64, shape: tuple[int, ...]) -> F32:
