@@ -145,3 +145,18 @@ def test_samples_are_rounded_and_clipped() -> None:
     assert set(np.unique(out)) == set(range(0, 193, 16))
     synthesis.convert(adu, 16, 32, 192, out)
     assert set(np.unique(out)) == set(range(32, 193, 16))
+
+
+def test_waves_are_sums_of_cosines_on_any_rows() -> None:
+    rng = generator(9, Stream.NOISE)
+    (fy, fx, phase), size = rng.uniform(-0.5, 0.5, (3, 5)), rng.uniform(1, 4, 5).astype(np.float32)
+    y, x = np.arange(37), np.arange(53)
+    down = size * synthesis.turns(2 * np.pi * (y[:, None] * fy + phase))
+    along = synthesis.turns(2 * np.pi * fx[:, None] * x)
+    whole, parts = np.ones((2, 37, 53), np.float32)
+    synthesis.add_waves(down, along, whole)
+    turn = np.multiply.outer(y, fy)[:, None] + np.multiply.outer(x, fx) + phase
+    np.testing.assert_allclose(whole, 1 + np.cos(2 * np.pi * turn) @ size, atol=1e-4)
+    for rows in (slice(11), slice(11, 37)):
+        synthesis.add_waves(down[:, rows], along, parts[rows])
+    np.testing.assert_array_equal(parts, whole)

@@ -142,6 +142,7 @@ def full_wells(taken: dict[str, NDArray[Any]]) -> None:
     taken["flat"][6:] = 3277 + (np.random.default_rng(4).random(taken["flat"][6:].shape) < 0.02)
     taken["flat"][7, -1] = 3277
     taken["flat"][:6] //= 10
+    taken["flat"][:, 3, 4] = 3278  # hot
 
 
 def bright_crests(taken: dict[str, NDArray[Any]]) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pixcal.stages.reduce.black_cut_off import CutOff
 from pixcal.stages.reduce.flat_survey import FlatSurvey
 
-SHAPE = (2, 61, 409)
+SHAPE = (8, 61, 409)
 
 
 class Frames:
@@ -53,7 +53,7 @@ def test_noise_above_the_lowest_code_is_whole(noise: float, level: float) -> Non
 
 
 @pytest.mark.parametrize("lowest", [1, 4, 64])
-@pytest.mark.parametrize("above", [-0.3, 0.4, 1.3, 2.0])
+@pytest.mark.parametrize("above", [0.2, 0.6, 1.3, 2.0])
 @pytest.mark.parametrize("noise", [0.9, 1.2, 1.5])
 def test_noise_of_about_a_step_has_an_edge(noise: float, above: float, lowest: int) -> None:
     samples = frames(noise, lowest + above * noise, lowest)
@@ -83,6 +83,37 @@ def test_broken_columns_are_no_lowest_code() -> None:
     assert CutOff.of(Frames(samples), 1.0) is None
 
 
+def test_a_dead_column_does_not_hide_the_lowest_code() -> None:
+    samples = frames(8.0, 64 + 12.0, 64)
+    samples[:, :, 17], samples[:, 3] = 12, 70
+    found = CutOff.of(Frames(samples), 1.0)
+    assert found is not None
+    assert found.code == 64
+
+
+@pytest.mark.parametrize("noise", [0.2, 0.3, 0.5, 2.0])
+def test_warm_pixels_of_a_quiet_camera_are_no_cut_off(noise: float) -> None:
+    rng = np.random.default_rng(4)
+    warm = rng.exponential(1.5, SHAPE[1:]) * (rng.random(SHAPE[1:]) < 0.1)
+    samples = np.rint(rng.normal(10 + warm, noise, SHAPE)).astype(np.uint16)
+    assert CutOff.of(Frames(samples), 1.0) is None
+
+
+def test_a_ramp_of_a_quiet_camera_is_no_cut_off() -> None:
+    ramp = np.linspace(40, 50, SHAPE[2])
+    samples = np.rint(np.random.default_rng(4).normal(ramp, 0.3, SHAPE)).astype(np.uint16)
+    assert CutOff.of(Frames(samples), 1.0) is None
+
+
+@pytest.mark.parametrize("shape", [(32, 32), (64, 64), (64, 128)])
+@pytest.mark.parametrize("noise", [0.8, 1.2, 1.5, 2.0, 3.0])
+def test_small_windows_raise_no_alarm(noise: float, shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng([int(10 * noise), *shape])
+    for level in np.linspace(100, 101, 40):
+        samples = np.rint(rng.normal(level, noise, (2, *shape))).astype(np.uint16)
+        assert CutOff.of(Frames(samples), 1.0) is None
+
+
 def flats(noise: float, well: float, scatter: float) -> NDArray[Any]:
     """Flats of a ladder that may end in full wells, whose codes scatter."""
     rng = np.random.default_rng(8)
@@ -91,10 +122,11 @@ def flats(noise: float, well: float, scatter: float) -> NDArray[Any]:
     return np.rint(np.minimum(shot, well) + scatter * rng.uniform(-1, 1, shot.shape))
 
 
+@pytest.mark.parametrize("step", [1, 16])
 @pytest.mark.parametrize(("scatter", "well"), [(0.0, 3277.0), (0.5, 3277.03), (0.5, 3277.4)])
-def test_full_wells_may_be_read_as_one_of_two_codes(scatter: float, well: float) -> None:
-    samples = flats(20.0, well, scatter).astype(np.uint16)
-    assert FlatSurvey.of({"flat": Frames(samples)}).saturation == 3277
+def test_full_wells_may_be_read_as_one_of_two_codes(scatter: float, well: float, step: int) -> None:
+    samples = (step * flats(20.0, well, scatter)).astype(np.uint16)
+    assert FlatSurvey.of({"flat": Frames(samples)}).saturation == step * 3277
 
 
 @pytest.mark.parametrize("noise", [0.2, 0.5, 1.0, 20.0])

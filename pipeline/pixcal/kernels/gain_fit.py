@@ -10,7 +10,7 @@ remaining uncertainty of the curve is in its error.
 A camera that reads bright pixels with another amplifier (dual gain) has a step in the curve, which
 no such term describes. Points that leave the curve by far more than their noise are therefore
 fitted up to lower levels too, and the gain is that of the best-determined range. Where frames
-without light have other noise than flats (a camera that clips black, or reads darks in another
+without light differ in noise from flats (a camera that clips black, or reads darks in another
 way), the same holds for a curve without them.
 """
 
@@ -103,8 +103,10 @@ def fit_gain(
         return int(np.count_nonzero((sums[:, 1] > 0) & (sums[:, 1] <= top * sums[:, 0])))
 
     best, top = whole, whole.levels[1] / _SHORTER
-    if points(whole.levels[1]) >= 2 * _SPARE:
-        found = fit(highest, (read_variance[0], max(read_variance)))
+    if points(1.001 * whole.levels[1]) >= 2 * _SPARE:
+        # Nothing is known of it but that noise grows with light.
+        lit = sums[(sums[:, 0] > 0) & (sums[:, 1] > 0)]
+        found = fit(highest, (read_variance[0], float((lit[:, 2] / lit[:, 0]).max())))
         if found is not None and found.chance > _OFF_CURVE and found.error < best.error:
             best = replace(found, without_dark=True)
     while points(top) >= _SPARE:

@@ -106,9 +106,10 @@ class SimulatedDetector:
                 f"saturation_adu: {self.saturation_adu:g} ADU is above the largest code of "
                 f"{self.bits} bits, {(1 << self.bits) - 1}; give less, or more bits"
             )
-        if self.lowest_adu >= self.top_adu:
+        if self.lowest_adu >= self.top_adu or self.lowest_adu % self.step_adu:
             raise InputError(
-                f"lowest_adu: {self.lowest_adu} ADU leaves no code below saturation; give less"
+                f"lowest_adu: {self.lowest_adu} ADU is no code below saturation; give a multiple "
+                "of step_adu below saturation_adu"
             )
         if self.bias_adu >= self.top_adu:
             raise InputError(f"bias_adu: {self.bias_adu:g} ADU leaves no room below saturation")

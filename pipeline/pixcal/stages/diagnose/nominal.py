@@ -210,10 +210,11 @@ class NominalBench:
         gain = self.gain.drawn(np.random.default_rng([seed, _GAIN]), change)
         m = measured.maps
         m = replace(m, bias=m.bias + np.float32(self.pedestal))
-        square = m.read_noise**2
-        noise = np.sqrt(np.maximum(square - np.float32(added), _WHITE * square)) * gain
+        noise = m.read_noise
         if self.noise is not None:
             noise = noise * self.noise.drawn(np.random.default_rng([own_seed, _NOISE]))
+        square = noise**2
+        noise = np.sqrt(np.maximum(square - np.float32(added), _WHITE * square)) * gain
         maps = replace(
             m,
             response=m.response * gain,

@@ -28,7 +28,7 @@ def cut_from(array: str, facts: Mapping[str, F64], rows: int) -> list[int | None
     # At a saturated step, all flats reach the converter's end, or full wells, which vary by a few
     # codes; in other arrays, most frames do.
     if array == "flat":
-        full = (level >= usual) & (level >= _FULL * largest)
+        full = level >= _FULL * np.maximum(usual, largest)
     else:
         full = (level == largest) & (level == usual)
     cut = (share == 1) & ~full

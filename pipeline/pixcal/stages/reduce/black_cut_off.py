@@ -1,21 +1,24 @@
 """Black level so low that the converter cuts off part of the noise, at its lowest code.
 
-Most converters end at code 0. A camera that subtracts black and then adds an offset ends at that.
+Most converters end at code 0. A camera that subtracts black and then adds an offset ends at that
+offset.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from pixcal.model.arrays import I64, Mask
 from pixcal.stages.reduce.flat_survey import middle_rows, of_whole_numbers
 from pixcal.storage.frame_reader import Reader
 
-_SHARE = 1e-3  # least share of samples at the lowest code
+_FRAMES = 8
+_SHARE, _COUNT = 1e-3, 400  # least share, and number, of samples at the lowest code
 # A pile: most samples below its code, over those at it (a normal distribution of this noise, in
 # steps, has three times as many or more).
 _BELOW, _NOISE = 0.01, 1.5
@@ -23,6 +26,7 @@ _BELOW, _NOISE = 0.01, 1.5
 # expected ones.
 _LACKING, _EDGE = 5e-3, 1.05
 _SECOND = 0.4  # least share of a pile at a second code over that at the first
+_LEAVE = 0.1  # least share of the samples at the lowest code that are above it in the next frame
 
 
 @dataclass(frozen=True)
@@ -35,52 +39,75 @@ class CutOff:
 
     @classmethod
     def of(cls, frames: Reader, step: float) -> "CutOff | None":
-        """Cut-off of the first two frames, whose samples are multiples of a step; None if none."""
-        samples = middle_rows(frames, 0, 2)
-        if samples.min() < 0:
-            return None
+        """Cut-off of the first frames, whose samples are multiples of a step; None if none."""
+        samples = middle_rows(frames, 0, _FRAMES)
         lower, upper = np.quantile(samples, ndtr([1.0, 2.0]))
-        noise = float(upper - lower)
-        code = 0
-        if of_whole_numbers(frames):
-            code = _pile(samples, lower) if noise > _NOISE * step else _edge(samples, step)
+        noise, code = float(upper - lower), 0
+        if len(samples) > 1 and of_whole_numbers(frames):
+            counts = _Counts.of(samples)
+            code = _pile(counts, lower) if noise > _NOISE * step else _edge(counts, step)
+            # Else a quiet camera: all usual pixels are at this code, and a few warm ones above.
+            leaving = samples[1:][samples[:-1] == code] > code
+            code = code if code > 0 and leaving.mean() > _LEAVE else 0
+        if not code and samples.min() < 0:
+            return None
         share = float((samples <= code).mean())
         return cls(float(code), share, noise) if _changing(samples, code) > _SHARE else None
 
 
-def _pile(samples: NDArray[Any], most: float) -> int:
+class _Counts(NamedTuple):
+    """Samples of some frames (t, y, x) by code."""
+
+    code: I64  # (n,) ascending
+    number: I64  # (n,) samples
+    below: I64  # (n,) samples of lower codes, without pixels that never change: these are broken
+
+    @classmethod
+    def of(cls, samples: NDArray[Any]) -> "_Counts":
+        first = int(samples.min())
+        codes = samples.astype(np.int64) - first
+        changing = samples.min(axis=0) != samples.max(axis=0)
+        every, moving = (np.bincount(c.ravel()) for c in (codes, codes[:, changing]))
+        there = np.flatnonzero(every)
+        below = np.concatenate([[0], np.cumsum(moving)])[np.minimum(there, len(moving))]
+        return cls(there + first, every[there], below)
+
+    def many(self) -> Mask:
+        """Whether a code has enough samples to compare with those below."""
+        return np.asarray(self.number > max(_SHARE * self.number.sum(), _COUNT))
+
+
+def _pile(found: _Counts, most: float) -> int:
     """Code up to ``most`` at which samples pile up, with hardly any below; 0 if there is none."""
-    codes, counts = np.unique(samples, return_counts=True)
-    below = np.cumsum(counts) - counts
-    piled = (counts > _SHARE * samples.size) & (below < _BELOW * counts) & (codes < most)
+    piled = found.many() & (found.below < _BELOW * found.number) & (found.code < most)
     if not piled.any():
         return 0
     at = int(np.flatnonzero(piled)[-1])
     # Rounding after the cut may spread the pile over two codes. Noise alone is log-concave.
-    after = counts[at + 1 : at + 4].astype(float)
-    if len(after) == 3 and after[0] - after[1] ** 2 / after[2] > _SECOND * counts[at]:
+    after = found.number[at + 1 : at + 4].astype(float)
+    if len(after) == 3 and after[0] - after[1] ** 2 / after[2] > _SECOND * found.number[at]:
         at += 1
-    return int(codes[at])
+    return int(found.code[at])
 
 
-def _edge(samples: NDArray[Any], step: float) -> int:
+def _edge(found: _Counts, step: float) -> int:
     """Lowest code of noise of about a step, if many lower samples are lacking; else 0.
 
     The logarithms of the counts of normal noise lie on a parabola, which the codes above continue.
     """
-    codes, counts = np.unique(samples, return_counts=True)
-    first = int(np.argmax(counts > _SHARE * samples.size))
+    code, number, total = found.code, found.number, found.number.sum()
+    first = int(np.argmax(found.many() & (found.below < _SHARE * total)))
     # Rounding after the cut may spread the pile over two codes.
     for at, below in ((first, (6, -8, 3)), (first + 1, (10, -15, 6))):
-        near = counts[at : at + 4].astype(float)
-        even = len(near) == 4 and codes[at + 3] - codes[first] == (at + 3 - first) * step
-        if not even or near.min() < _SHARE * samples.size:
+        near = number[at : at + 4].astype(float)
+        even = len(near) == 4 and code[at + 3] - code[first] == (at + 3 - first) * step
+        if not even or near.min() < max(_SHARE * total, _COUNT):
             return 0
         above = np.log(near[1:])
         lacking = math.exp(above @ below)  # expected at the code below the first
-        lost = lacking > max(_LACKING * samples.size, counts[:first].sum() / _BELOW)
+        lost = lacking > max(_LACKING * total, found.below[first] / _BELOW)
         if lost and near[0] > _EDGE * math.exp(above @ (3, -3, 1)):
-            return int(codes[at])
+            return int(code[at])
     return 0
 
 
@@ -89,7 +116,7 @@ def _changing(samples: NDArray[Any], code: int) -> float:
     at_code = samples == code
     if len(samples) == 1 or np.median(samples) == code:
         return float(at_code.mean())
-    return float((at_code & (samples[0] != samples[-1])).mean())
+    return float((at_code & (samples.min(axis=0) != samples.max(axis=0))).mean())
 
 
 def cut_offs(arrays: Mapping[str, Reader], step: float) -> dict[str, CutOff]:
@@ -101,7 +128,7 @@ def cut_offs(arrays: Mapping[str, Reader], step: float) -> dict[str, CutOff]:
 def cut_off_warnings(found: Mapping[str, CutOff]) -> Sequence[str]:
     """Sentences about cut-offs."""
     return [
-        f"{name} frames are cut off at code {one.code:.0f}, where {100 * one.share:.2g} % of their "
+        f"{name} frames are cut off at code {one.code:.0f}, where {100 * one.share:.3g} % of their "
         "samples lie: level and noise are estimated from a normal distribution cut off there; "
         "raise the black level (offset) of the camera"
         for name, one in found.items()

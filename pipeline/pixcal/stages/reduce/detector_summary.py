@@ -34,6 +34,7 @@ ROUNDING_ADU = math.sqrt(SHEPPARD)  # noise of a converter that rounds to whole 
 
 _LINEAR_SHARE = 0.7
 _SATURATED_RUNG = 1e-2
+_KNOWN = 0.2  # largest relative error of a variance that replaces that of frames without light
 _GAIN_ERROR = 0.2
 _GUESS_ERROR = 0.1
 # variance of a sample, in square codes, above which rounding adds the same at every level
@@ -137,12 +138,18 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
         shot = charge / (job.gain if gain is None else gain.gain)
         noise, own = read_noise(sums[0], lost, shot, folder, job)
         gain = _gain(sums, own, lost[0], wander, top, job)
-    if gain is not None and (is_cut_off(job) or gain.without_dark):
+    if gain is not None and (is_cut_off(job) or _tells_noise(gain)):
         noise, own = of_variance(gain.read_variance, job.quantum)
     return Summary(
         declared, job.quantum or 1.0, medians, light, noise, own, gain, levels, usable, full,
         points, well, straight,
     )  # fmt: skip
+
+
+def _tells_noise(gain: GainFit) -> bool:
+    """Whether flats alone tell the noise at level zero."""
+    variance, error = gain.read_variance
+    return gain.without_dark and error < _KNOWN * variance
 
 
 def pair_sums(folder: Place, job: Measuring) -> F64:

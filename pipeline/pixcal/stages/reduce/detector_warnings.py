@@ -68,9 +68,9 @@ def _of_gain(fit: GainFit, summary: Summary, used: float) -> list[str]:
         )
     if fit.without_dark:
         found.append(
-            "frames without light have another noise than the photon-transfer curve at level zero: "
-            "gain and read noise are those of the flats alone; possible causes: the camera clips "
-            "its black level, or reads dark frames in another way"
+            "frames without light differ in noise from the photon-transfer curve at level zero: "
+            "the gain is that of the flats alone; possible causes: the camera clips its black "
+            "level, or reads dark frames in another way"
         )
     clear = [lag for lag, sigmas in fit.neighbours.items() if sigmas > SHARED]
     if clear:

@@ -51,6 +51,7 @@ class FlatSurvey:
         pedestal = 0.0 if dark is None else float(np.nanmean(middle_rows(dark, 0, 1)))
         flats = arrays["flat"]
         whole = of_whole_numbers(flats)
+        step = code_step([flats]) if whole else 1
         levels: list[float] = []
         tops: list[_Top] = []
         for number in range(flats.shape[0]):
@@ -60,11 +61,13 @@ class FlatSurvey:
             levels.append(float(np.nanmean(samples)) - pedestal)
             if whole:
                 top = int(samples.max())
-                below = top - samples[samples >= top - NEIGHBOURS].astype(np.int64)
+                near = samples[samples >= top - NEIGHBOURS * step].astype(np.int64)
+                below = (top - near) // step
                 counts = np.bincount(below.ravel(), minlength=NEIGHBOURS + 1)
                 low, high = np.quantile(samples, _ONE_SIGMA)
-                tops.append(_Top(top, counts, float(counts[0] / samples.size), float(high - low)))
-        return cls(np.array(levels), _pile(tops))
+                share, spread = float(counts[0] / samples.size), float(high - low) / step
+                tops.append(_Top(top, counts, share, spread))
+        return cls(np.array(levels), _pile(tops, step))
 
     def steps(self, exposures: Sequence[float | None]) -> list[int]:
         """Index from 0 of each frame's level among those of its exposure time."""
@@ -181,7 +184,7 @@ class _Top:
     spread: float  # codes between the quantiles at one sigma below and above the median
 
 
-def _pile(tops: Sequence[_Top]) -> float | None:
+def _pile(tops: Sequence[_Top], step: int) -> float | None:
     """Highest code, or the one below, if it has far more samples than the codes below these."""
     if not tops:
         return None
@@ -194,4 +197,4 @@ def _pile(tops: Sequence[_Top]) -> float | None:
     # Full wells are read as one of two codes. Flats that are not full vary more if brighter.
     narrow = min(top.spread for top in own) <= 1 and max(top.spread for top in tops) >= WIDE
     double = counts[:2].min() >= MIN_SAMPLES and counts[:2].sum() > PILED * counts[2:].max()
-    return float(highest - 1) if narrow and double else None
+    return float(highest - step) if narrow and double else None

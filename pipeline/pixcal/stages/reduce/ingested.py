@@ -194,7 +194,7 @@ class Ingested:
     @property
     def lowest_adu(self) -> float | None:
         """Code (ADU) at which noise is cut off; None if it is not."""
-        return max((one.code for one in self.cut_off.values()), default=None)
+        return min((one.code for one in self.cut_off.values()), default=None)
 
     def lowest(self, name: str) -> float:
         """Least sample (ADU) that an array can hold."""
