@@ -179,7 +179,7 @@ def _search(frames: F32) -> tuple[F64, F64]:
         # The two halves of this column are the same.
         power[ny // 2 + 1 :, -1] = 0
     peaks = power == maximum_filter(power, 3, mode=("wrap", "nearest"))
-    peaks &= power > _NEARLY * power.max()
+    peaks &= power >= _NEARLY * power.max()
     at = np.argwhere(peaks)
     at = at[np.argsort(-power[*at.T])][:_AT_ONCE]
     # An ordinate over its median has Wilson and Hilferty's distribution (1931).
