@@ -59,7 +59,7 @@ def modulated_glow(bench: Bench, size: float, rng: np.random.Generator) -> _Draw
     return {"corner": corner.tolist()}
 
 
-@law("pickup", "tone", 1, 25, "e- amplitude", known=False)
+@law("pickup", "tone", 1, 25, "e- amplitude")
 def pickup(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     """A tone of a power supply, sampled as pixels are read one after the other."""
     ny, nx = bench.shape

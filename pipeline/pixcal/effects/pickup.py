@@ -28,9 +28,12 @@ _WILD = 8.0  # standard deviations above which a sample is no noise
 _MOST = 48  # tones
 _AT_ONCE, _NEARLY = 8, 0.25  # tones found in one search, and their least power over the strongest
 _DISTINCT = 0.7  # least distance of two tones, modes
-_AROUND = 8  # modes along each axis whose median is the noise about a tone
-# Fewer cycles along rows and along columns are steps between outputs, drifts and 1/f noise.
-_SLOW = 4, 8
+# Modes (y, x) whose median is the noise about a tone: few of one frequency along rows where this is
+# low, as noise is 1/f there.
+_AROUND, _AROUND_SLOW = (8, 8), (32, 1)
+_SLOW = 8  # modes along rows that are low
+# Fewer cycles along columns are steps between outputs and drifts; with low ones along rows, more.
+_DRIFTS, _STEPS = 4, 24
 
 
 @dataclass(frozen=True)
@@ -172,9 +175,11 @@ def _search(frames: F32) -> tuple[F64, F64]:
     spectra = rfft2(frames)
     power = spectra.real**2 + spectra.imag**2
     power = (power / np.square(frames).sum(axis=(1, 2), keepdims=True)).mean(axis=0, dtype=float)
-    power /= _surroundings(power)
-    power[np.abs(np.fft.fftfreq(ny)) * ny < _SLOW[0]] = 0
-    power[:, : _SLOW[1]] = 0
+    power[:, _SLOW:] /= _surroundings(power[:, _SLOW:], _AROUND)
+    power[:, :_SLOW] /= _surroundings(power[:, :_SLOW], _AROUND_SLOW)
+    down = np.abs(np.fft.fftfreq(ny)) * ny
+    power[down < _DRIFTS] = power[:, 0] = 0
+    power[down < _STEPS, :_SLOW] = 0
     if nx % 2 == 0:
         # The two halves of this column are the same.
         power[ny // 2 + 1 :, -1] = 0
@@ -189,16 +194,16 @@ def _search(frames: F32) -> tuple[F64, F64]:
     return np.stack([np.fft.fftfreq(ny)[at[:, 0]], at[:, 1] / nx], axis=1), np.array(sigmas)
 
 
-def _surroundings(power: F64) -> F64:
-    """Median of the modes (y, x) of each block, at every mode."""
-    blocks = [n // _AROUND for n in power.shape]
-    inside = power[: blocks[0] * _AROUND, : blocks[1] * _AROUND]
-    medians = np.median(inside.reshape(blocks[0], _AROUND, blocks[1], _AROUND), axis=(1, 3))
+def _surroundings(power: F64, size: tuple[int, int]) -> F64:
+    """Median of the modes (y, x) of each block of a size, at every mode."""
+    size = min(size[0], power.shape[0]), min(size[1], power.shape[1])
+    (ny, nx), (height, width) = (n // m for n, m in zip(power.shape, size, strict=True)), size
+    inside = power[: ny * height, : nx * width].reshape(ny, height, nx, width)
+    medians = np.median(inside, axis=(1, 3))
     # The last modes belong to the last whole block.
-    at = [
-        np.minimum(np.arange(n) // _AROUND, m - 1) for n, m in zip(power.shape, blocks, strict=True)
-    ]
-    return np.asarray(np.maximum(medians, 1e-30)[np.ix_(*at)])
+    y = np.minimum(np.arange(power.shape[0]) // height, ny - 1)
+    x = np.minimum(np.arange(power.shape[1]) // width, nx - 1)
+    return np.asarray(np.maximum(medians, 1e-30)[np.ix_(y, x)])
 
 
 def _refined(frames: F32, tone: F64) -> F64:
