@@ -32,7 +32,7 @@ _DISTINCT = 0.7  # least distance of two tones, modes
 # low, as noise is 1/f there.
 _AROUND, _AROUND_SLOW = (8, 8), (32, 1)
 _SLOW = 8  # modes along rows that are low
-# Fewer cycles along columns are steps between outputs and drifts; with low ones along rows, more.
+# Fewer cycles along columns are drifts; or, with few along rows, steps between outputs.
 _DRIFTS, _STEPS = 4, 24
 
 
@@ -179,7 +179,7 @@ def _search(frames: F32) -> tuple[F64, F64]:
     power[:, :_SLOW] /= _surroundings(power[:, :_SLOW], _AROUND_SLOW)
     down = np.abs(np.fft.fftfreq(ny)) * ny
     power[down < _DRIFTS] = power[:, 0] = 0
-    power[down < _STEPS, :_SLOW] = 0
+    power[down < _STEPS, :_DRIFTS] = 0
     if nx % 2 == 0:
         # The two halves of this column are the same.
         power[ny // 2 + 1 :, -1] = 0
