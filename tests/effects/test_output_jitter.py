@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from dark_frames import in_the_dark
 
 from pixcal.effects.bias_drift import BiasDrift
 from pixcal.effects.cosmic_hits import CosmicHits
@@ -19,14 +20,6 @@ from pixcal.simulation.recording import recordings
 
 SHAPE = (160, 96)
 GOOD = np.ones(SHAPE, np.bool_)
-
-
-def in_the_dark(evidence: Evidence, bench: Bench, *on: Effect) -> Evidence:
-    made = {r.kind: r for r in recordings(bench)}
-    stacks = [s for s in evidence.stacks if s.kind in ("bias", "dark")]
-    frames = [frames_of(bench, made[s.kind], on).astype(np.float32) for s in stacks]
-    remade = tuple(replace(s, adu=a) for s, a in zip(stacks, frames, strict=True))
-    return replace(evidence, stacks=remade, fringes={})
 
 
 def test_an_output_moves_as_a_whole_and_by_itself(

@@ -1,11 +1,11 @@
 """Tones in the noise: frequencies and sizes are found, and other noise is not taken for them."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import scipy.signal
+from dark_frames import in_the_dark
 
 from pixcal.effects.bias_drift import BiasDrift
 from pixcal.effects.output_jitter import OutputJitter
@@ -19,14 +19,6 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
-
-
-def in_the_dark(evidence: Evidence, bench: Bench, *on: Effect) -> Evidence:
-    made = {r.kind: r for r in recordings(bench)}
-    stacks = [s for s in evidence.stacks if s.kind in ("bias", "dark")]
-    frames = [frames_of(bench, made[s.kind], on).astype(np.float32) for s in stacks]
-    remade = tuple(replace(s, adu=a) for s, a in zip(stacks, frames, strict=True))
-    return replace(evidence, stacks=remade, fringes={})
 
 
 def test_a_tone_is_a_wave_of_another_phase_in_each_frame(

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from dark_frames import in_the_dark
 from numpy.typing import NDArray
 
 from pixcal.effects.bias_drift import BiasDrift
@@ -18,15 +19,6 @@ from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
 
 NAMES = RowNoise.strengths
-
-
-def in_the_dark(evidence: Evidence, bench: Bench, *on: Effect) -> Evidence:
-    """The same evidence with bias and dark frames made anew, and no others."""
-    made = {r.kind: r for r in recordings(bench)}
-    stacks = [s for s in evidence.stacks if s.kind in ("bias", "dark")]
-    frames = [frames_of(bench, made[s.kind], on).astype(np.float32) for s in stacks]
-    remade = tuple(replace(s, adu=a) for s, a in zip(stacks, frames, strict=True))
-    return replace(evidence, stacks=remade, fringes={})
 
 
 @pytest.mark.parametrize("count", [61, 64])

@@ -55,8 +55,8 @@ class Pickup(Effect):
     frames_needed = ("dark",)
     remedy = "fix on the bench: find the source among supplies, cables and clocks"
     sources = (
-        "bias frames of the ESIS camera (package msfc-ccd 1.1): tones of 3 to 4 e- rms in a read "
-        "noise of 10 e-",
+        "assumed; bias frames of the ESIS camera (package msfc-ccd 1.2) have tones of 5.6 e- rms "
+        "together, in a read noise of 10 e-",
     )
 
     rms: tuple[float, ...] = quantity(
