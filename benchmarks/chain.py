@@ -107,8 +107,10 @@ def write_again(work: Workload, threads: int) -> float:
         target = work.folder / f"again-{number}"
         writer = create_array(target, reader.shape, reader.dtype)
         for n in range(0, len(columns), 16):
-            blocks = [((0, y[0], x[0]), reader.read((0, reader.shape[0]), y, x))
-                      for y, x in columns[n : n + 16]]  # fmt: skip
+            blocks = [
+                ((0, y[0], x[0]), reader.read((0, reader.shape[0]), y, x))
+                for y, x in columns[n : n + 16]
+            ]
             took += seconds(lambda: share_out(lambda at: writer.write(*at), blocks, threads))  # noqa: B023
         took += seconds(os.sync)
         shutil.rmtree(target)

@@ -95,9 +95,12 @@ def namespaces(names: Sequence[str]) -> Iterator[list[Host]]:
             for device in ("lo", "eth0"):
                 ip("-n", space, "link", "set", device, "up")
             hosts.append(
-                Host(f"{net}.{number}", ("ip", "netns", "exec", space),
-                     lambda link=link: ip("link", "set", link, "down"))  # type: ignore[misc]
-            )  # fmt: skip
+                Host(
+                    f"{net}.{number}",
+                    ("ip", "netns", "exec", space),
+                    lambda link=link: ip("link", "set", link, "down"),
+                )  # type: ignore[misc]
+            )
         yield hosts
 
 
@@ -174,18 +177,31 @@ def run_with_a_loss(work: Workload, store: Host, head: Host, lost: Host, left: H
     """Run on the cluster, lose a host in the middle, and compare with a run of this machine."""
     endpoint, scheduler = f"http://{store.address}:{STORE_PORT}", f"tcp://{head.address}:{PORT}"
     os.environ |= {
-        "AWS_ENDPOINT_URL": endpoint, "AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test",
-        "AWS_DEFAULT_REGION": "us-east-1", "AWS_CONFIG_FILE": os.devnull,
+        "AWS_ENDPOINT_URL": endpoint,
+        "AWS_ACCESS_KEY_ID": "test",
+        "AWS_SECRET_ACCESS_KEY": "test",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_CONFIG_FILE": os.devnull,
         "DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": SILENCE,
-    }  # fmt: skip
+    }
     store.start("moto_server", "--host", store.address, "--port", str(STORE_PORT))
     until(lambda: make_bucket(endpoint), "the store")
     head.start("dask", "scheduler", "--host", head.address, "--port", str(PORT), "--no-dashboard")
     for host in (lost, left):
         host.start(
-            "dask", "worker", scheduler, "--host", host.address, "--nworkers", "1",
-            "--nthreads", "1", "--no-dashboard", "--local-directory", str(work.folder / "dask"),
-        )  # fmt: skip
+            "dask",
+            "worker",
+            scheduler,
+            "--host",
+            host.address,
+            "--nworkers",
+            "1",
+            "--nthreads",
+            "1",
+            "--no-dashboard",
+            "--local-directory",
+            str(work.folder / "dask"),
+        )
     alone, spread = work.folder / "alone", work.folder / "spread"
     command = ("pixcal", "run", str(work.folder / "acq"), "--no-diagnose", "--quiet", "--out")
     if store.start(*command, str(alone), quiet=False).wait():

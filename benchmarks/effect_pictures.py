@@ -64,9 +64,16 @@ def draw(title: str, change: F64, sigma: F64, file: Path) -> None:
     unit = unit_for([limit], "px")
     scale: Any = {"cmap": DIVERGING, "vmin": -unit.factor * limit, "vmax": unit.factor * limit}
     figure, axes = axes_grid(
-        (7.6, 6.0), 2, 2, right=1.0, bottom=0.9, top=0.9, beside=0.65, between=0.65,
+        (7.6, 6.0),
+        2,
+        2,
+        right=1.0,
+        bottom=0.9,
+        top=0.9,
+        beside=0.65,
+        between=0.65,
         height_ratios=(3, 1.3),
-    )  # fmt: skip
+    )
     for n, name in enumerate(AXES):
         drawn = draw_blocks(axes[0, n], unit.factor * change[n], aspect="auto", **scale)
         rms = number(float(np.nanstd(change[n])), 2)

@@ -43,8 +43,13 @@ def examine(case: Case) -> dict[str, Any]:
     variant = VARIANTS[number]
     seed = 300_000 + 1000 * number + draw
     true = variant.make(times * variant.small, default_rng(seed))
-    marks = {"variant": number, "effect": variant.effect, "strength": variant.strength,
-             "times": times, "draw": draw}  # fmt: skip
+    marks = {
+        "variant": number,
+        "effect": variant.effect,
+        "strength": variant.strength,
+        "times": times,
+        "draw": draw,
+    }
     with tempfile.TemporaryDirectory() as folder:
         file, acquisition, run = (Path(folder, n) for n in ("bench.yaml", "acq", "run"))
         plain = bench(seed) | {"effects": {variant.effect: true}}

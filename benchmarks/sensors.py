@@ -90,11 +90,12 @@ def _diagnosis(file: Path, causes: list[list[str]] | None) -> dict[str, Any]:
         right = len(named) == len(causes) and all(set(named) & set(one) for one in causes)
     return {
         "right": right,
-        "verdict": found["verdict"], "named": named,
+        "verdict": found["verdict"],
+        "named": named,
         "p": [cause["p_value"] for cause in found["causes"]],
         "parameters": [[cause["parameters"], cause["uncertainty"]] for cause in found["causes"]],
         "where": [w["statistic"] for w in found["gap"].get("where", [])][:4],
-    }  # fmt: skip
+    }
 
 
 def table(lines: list[dict[str, Any]]) -> str:
@@ -126,9 +127,11 @@ def main() -> None:
     parser.add_argument("--ladder")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument(
-        "--no-diagnose", action="store_false", dest="diagnose",
+        "--no-diagnose",
+        action="store_false",
+        dest="diagnose",
         help="gain, read noise and masks only",
-    )  # fmt: skip
+    )
     parser.add_argument("--keep", action="store_true", help="keep frames and runs")
     asked = parser.parse_args()
     counts = asked.bias, asked.flats

@@ -54,9 +54,18 @@ def weighted_sums(source: ReducedSet) -> Callable[[NDArray[np.uint16]], None]:
         n, *shape = codes.shape
         *fixed, sums, of_batches = of_pixels((shape[0], shape[1]))
         sweep_batches(
-            codes, *coding, g[:n], still[:n], 0.0, 0.0, *fixed, np.array([n]), np.array([GOES_ON]),
-            *sums, *of_batches,
-        )  # fmt: skip
+            codes,
+            *coding,
+            g[:n],
+            still[:n],
+            0.0,
+            0.0,
+            *fixed,
+            np.array([n]),
+            np.array([GOES_ON]),
+            *sums,
+            *of_batches,
+        )
 
     return add
 
@@ -84,8 +93,11 @@ class Workload:
     @property
     def sources(self) -> list[ReducedSet]:
         """The reduced cubes."""
-        return [ReducedSet(p) for p in sorted((self.run / "reduce" / "reduced.zarr").iterdir())
-                if p.is_dir()]  # fmt: skip
+        return [
+            ReducedSet(p)
+            for p in sorted((self.run / "reduce" / "reduced.zarr").iterdir())
+            if p.is_dir()
+        ]
 
     def simulate(self) -> float:
         """Write the acquisition; seconds."""

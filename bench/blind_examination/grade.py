@@ -95,11 +95,16 @@ def grade(case: str, truth: Truth, diagnosis: Diagnosis | None, error: str = "")
     closed = 1 - float(diagnosis["gap"]["after"]) if named else None
     parameters = () if truth.second else tuple(_parameters(truth, diagnosis))
     return Grade(
-        *about, diagnosis["verdict"], named, marks, why,
+        *about,
+        diagnosis["verdict"],
+        named,
+        marks,
+        why,
         claims=tuple(_claim(cause) for cause in diagnosis["causes"]),
         worst=tuple(_place(one) for one in diagnosis["gap"]["where"][:WORST]),
-        parameters=parameters, closed=closed,
-    )  # fmt: skip
+        parameters=parameters,
+        closed=closed,
+    )
 
 
 def _claim(cause: Mapping[str, Any]) -> dict[str, Any]:

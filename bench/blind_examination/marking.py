@@ -167,7 +167,7 @@ def _graded(folder: Path, manifest: ExaminationManifest, opened: Sealed, number:
     with _understood(run_dir / PRODUCTS / "correction.json"):
         errors = offset_errors(
             run_dir / PRODUCTS, folder / name, truth, opened.benches[number], LAYOUTS[manifest.size]
-        )  # fmt: skip
+        )
     return replace(graded, offsets=errors)
 
 

@@ -101,10 +101,21 @@ def _options(case: SecondCase, layout: Layout) -> Sequence[str]:
         raise InputError(f"{case.case!r}: not a case of the second bench; give another sealed file")
     many = min(FLATS, layout.frames // 2)
     return (
-        case.case, "--seed", str(case.seed), "--strength", str(case.strength),
-        "--size", str(layout.shape[0]), str(layout.shape[1]), "--frames", str(layout.frames),
-        "--bias", str(min(BIAS, many)), "--flats", str(many),
-    )  # fmt: skip
+        case.case,
+        "--seed",
+        str(case.seed),
+        "--strength",
+        str(case.strength),
+        "--size",
+        str(layout.shape[0]),
+        str(layout.shape[1]),
+        "--frames",
+        str(layout.frames),
+        "--bias",
+        str(min(BIAS, many)),
+        "--flats",
+        str(many),
+    )
 
 
 def record_second(case: SecondCase, layout: Layout, out: Path) -> None:

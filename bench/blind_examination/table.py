@@ -110,14 +110,23 @@ def _maps(maps: Plain) -> str:
         within = errors["within_target"]
         rows.append(
             (
-                title, errors["maps"], f"{errors['before']:.2f}", f"{errors['after']:.2f}",
-                f"{within['right']} ({_percent(within)[1]})", *of_target,
+                title,
+                errors["maps"],
+                f"{errors['before']:.2f}",
+                f"{errors['after']:.2f}",
+                f"{within['right']} ({_percent(within)[1]})",
+                *of_target,
             )
-        )  # fmt: skip
+        )
     header = (
-        "maps along x or y", "number", "median error as fitted, bounds", "as corrected",
-        f"at most {maps['target']} bounds", "target of the median", "reached",
-    )  # fmt: skip
+        "maps along x or y",
+        "number",
+        "median error as fitted, bounds",
+        "as corrected",
+        f"at most {maps['target']} bounds",
+        "target of the median",
+        "reached",
+    )
     return _table(header, rows)
 
 

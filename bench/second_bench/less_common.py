@@ -5,9 +5,18 @@ import numpy as np
 from second_bench.model import F64, WARM_UP, Bench, Frame, stream
 
 LESS_COMMON = (
-    "noise_tail", "coarse_gain", "hot_clusters", "bad_frames", "dropped_frames", "phase_errors",
-    "dim_fringes", "far_aims", "long_period", "levels", "no_stamps",
-)  # fmt: skip
+    "noise_tail",
+    "coarse_gain",
+    "hot_clusters",
+    "bad_frames",
+    "dropped_frames",
+    "phase_errors",
+    "dim_fringes",
+    "far_aims",
+    "long_period",
+    "levels",
+    "no_stamps",
+)
 SHARE = dict.fromkeys(LESS_COMMON, 0.15)
 """Probability of each."""
 

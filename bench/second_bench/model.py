@@ -127,9 +127,18 @@ def new_run(
     """A run without any change in time."""
     n = count + WARM_UP
     return Run(
-        name, kind, exptime_s, start_s, number, np.zeros(n), np.ones((n, 2)), np.ones(n),
-        np.zeros((n, 2)), np.zeros((n, rows)), np.zeros(n),
-    )  # fmt: skip
+        name,
+        kind,
+        exptime_s,
+        start_s,
+        number,
+        np.zeros(n),
+        np.ones((n, 2)),
+        np.ones(n),
+        np.zeros((n, 2)),
+        np.zeros((n, rows)),
+        np.zeros(n),
+    )
 
 
 @dataclass(frozen=True)

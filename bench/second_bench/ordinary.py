@@ -25,10 +25,25 @@ from second_bench.model import (
 )
 
 VARIATIONS = (
-    "aim", "centred", "radii", "powers", "read_noise", "dust", "phases", "amplifiers",
-    "bad_pixels", "gain", "period", "rotated", "ambient",
-    "declared_gain", "stitches", "noisy_pixels", "lamp", *LESS_COMMON,
-)  # fmt: skip
+    "aim",
+    "centred",
+    "radii",
+    "powers",
+    "read_noise",
+    "dust",
+    "phases",
+    "amplifiers",
+    "bad_pixels",
+    "gain",
+    "period",
+    "rotated",
+    "ambient",
+    "declared_gain",
+    "stitches",
+    "noisy_pixels",
+    "lamp",
+    *LESS_COMMON,
+)
 """What differs from bench to bench."""
 CHANCE = {
     "centred": 0.1,
@@ -95,19 +110,31 @@ def draw_bench(layout: Layout, seed: int, varied: set[str]) -> Bench:
     peak = min(rng.uniform(36_000, 46_000), 0.8 * TOP_ADU * gain)
     read = max(rng.uniform(8, 20), 1.5 * gain)
     bench = Bench(
-        seed=seed, pitch_um=PITCH_UM, wavelength_nm=WAVELENGTH_NM, distance_mm=DISTANCE_MM,
+        seed=seed,
+        pitch_um=PITCH_UM,
+        wavelength_nm=WAVELENGTH_NM,
+        distance_mm=DISTANCE_MM,
         period_s=PERIOD_S,
-        delta_x=rng.normal(0, 6e-3, shape), delta_y=rng.normal(0, 6e-3, shape),
+        delta_x=rng.normal(0, 6e-3, shape),
+        delta_y=rng.normal(0, 6e-3, shape),
         response=rng.normal(1, rng.uniform(0.004, 0.015), shape),
-        flat_response=np.ones(shape), dark_e=np.full(shape, rng.uniform(0, 2)),
+        flat_response=np.ones(shape),
+        dark_e=np.full(shape, rng.uniform(0, 2)),
         read_noise_e=np.full(shape, read),
-        bias_adu=rng.uniform(300, 1000) + (
+        bias_adu=rng.uniform(300, 1000)
+        + (
             rng.normal(0, rng.uniform(2, 8), shape)
             + rng.normal(0, rng.uniform(1, 4), shape[1])
-            + rng.normal(0, rng.uniform(0.5, 2), (shape[0], 1))) / gain,
-        relative_gain=np.ones(shape), gain_e_per_adu=gain, declared_gain=gain,
-        full_well_e=1.5 * peak, flat_e=0.6 * peak, peak_e=peak,
-    )  # fmt: skip
+            + rng.normal(0, rng.uniform(0.5, 2), (shape[0], 1))
+        )
+        / gain,
+        relative_gain=np.ones(shape),
+        gain_e_per_adu=gain,
+        declared_gain=gain,
+        full_well_e=1.5 * peak,
+        flat_e=0.6 * peak,
+        peak_e=peak,
+    )
     bench.notes = {"gain_e_per_adu": gain, "read_noise_e": read, "peak_e": peak}
     _vary_detector(bench, varied)
     vary_camera(bench, varied)
@@ -233,11 +260,14 @@ def _draw_sets(bench: Bench, varied: set[str]) -> list[FringeSet]:
         share = rng.uniform(0.005, 0.04) if "ambient" in varied else 0.0
         found.append(
             FringeSet(
-                name, (float(declared[0]), float(declared[1])), beams,
-                bench.peak_e * rng.uniform(0.9, 1), rng.uniform(0.85, 0.98),
+                name,
+                (float(declared[0]), float(declared[1])),
+                beams,
+                bench.peak_e * rng.uniform(0.9, 1),
+                rng.uniform(0.85, 0.98),
                 np.full(bench.shape, share),
             )
-        )  # fmt: skip
+        )
         bench.notes[name] = {
             "period_px": float(period),
             "aims_mm": [b.aim_mm.tolist() for b in beams],

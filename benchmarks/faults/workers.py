@@ -39,9 +39,17 @@ def cluster() -> Iterator[str]:
 
         start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
         start(
-            "worker", "--host", "127.0.0.1", "--no-dashboard", "--nworkers", "2",
-            "--nthreads", "1", "--memory-limit", f"{MEMORY_MIB}MiB",
-        )  # fmt: skip
+            "worker",
+            "--host",
+            "127.0.0.1",
+            "--no-dashboard",
+            "--nworkers",
+            "2",
+            "--nthreads",
+            "1",
+            "--memory-limit",
+            f"{MEMORY_MIB}MiB",
+        )
         try:
             while not file.exists():
                 time.sleep(0.05)

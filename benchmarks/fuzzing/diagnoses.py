@@ -54,8 +54,20 @@ def reduced(night: Night, folder: Path, dtype: str = "uint16") -> Path | None:
 
 def _odd(case: Case) -> Answer:
     """Frames with which a diagnosis has little or nothing to begin."""
-    what = str(case.pick("few", "tiny", "saturated", "constant", "no fringes", "masked", "alone",
-                         "still", "short", "loud"))  # fmt: skip
+    what = str(
+        case.pick(
+            "few",
+            "tiny",
+            "saturated",
+            "constant",
+            "no fringes",
+            "masked",
+            "alone",
+            "still",
+            "short",
+            "loud",
+        )
+    )
     shape = (7, 5) if what == "tiny" and case.number % 2 else SHAPE
     if what == "tiny" and case.number % 2 == 0:
         shape = tuple(int(n) for n in case.rng.integers(1, 12, 2))
@@ -166,29 +178,57 @@ OWN = (
 ANSWER = 'return Estimate(cls(electrons=50.0), {"electrons": 1.0}, 50.0, "made up")'
 LIGHT = "return mean + self.electrons"
 BROKEN = (
-    ("", ""), (ANSWER, "return None"), (ANSWER, "raise ValueError('two\\nlines')"),
-    (ANSWER, "raise InputError('glow: no darks; take some')"), (ANSWER, "return 3"),
-    (ANSWER, "return float('nan')"), (ANSWER, "return cls()"), (ANSWER, "1 / 0"),
-    (ANSWER, "raise SystemExit(3)"), (ANSWER, "exit('bye')"), (ANSWER, "return []"),
-    (ANSWER, "return evidence.nothing"), (ANSWER, "return cls.estimate(evidence)"),
-    (ANSWER, "return Estimate(None, {}, 50.0, '')"), (ANSWER, "return Estimate()"),
-    (ANSWER, "return np.array(1.0)"), (ANSWER, "raise MemoryError"),
+    ("", ""),
+    (ANSWER, "return None"),
+    (ANSWER, "raise ValueError('two\\nlines')"),
+    (ANSWER, "raise InputError('glow: no darks; take some')"),
+    (ANSWER, "return 3"),
+    (ANSWER, "return float('nan')"),
+    (ANSWER, "return cls()"),
+    (ANSWER, "1 / 0"),
+    (ANSWER, "raise SystemExit(3)"),
+    (ANSWER, "exit('bye')"),
+    (ANSWER, "return []"),
+    (ANSWER, "return evidence.nothing"),
+    (ANSWER, "return cls.estimate(evidence)"),
+    (ANSWER, "return Estimate(None, {}, 50.0, '')"),
+    (ANSWER, "return Estimate()"),
+    (ANSWER, "return np.array(1.0)"),
+    (ANSWER, "raise MemoryError"),
     (ANSWER, "evidence.good[:] = False; return None"),
-    ("electrons=50.0", "electrons=float('nan')"), ("electrons=50.0", "electrons=-1.0"),
-    ("electrons=50.0", "electrons='many'"), ("electrons=50.0", "electrons=1e30"),
-    ("electrons=50.0", "protons=1.0"), ('"electrons": 1.0}', '"electrons": float("nan")}'),
-    ('"electrons": 1.0}', '"electrons": 0.0}'), ('"electrons": 1.0}', '"electrons": -1.0}'),
-    ('{"electrons": 1.0}', "{}"), ('{"electrons": 1.0}', "None"),
-    ('{"electrons": 1.0}', '{"protons": 1.0}'), ("50.0, \"made", "float('nan'), \"made"),
-    ("50.0, \"made", "float('inf'), \"made"), ("50.0, \"made", "'much', \"made"),
-    ("50.0, \"made", "-50.0, \"made"), ("50.0, \"made", "np.float32(50), \"made"),
-    ('"made up"', "None"), ('"made up"', "'two\\nlines <b>&'"),
-    ("@classmethod\n", "\n"), ("(cls, evidence)", "(cls)"), ("class Glow", "clas Glow"),
-    ("(Effect)", "(Exception)"), ("(Effect)", ""), ("(frozen=True)", ""),
-    (LIGHT, "return mean * float('nan')"), (LIGHT, "raise ValueError('x')"), (LIGHT, "return None"),
-    (LIGHT, "return mean[:1]"), (LIGHT, "raise SystemExit(3)"), (LIGHT, "return mean - 1e9"),
-    (LIGHT, "return mean * 1e300"), (LIGHT, "return 'light'"),
-)  # fmt: skip
+    ("electrons=50.0", "electrons=float('nan')"),
+    ("electrons=50.0", "electrons=-1.0"),
+    ("electrons=50.0", "electrons='many'"),
+    ("electrons=50.0", "electrons=1e30"),
+    ("electrons=50.0", "protons=1.0"),
+    ('"electrons": 1.0}', '"electrons": float("nan")}'),
+    ('"electrons": 1.0}', '"electrons": 0.0}'),
+    ('"electrons": 1.0}', '"electrons": -1.0}'),
+    ('{"electrons": 1.0}', "{}"),
+    ('{"electrons": 1.0}', "None"),
+    ('{"electrons": 1.0}', '{"protons": 1.0}'),
+    ('50.0, "made', "float('nan'), \"made"),
+    ('50.0, "made', "float('inf'), \"made"),
+    ('50.0, "made', "'much', \"made"),
+    ('50.0, "made', '-50.0, "made'),
+    ('50.0, "made', 'np.float32(50), "made'),
+    ('"made up"', "None"),
+    ('"made up"', "'two\\nlines <b>&'"),
+    ("@classmethod\n", "\n"),
+    ("(cls, evidence)", "(cls)"),
+    ("class Glow", "clas Glow"),
+    ("(Effect)", "(Exception)"),
+    ("(Effect)", ""),
+    ("(frozen=True)", ""),
+    (LIGHT, "return mean * float('nan')"),
+    (LIGHT, "raise ValueError('x')"),
+    (LIGHT, "return None"),
+    (LIGHT, "return mean[:1]"),
+    (LIGHT, "raise SystemExit(3)"),
+    (LIGHT, "return mean - 1e9"),
+    (LIGHT, "return mean * 1e300"),
+    (LIGHT, "return 'light'"),
+)
 
 
 def _own(case: Case) -> Answer:
@@ -214,27 +254,54 @@ def _own(case: Case) -> Answer:
 BENCH: dict[str, Any] = {
     "schema": "pixcal/bench/1",
     "seed": 3,
-    "detector": {"shape": list(SHAPE), "pitch_um": 4.4, "gain_e_per_adu": 1.0, "read_noise_e": 16,
-                 "delta_rms_px": 2.0e-3},
-    "optics": {"wavelength_nm": 632.8, "distance_mm": 400.0, "beam_radius_mm": 30.0,
-               "visibility": 0.9},
+    "detector": {
+        "shape": list(SHAPE),
+        "pitch_um": 4.4,
+        "gain_e_per_adu": 1.0,
+        "read_noise_e": 16,
+        "delta_rms_px": 2.0e-3,
+    },
+    "optics": {
+        "wavelength_nm": 632.8,
+        "distance_mm": 400.0,
+        "beam_radius_mm": 30.0,
+        "visibility": 0.9,
+    },
     "frames": {
         "exptime_s": 0.02,
         "period_s": 0.14,
         "bias": 12,
-        "fringes": [
-            {"name": "vertical", "baseline_mm": [10.9, 0.0], "count": 50, "peak_e": 38000}
-        ],
+        "fringes": [{"name": "vertical", "baseline_mm": [10.9, 0.0], "count": 50, "peak_e": 38000}],
     },
     "effects": {"lag": {}},
-}  # fmt: skip
+}
 EFFECTS: tuple[Any, ...] = (
-    {"lag": {}}, {}, None, [], 3, "lag", {"lag": None}, {"lag": 3}, {"lag": {"x": 1}},
-    {"nowhere": {}}, {"ipc": {}, "lag": {}}, {"intensity_noise": {}}, {3: {}}, {"glow": {}},
-    {"quantisation": {}}, {"cosmic_hits": {}}, {"hyperbolic_fringes": {}}, {"straylight": {}},
-    {"nonlinearity": {}}, {"telegraph_noise": {}}, {"rolling_shutter": {}}, {"flat_error": {}},
-    {"lag": {"fraction": -1}}, {"lag": {"fraction": "a"}}, {"ipc": {"nearest": 3}},
-)  # fmt: skip
+    {"lag": {}},
+    {},
+    None,
+    [],
+    3,
+    "lag",
+    {"lag": None},
+    {"lag": 3},
+    {"lag": {"x": 1}},
+    {"nowhere": {}},
+    {"ipc": {}, "lag": {}},
+    {"intensity_noise": {}},
+    {3: {}},
+    {"glow": {}},
+    {"quantisation": {}},
+    {"cosmic_hits": {}},
+    {"hyperbolic_fringes": {}},
+    {"straylight": {}},
+    {"nonlinearity": {}},
+    {"telegraph_noise": {}},
+    {"rolling_shutter": {}},
+    {"flat_error": {}},
+    {"lag": {"fraction": -1}},
+    {"lag": {"fraction": "a"}},
+    {"ipc": {"nearest": 3}},
+)
 
 
 def _nominal(case: Case) -> Answer:

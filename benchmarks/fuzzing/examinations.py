@@ -73,8 +73,22 @@ def _exam(case: Case) -> Answer:
     shutil.copytree(first / "exam", exam, copy_function=os.link)
     shutil.copy(first / "truth.json", truth)
     runs = sorted((exam / "runs").iterdir())
-    what = str(case.pick("paper", "paper", "paper", "truth", "truth", "other", "foreign",
-                         "diagnosis", "diagnosis", "sat", "case", "page"))  # fmt: skip
+    what = str(
+        case.pick(
+            "paper",
+            "paper",
+            "paper",
+            "truth",
+            "truth",
+            "other",
+            "foreign",
+            "diagnosis",
+            "diagnosis",
+            "sat",
+            "case",
+            "page",
+        )
+    )
     more: tuple[str | Path, ...] = ()
     run = runs[int(case.rng.integers(CASES))]
     if what == "paper":

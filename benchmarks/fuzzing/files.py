@@ -18,14 +18,60 @@ CARD, BLOCK = 80, 2880
 WHOLE = (0, 1, -1, 2, 3, 5, 7, 8, 16, 24, 32, 64, -32, -64, 255, 999, 65536, 2**31, 2**63, 10**18)
 NUMBERS = (0.0, -1.0, 1e-300, 1e38, 1e300, 1e400, -1e308, 32768.0, 0.5, 1e-45)
 WORDS = ("'abc'", "''", "T", "F", "NaN", "Inf", "-", "1.2.3", "(1,2)", "'it''s", "/", "1 / 2 / 3")
-KEYS = ("SIMPLE", "BITPIX", "NAXIS", "NAXIS1", "NAXIS2", "NAXIS3", "EXTEND", "BSCALE", "BZERO",
-        "BLANK", "EXPTIME", "MJD-OBS", "DATE-OBS", "TIME-OBS", "CCD-TEMP", "PCOUNT", "GCOUNT",
-        "XTENSION", "ZIMAGE", "ZBITPIX", "ZNAXIS", "ZNAXIS1", "ZNAXIS2", "ZTILE1", "ZTILE2",
-        "ZCMPTYPE", "ZSCALE", "ZZERO", "ZBLANK", "TFIELDS", "TFORM1", "TTYPE1", "END", "COMMENT",
-        "CONTINUE", "HIERARCH a b", "OBJECT")  # fmt: skip
-DATES = ("'2026-01-01T00:00:00'", "'0001-01-01T00:00:00'", "'9999-12-31T23:59:60'", "'2026-13-01'",
-         "'2026-01-01T00:00:00+14:00'", "'10000-01-01T00:00:00'", "'31/12/99'", "'2026-001T00'",
-         "'T'", "'2026-01-01T'", "1e300", "-1e300", "'２０２６-01-01T00:00:00'")  # fmt: skip
+KEYS = (
+    "SIMPLE",
+    "BITPIX",
+    "NAXIS",
+    "NAXIS1",
+    "NAXIS2",
+    "NAXIS3",
+    "EXTEND",
+    "BSCALE",
+    "BZERO",
+    "BLANK",
+    "EXPTIME",
+    "MJD-OBS",
+    "DATE-OBS",
+    "TIME-OBS",
+    "CCD-TEMP",
+    "PCOUNT",
+    "GCOUNT",
+    "XTENSION",
+    "ZIMAGE",
+    "ZBITPIX",
+    "ZNAXIS",
+    "ZNAXIS1",
+    "ZNAXIS2",
+    "ZTILE1",
+    "ZTILE2",
+    "ZCMPTYPE",
+    "ZSCALE",
+    "ZZERO",
+    "ZBLANK",
+    "TFIELDS",
+    "TFORM1",
+    "TTYPE1",
+    "END",
+    "COMMENT",
+    "CONTINUE",
+    "HIERARCH a b",
+    "OBJECT",
+)
+DATES = (
+    "'2026-01-01T00:00:00'",
+    "'0001-01-01T00:00:00'",
+    "'9999-12-31T23:59:60'",
+    "'2026-13-01'",
+    "'2026-01-01T00:00:00+14:00'",
+    "'10000-01-01T00:00:00'",
+    "'31/12/99'",
+    "'2026-001T00'",
+    "'T'",
+    "'2026-01-01T'",
+    "1e300",
+    "-1e300",
+    "'２０２６-01-01T00:00:00'",
+)
 
 
 def _samples(case: Case) -> NDArray[Any]:

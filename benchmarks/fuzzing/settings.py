@@ -15,11 +15,51 @@ from fuzzing.night import Night
 
 HUGE = 10**19
 WRONG: tuple[Any, ...] = (
-    None, True, False, 0, -1, 1, 2, 1e-320, -1e-9, 1e9, 1e300, 10**18, HUGE, 10**400,
-    float("nan"), float("inf"), -float("inf"), "", " ", "1", "abc", "1e3", "nan", "é💥", "\x07",
-    "x" * 3000, "<script>alert(1)</script>", "%s%n", "{}", "../..", "a\nb", [], [1], [1, 2],
-    [[]], [None], [1, 2, 3], ["a", "b"], {}, {"a": 1}, {"": {}}, [{"a": []}], [0, 0], [1e300, 1],
-)  # fmt: skip
+    None,
+    True,
+    False,
+    0,
+    -1,
+    1,
+    2,
+    1e-320,
+    -1e-9,
+    1e9,
+    1e300,
+    10**18,
+    HUGE,
+    10**400,
+    float("nan"),
+    float("inf"),
+    -float("inf"),
+    "",
+    " ",
+    "1",
+    "abc",
+    "1e3",
+    "nan",
+    "é💥",
+    "\x07",
+    "x" * 3000,
+    "<script>alert(1)</script>",
+    "%s%n",
+    "{}",
+    "../..",
+    "a\nb",
+    [],
+    [1],
+    [1, 2],
+    [[]],
+    [None],
+    [1, 2, 3],
+    ["a", "b"],
+    {},
+    {"a": 1},
+    {"": {}},
+    [{"a": []}],
+    [0, 0],
+    [1e300, 1],
+)
 GONE = object()
 BENCH = Path(__file__).parents[2] / "tests" / "bench.yaml"
 MAX_SAMPLES = 400_000
@@ -155,12 +195,35 @@ def _text(case: Case, good: str) -> bytes:
     lines = good.splitlines(keepends=True)
     at = int(case.rng.integers(len(lines)))
     key = lines[at].partition(":")[0].strip(" -") or "x"
-    tags = ("!!python/object/apply:os.system ['true']", "!!python/name:os.system", "!!binary aGk=",
-            "!!python/object/new:type {}", "!!timestamp 2026-01-01", "!!set {a, b}", "!x y",
-            "!!map {}", "!!float 1", "!<tag:yaml.org,2002:int> 3")  # fmt: skip
-    numbers = ("9" * 400, "9" * 5000, "1e999", "-1e999", "0x" + "f" * 300, "1_0", "1:1:1", "٣",
-    "+.inf",
-               ".nan", "0o17", "0b1", "1e", "--1", "0" * 10_000)  # fmt: skip
+    tags = (
+        "!!python/object/apply:os.system ['true']",
+        "!!python/name:os.system",
+        "!!binary aGk=",
+        "!!python/object/new:type {}",
+        "!!timestamp 2026-01-01",
+        "!!set {a, b}",
+        "!x y",
+        "!!map {}",
+        "!!float 1",
+        "!<tag:yaml.org,2002:int> 3",
+    )
+    numbers = (
+        "9" * 400,
+        "9" * 5000,
+        "1e999",
+        "-1e999",
+        "0x" + "f" * 300,
+        "1_0",
+        "1:1:1",
+        "٣",
+        "+.inf",
+        ".nan",
+        "0o17",
+        "0b1",
+        "1e",
+        "--1",
+        "0" * 10_000,
+    )
     ways = {
         "bomb": lambda: _bomb(int(case.rng.integers(2, 30))) + "\n" + good,
         "alias": lambda: good + f"\nextra: &a [*a, {key}]\n",

@@ -23,9 +23,13 @@ def image(figure: Figure, axes: Axes, values: NDArray[Any], scale: ColourScale, 
     """A map (y, x) with its colour bar, square pixels, y upwards."""
     ny, nx = values.shape
     drawn = axes.imshow(
-        np.ma.masked_invalid(values), norm=scale.norm, cmap=scale.colours, origin="lower",
-        interpolation="nearest", extent=(-0.5, nx - 0.5, -0.5, ny - 0.5),
-    )  # fmt: skip
+        np.ma.masked_invalid(values),
+        norm=scale.norm,
+        cmap=scale.colours,
+        origin="lower",
+        interpolation="nearest",
+        extent=(-0.5, nx - 0.5, -0.5, ny - 0.5),
+    )
     _add_bar(figure, axes, drawn, unit, scale.beyond)
     axes.tick_params(labelsize=8)
 

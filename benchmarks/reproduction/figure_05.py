@@ -104,9 +104,13 @@ def _frame(axes: Axes, edge: Edge, shape: str) -> None:
     frame = edge.frames[shape]
     ny, nx = frame.shape
     axes.imshow(
-        frame, cmap="gray", aspect="auto", origin="lower", interpolation="nearest",
+        frame,
+        cmap="gray",
+        aspect="auto",
+        origin="lower",
+        interpolation="nearest",
         extent=(edge.first - 0.5, edge.first + nx - 0.5, -0.5, ny - 0.5),
-    )  # fmt: skip
+    )
     axes.set_title("hyperbolic" if shape == "exact" else "straight", fontsize=10)
     axes.set_xlabel("x (px)")
     axes.set_xticks([edge.first, edge.first + nx - 1])
@@ -134,8 +138,11 @@ def make(lab: Lab) -> Outcome:
             Row("their distance at the edge, middle row", f"{number(middle)} px", "curved"),
             Row("distance in a corner", f"{number(corner)} px"),
             Row("the same by −qₓ (q² + B²/4) / 2D²", f"{number(leading)} px"),
-            Row("error of the straight model",
-                f"{number(corner / period, 2)} fringes in the corners", "straight"),
+            Row(
+                "error of the straight model",
+                f"{number(corner / period, 2)} fringes in the corners",
+                "straight",
+            ),
         ),
         difference="The shape agrees. The distance in pixels hardly depends on the baseline. "
         f"The paper gives 7 px for the shortest period, its equation 4 gives {number(period, 2)} "
@@ -147,4 +154,4 @@ def make(lab: Lab) -> Outcome:
             "interfringe_px": period,
         },
         picture=png(draw(edges)),
-    )  # fmt: skip
+    )

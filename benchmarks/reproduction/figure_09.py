@@ -124,9 +124,13 @@ def draw(lines: dict[str, Line], methods: dict[str, dict[str, list[Point]]]) -> 
         axes.legend(fontsize=8, loc="upper right", framealpha=0.9)
         finish(axes)
     left.annotate(
-        "needed", (own[0].frames, TARGET_PX), xytext=(0, 4), textcoords="offset points",
-        color=INK, fontsize=9,
-    )  # fmt: skip
+        "needed",
+        (own[0].frames, TARGET_PX),
+        xytext=(0, 4),
+        textcoords="offset points",
+        color=INK,
+        fontsize=9,
+    )
     top = max(p.error for found in methods.values() for points in found.values() for p in points)
     highest = max(top, max(p.error for line in lines.values() for p in line.points))
     left.set_ylim(0.6 * TARGET_PX, 12 * highest)
@@ -143,10 +147,17 @@ def _points(
     hollow: bool = False,
 ) -> None:
     axes.plot(
-        [p.frames for p in points], [p.error for p in points], marker, color=colour, label=label,
-        markersize=9 if hollow else 6, markerfacecolor="white" if hollow else colour,
-        ls=":" if hollow else "", linewidth=1, zorder=2 if hollow else 3,
-    )  # fmt: skip
+        [p.frames for p in points],
+        [p.error for p in points],
+        marker,
+        color=colour,
+        label=label,
+        markersize=9 if hollow else 6,
+        markerfacecolor="white" if hollow else colour,
+        ls=":" if hollow else "",
+        linewidth=1,
+        zorder=2 if hollow else 3,
+    )
 
 
 def _bound(axes: Axes, points: tuple[Point, ...], colour: str) -> None:
@@ -171,8 +182,10 @@ def make(lab: Lab) -> Outcome:
     ratios = [p.error / p.bound for line in lines.values() for p in line.points]
     last = lines[FINEST].points[-1]
     own, paper = last.frames_to_target, methods["steady"]["constant"][-1].frames_to_target
-    needed = {laser: {m: p[-1].frames_to_target for m, p in found.items()}
-              for laser, found in methods.items()}  # fmt: skip
+    needed = {
+        laser: {m: p[-1].frames_to_target for m, p in found.items()}
+        for laser, found in methods.items()
+    }
     side = bench.detector.shape[0]
     # What four patterns hold of a map without correlations.
     floor = bench.detector.delta_rms_px * 2 / side
@@ -189,18 +202,35 @@ def make(lab: Lab) -> Outcome:
         "frames; hollow: with laser noise. From the paper's maps only piston and slopes are "
         "removed.",
         rows=(
-            Row("frames for 5 × 10⁻⁵ px with a period of 5 px, pixcal",
-                with_error(own, own * chance), "target"),
-            Row("the same, A and B constant, no weights", with_error(paper, paper * chance),
-                "constant"),
-            Row("error over the Cramér–Rao bound, all points",
-                f"{min(ratios):.3f} to {max(ratios):.3f}", "finer"),
-            Row("error with A and B free and all modes kept, all frames",
-                f"{number(methods['steady']['free'][-1].error)} px", "free"),
-            Row(f"A and B constant, {100 * LASER_RMS:g} % laser noise: frames for 5 × 10⁻⁵ px",
-                number(needed["laser"]["constant"]), "laser"),
-            Row(f"pixcal, {100 * LASER_RMS:g} % laser noise: frames for 5 × 10⁻⁵ px",
-                number(needed["laser"]["pixcal"])),
+            Row(
+                "frames for 5 × 10⁻⁵ px with a period of 5 px, pixcal",
+                with_error(own, own * chance),
+                "target",
+            ),
+            Row(
+                "the same, A and B constant, no weights",
+                with_error(paper, paper * chance),
+                "constant",
+            ),
+            Row(
+                "error over the Cramér–Rao bound, all points",
+                f"{min(ratios):.3f} to {max(ratios):.3f}",
+                "finer",
+            ),
+            Row(
+                "error with A and B free and all modes kept, all frames",
+                f"{number(methods['steady']['free'][-1].error)} px",
+                "free",
+            ),
+            Row(
+                f"A and B constant, {100 * LASER_RMS:g} % laser noise: frames for 5 × 10⁻⁵ px",
+                number(needed["laser"]["constant"]),
+                "laser",
+            ),
+            Row(
+                f"pixcal, {100 * LASER_RMS:g} % laser noise: frames for 5 × 10⁻⁵ px",
+                number(needed["laser"]["pixcal"]),
+            ),
         ),
         difference=f"The paper's estimator needs {number(paper)} frames, as the paper says. It "
         f"weights all samples alike. With weights from the model, {number(own)} frames suffice, "
@@ -218,4 +248,4 @@ def make(lab: Lab) -> Outcome:
             "frames_to_target": needed | {"pixcal_steady": own},
         },
         picture=png(draw(lines, methods)),
-    )  # fmt: skip
+    )

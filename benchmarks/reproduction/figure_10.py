@@ -79,7 +79,9 @@ def measure(scene: Scene) -> Estimates:
     noise = scene.bench.detector.read_noise_e**2
     information = phase_information(true_iota, true_alpha, noise).sum()
     return Estimates(
-        iota, alpha, delta,
+        iota,
+        alpha,
+        delta,
         iota_error=without(iota / true_iota, np.concatenate([ones, fringe])),
         alpha_error=without(alpha / true_alpha, np.concatenate([ones, fringe, second])),
         delta_error=without(delta - truth.delta, open_modes),
@@ -92,7 +94,7 @@ def measure(scene: Scene) -> Estimates:
         ),
         bound=truth.bound,
         phi_bound=float(information**-0.5),
-    )  # fmt: skip
+    )
 
 
 def draw(found: Estimates) -> Figure:
@@ -136,14 +138,19 @@ def make(lab: Lab) -> Outcome:
     pull = float(np.std(found.delta_error / found.sigma))
     photons = 1 / float(np.sqrt(frames * found.iota.mean()))
     numbers: dict[str, Any] = {
-        "delta_error_px": rms, "bound_px": found.bound, "error_over_sigma": pull,
+        "delta_error_px": rms,
+        "bound_px": found.bound,
+        "error_over_sigma": pull,
         "delta_mean_error_px": float(found.delta_error.mean()),
-        "iota_error": float(found.iota_error.std()), "photon_error_of_iota": photons,
+        "iota_error": float(found.iota_error.std()),
+        "photon_error_of_iota": photons,
         "alpha_error": float(found.alpha_error.std()),
-        "phi_error_rad": float(found.phi_error.std()), "phi_bound_rad": found.phi_bound,
+        "phi_error_rad": float(found.phi_error.std()),
+        "phi_bound_rad": found.phi_bound,
         "level_error": float(found.level_error.std()),
-        "response_correlation": found.response, "whiteness": asdict(white),
-    }  # fmt: skip
+        "response_correlation": found.response,
+        "whiteness": asdict(white),
+    }
     worst = max(map(abs, (white.neighbours_x, white.neighbours_y, white.rows, white.columns)))
     side = bench.detector.shape[0]
     return Outcome(
@@ -156,12 +163,17 @@ def make(lab: Lab) -> Outcome:
         rows=(
             Row("error of δx over the Cramér–Rao bound", f"{rms / found.bound:.3f}", "systematics"),
             Row("error of δx over its own sigma", f"{pull:.3f}"),
-            Row("largest of four tests for patterns (neighbours, rows, columns)",
-                f"{worst:.1f} standard deviations", "map"),
+            Row(
+                "largest of four tests for patterns (neighbours, rows, columns)",
+                f"{worst:.1f} standard deviations",
+                "map",
+            ),
             Row("p-value of the highest peak of its power spectrum", f"{white.peak:.2f}"),
             Row("correlation of ι with the true response", f"{found.response:.4f}", "response"),
-            Row("error of φ(t) over the Cramér–Rao bound",
-                f"{numbers['phi_error_rad'] / found.phi_bound:.3f}"),
+            Row(
+                "error of φ(t) over the Cramér–Rao bound",
+                f"{numbers['phi_error_rad'] / found.phi_bound:.3f}",
+            ),
             Row("error of B(t)", number(numbers["level_error"])),
         ),
         difference="None in the result. The paper holds A, B and the fringe vector constant from "
@@ -169,4 +181,4 @@ def make(lab: Lab) -> Outcome:
         "removed.",
         numbers=numbers,
         picture=png(draw(found)),
-    )  # fmt: skip
+    )

@@ -69,9 +69,14 @@ def _panel(axes: Axes, one: Stability, period_s: float) -> None:
     curve = one.allan
     frames, deviation = np.array(curve["frames"]), np.array(curve["adev_px"])
     axes.errorbar(
-        frames, deviation, yerr=curve["adev_err_px"], fmt="o", color=INK, markersize=5,
+        frames,
+        deviation,
+        yerr=curve["adev_err_px"],
+        fmt="o",
+        color=INK,
+        markersize=5,
         label="Allan deviation, median pixel",
-    )  # fmt: skip
+    )
     ends = np.array([frames[0], max(one.frames, MEASURED_FRAMES)])
     middle = float(np.exp(np.mean(np.log(frames))))
     level = float(np.exp(np.mean(np.log(deviation))))
@@ -79,9 +84,13 @@ def _panel(axes: Axes, one: Stability, period_s: float) -> None:
     fitted = level * (ends / middle) ** curve["slope"]
     axes.plot(ends, fitted, color=RED, linewidth=1.2, label=f"power law, slope {slope}")
     axes.plot(
-        ends, one.bound * np.sqrt(one.frames / ends), color=GREEN, ls="--", linewidth=1.2,
+        ends,
+        one.bound * np.sqrt(one.frames / ends),
+        color=GREEN,
+        ls="--",
+        linewidth=1.2,
         label="Cramér–Rao bound, square-root law",
-    )  # fmt: skip
+    )
     axes.plot(one.frames, one.error, "s", color=BLUE, label="error of all frames against the truth")
     axes.plot(MEASURED_FRAMES, MEASURED_PX, "*", color=GREY, markersize=12, label="paper's bench")
     logarithmic(axes)
@@ -118,9 +127,11 @@ def make(lab: Lab) -> Outcome:
         Row("knee, where the deviation leaves the power law", rise, "rise"),
         Row(f"deviation of {number(MEASURED_FRAMES)} frames", f"{number(at)} px", "allan"),
         Row("deviation of the paper's bench over this simulation", number(excess), "gap"),
-        Row("error of all frames over the Cramér–Rao bound",
-            ", ".join(f"{one.error / one.bound:.3f}" for one in found)),
-    ]  # fmt: skip
+        Row(
+            "error of all frames over the Cramér–Rao bound",
+            ", ".join(f"{one.error / one.bound:.3f}" for one in found),
+        ),
+    ]
     lasts = frames * period
     return Outcome(
         figure="11",
@@ -139,14 +150,18 @@ def make(lab: Lab) -> Outcome:
         f"rise after {STABLE_S / 60:.0f} minutes is not simulated.",
         numbers={
             one.name: {
-                "slope": one.allan["slope"], "slope_err": one.allan["slope_err"],
-                "frames": one.allan["frames"], "adev_px": one.allan["adev_px"],
+                "slope": one.allan["slope"],
+                "slope_err": one.allan["slope_err"],
+                "frames": one.allan["frames"],
+                "adev_px": one.allan["adev_px"],
                 "adev_err_px": one.allan["adev_err_px"],
                 "white_expected_px": one.allan["white_expected_px"],
-                "knee_frames": one.allan["knee_frames"], "error_px": one.error,
-                "bound_px": one.bound, "at_10000_frames_px": one.at(MEASURED_FRAMES),
+                "knee_frames": one.allan["knee_frames"],
+                "error_px": one.error,
+                "bound_px": one.bound,
+                "at_10000_frames_px": one.at(MEASURED_FRAMES),
             }
             for one in found
         },
         picture=png(draw(found, period)),
-    )  # fmt: skip
+    )

@@ -194,14 +194,21 @@ def make(lab: Lab) -> Outcome:
             Row("teeth of δx, figure 12, peak to peak", _height(real["vertical"]), "teeth_x"),
             Row("teeth of δy, figure 13", _height(simulated["horizontal"]), "alike"),
             Row("teeth of δx, figure 13", _height(simulated["vertical"]), "alike"),
-            Row(f"teeth of δy, figure 13, after {alternating.ITERATIONS} iterations",
-                _height(few), "alike"),
+            Row(
+                f"teeth of δy, figure 13, after {alternating.ITERATIONS} iterations",
+                _height(few),
+                "alike",
+            ),
             Row("teeth against arg(Σ kₙ exp(iKn)) / K, worst row", f"{number(worst)} px", "kernel"),
-            Row("error without crosstalk, δy and δx",
+            Row(
+                "error without crosstalk, δy and δx",
                 f"{number(none['horizontal'].rest)} and {number(none['vertical'].rest)} px",
-                "clean"),
-            Row(f"teeth of δy at {periods[1]:.2g} px when A and B are free",
-                _height(free["horizontal"])),
+                "clean",
+            ),
+            Row(
+                f"teeth of δy at {periods[1]:.2g} px when A and B are free",
+                _height(free["horizontal"]),
+            ),
         ),
         difference="The teeth follow the closed form row by row. Without crosstalk the error is "
         "that of rounding to 16 bits, which the paper's 10⁻⁷ px do not contain. "
@@ -211,20 +218,25 @@ def make(lab: Lab) -> Outcome:
         numbers={
             title: {
                 OFFSET[name]: {
-                    "teeth_px": one.found.tolist(), "expected_px": one.expected.tolist(),
+                    "teeth_px": one.found.tolist(),
+                    "expected_px": one.expected.tolist(),
                     "kernel_px": one.kernel.tolist(),
-                    "height_px": one.height, "expected_height_px": one.expected_height,
-                    "sigma_px": one.sigma, "rest_px": one.rest,
+                    "height_px": one.height,
+                    "expected_height_px": one.expected_height,
+                    "sigma_px": one.sigma,
+                    "rest_px": one.rest,
                 }
                 for name, one in found.items()
             }
             for title, found in (
-                ("figure_12", real), ("figure_13", simulated), ("no_crosstalk", none),
+                ("figure_12", real),
+                ("figure_13", simulated),
+                ("no_crosstalk", none),
                 ("figure_13_free_intensities", free),
             )
         },
         picture=png(draw(panels)),
-    )  # fmt: skip
+    )
 
 
 def _height(one: Teeth) -> str:

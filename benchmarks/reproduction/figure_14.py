@@ -66,7 +66,8 @@ def measure(scene: Scene) -> dict[str, Bent]:
         modes = np.concatenate([plane((ny, nx)), harmonics((ny, nx), (kx, ky))])
         shape = told["geometry"]
         found[name] = Bent(
-            straight[name], auto,
+            straight[name],
+            auto,
             crest=crest,
             left=Crest.of(auto - truth.delta),
             expected=Crest.of(phase(x, y, g) / np.hypot(kx, ky)),
@@ -78,7 +79,7 @@ def measure(scene: Scene) -> dict[str, Bent]:
             fitted_sigma=tuple(shape.get(f"centre_{a}_sigma_mm", np.nan) for a in "xy"),
             model=told["model"],
             error=float(np.nanstd(without(auto - truth.delta, modes))),
-        )  # fmt: skip
+        )
     return found
 
 
@@ -105,14 +106,16 @@ def mixture(scene: Scene, name: str) -> Mixed:
     delta, (auto,) = truth.offsets(psi), read_set(run, name, "delta")
     crest = Crest.of(delta - truth.delta)
     return Mixed(
-        delta, auto,
-        teeth=float(np.ptp(teeth(without(delta - truth.delta, _smooth(delta.shape)),
-                                 period_of(couplings)))),
+        delta,
+        auto,
+        teeth=float(
+            np.ptp(teeth(without(delta - truth.delta, _smooth(delta.shape)), period_of(couplings)))
+        ),
         expected_teeth=float(np.ptp(predicted_teeth(couplings, truth.vector))),
         fringes=fringes_left(delta - truth.delta, truth.vector),
         auto_fringes=fringes_left(auto - truth.delta, truth.vector),
         crest=crest,
-    )  # fmt: skip
+    )
 
 
 def causes(lab: Lab, bench: Bench, name: str) -> dict[str, float]:
@@ -202,24 +205,38 @@ def make(lab: Lab) -> Outcome:
         "fitted as straight ones (`--model paraxial`). Below: the same frames with `--model auto`, "
         "same colours.",
         rows=(
-            Row("crest of δx, straight model, peak to peak",
-                f"{number(dx.crest.reach)} px", "crest"),
+            Row(
+                "crest of δx, straight model, peak to peak", f"{number(dx.crest.reach)} px", "crest"
+            ),
             Row("crest of δy, straight model, peak to peak", f"{number(dy.crest.reach)} px"),
-            Row("direction of the crest of δx, from the x axis", f"{dx.crest.ridge_deg:.1f}°, "
-                f"expected {dx.expected.ridge_deg:.1f}°", "crest"),
+            Row(
+                "direction of the crest of δx, from the x axis",
+                f"{dx.crest.ridge_deg:.1f}°, expected {dx.expected.ridge_deg:.1f}°",
+                "crest",
+            ),
             Row("fibre offset from the crest of δx", _place(dx.seen), "offset_x"),
             Row("fibre offset from the crest of δy", _place(dy.seen), "offset_y"),
             Row("fibre offset from the hyperbolic fit, δx", _fitted(dx)),
-            Row("remaining crests with `--model auto`, δx and δy",
-                f"{number(dx.left.reach)} and {number(dy.left.reach)} px "
-                f"({dx.model}, {dy.model})"),
-            Row("teeth of δy, figure 14", f"{number(mixed['horizontal'].teeth)} px, kernel "
-                f"{number(mixed['horizontal'].expected_teeth)} px", "same_teeth"),
-            Row("fringes in δx, paper's iterations", f"{number(mixed['vertical'].fringes)} px rms",
-                "residuals"),
-            Row("the same with laser noise only, varying fringe vector only, neither",
+            Row(
+                "remaining crests with `--model auto`, δx and δy",
+                f"{number(dx.left.reach)} and {number(dy.left.reach)} px ({dx.model}, {dy.model})",
+            ),
+            Row(
+                "teeth of δy, figure 14",
+                f"{number(mixed['horizontal'].teeth)} px, kernel "
+                f"{number(mixed['horizontal'].expected_teeth)} px",
+                "same_teeth",
+            ),
+            Row(
+                "fringes in δx, paper's iterations",
+                f"{number(mixed['vertical'].fringes)} px rms",
+                "residuals",
+            ),
+            Row(
+                "the same with laser noise only, varying fringe vector only, neither",
                 f"{number(alone['laser'])}, {number(alone['vector'])}, "
-                f"{number(alone['nothing'])} px rms"),
+                f"{number(alone['nothing'])} px rms",
+            ),
             Row("fringes in δx, pixcal", f"{number(mixed['vertical'].auto_fringes)} px rms"),
         ),
         difference="The crest is the second order of the path difference; its shape gives the "
@@ -233,28 +250,35 @@ def make(lab: Lab) -> Outcome:
         numbers={
             "figure_15": {
                 OFFSET[name]: {
-                    "crest_px": bent.crest.reach, "expected_crest_px": bent.expected.reach,
+                    "crest_px": bent.crest.reach,
+                    "expected_crest_px": bent.expected.reach,
                     "ridge_deg": bent.crest.ridge_deg,
                     "expected_ridge_deg": bent.expected.ridge_deg,
-                    "crest": asdict(bent.crest), "crest_left_px": bent.left.reach,
-                    "offset_mm": bent.offset, "offset_of_crest_mm": bent.seen,
-                    "offset_of_fit_mm": bent.fitted, "offset_of_fit_sigma_mm": bent.fitted_sigma,
-                    "model": bent.model, "error_px": bent.error,
+                    "crest": asdict(bent.crest),
+                    "crest_left_px": bent.left.reach,
+                    "offset_mm": bent.offset,
+                    "offset_of_crest_mm": bent.seen,
+                    "offset_of_fit_mm": bent.fitted,
+                    "offset_of_fit_sigma_mm": bent.fitted_sigma,
+                    "model": bent.model,
+                    "error_px": bent.error,
                 }
                 for name, bent in found.items()
             },
             "fringes_by_cause_px": alone,
             "figure_14": {
                 OFFSET[name]: {
-                    "crest_px": one.crest.reach, "teeth_px": one.teeth,
-                    "kernel_teeth_px": one.expected_teeth, "fringes_px": one.fringes,
+                    "crest_px": one.crest.reach,
+                    "teeth_px": one.teeth,
+                    "kernel_teeth_px": one.expected_teeth,
+                    "fringes_px": one.fringes,
                     "fringes_pixcal_px": one.auto_fringes,
                 }
                 for name, one in mixed.items()
             },
         },
         picture=png(draw(found, mixed)),
-    )  # fmt: skip
+    )
 
 
 def _place(offset: tuple[float, float]) -> str:

@@ -59,22 +59,35 @@ def make(lab: Lab) -> Outcome:
         "details of the frame, and the scatter of the points. Below: the cost of equation 7 over "
         "distance and baseline, over distance and their ratio, and along the valley.",
         rows=(
-            Row("paths followed", f"{number(facts['paths'])}, with {number(facts['points_used'])} "
-                "points", "paths"),
-            Row("single minimum within the maps", "yes" if facts["unique_minimum"] else "no",
-                "minimum"),
+            Row(
+                "paths followed",
+                f"{number(facts['paths'])}, with {number(facts['points_used'])} points",
+                "paths",
+            ),
+            Row(
+                "single minimum within the maps",
+                "yes" if facts["unique_minimum"] else "no",
+                "minimum",
+            ),
             Row("distance D", _apart(*distance), "accurate"),
             Row("baseline B", _apart(*baseline), "accurate"),
-            Row("relative error of D, and of B/D",
-                f"{number(alone, 2)} and {number(abs(found.ratio_error), 2)}", "correlated"),
+            Row(
+                "relative error of D, and of B/D",
+                f"{number(alone, 2)} and {number(abs(found.ratio_error), 2)}",
+                "correlated",
+            ),
             Row("evaluations of the model", number(facts["evaluations"])),
         ),
         difference="None. The fit uses the nominal values of the bench as weak priors and also "
         "frees the tilt of the baseline.",
         numbers={
-            "geometry": facts["geometry"], "paths": facts["paths"], "points": facts["points"],
-            "points_used": facts["points_used"], "unique_minimum": facts["unique_minimum"],
-            "cost_rad2": facts["cost_rad2"], "relative_error_of_distance": float(alone),
+            "geometry": facts["geometry"],
+            "paths": facts["paths"],
+            "points": facts["points"],
+            "points_used": facts["points_used"],
+            "unique_minimum": facts["unique_minimum"],
+            "cost_rad2": facts["cost_rad2"],
+            "relative_error_of_distance": float(alone),
             "relative_error_of_ratio": found.ratio_error,
             "point_sigma_median_px": facts["point_sigma_median_px"],
             "residual_of_distance_sigma": float(
@@ -82,7 +95,7 @@ def make(lab: Lab) -> Outcome:
             ),
         },
         picture=found.picture,
-    )  # fmt: skip
+    )
 
 
 def _apart(value: float, sigma: float, true: float) -> str:

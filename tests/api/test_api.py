@@ -36,14 +36,26 @@ from pixcal_cli.main import cli
 SYNC = pixcal.Runtime(cluster="sync")
 PUBLIC = [name for name in pixcal.__all__ if name != "__version__"]
 STAGES = {
-    "allan": allan, "astrometry": astrometry, "budget": budget, "compare": compare,
-    "crests": crests, "diagnose": diagnose, "fit": fit, "ingest": ingest, "reduce": reduce,
+    "allan": allan,
+    "astrometry": astrometry,
+    "budget": budget,
+    "compare": compare,
+    "crests": crests,
+    "diagnose": diagnose,
+    "fit": fit,
+    "ingest": ingest,
+    "reduce": reduce,
     "simulate": simulate,
-}  # fmt: skip
+}
 BENCH_OPTIONS = {
-    "pitch_um": 4.4, "gain_e_per_adu": 1.0, "read_noise_e": 16.0, "wavelength_nm": 632.8,
-    "distance_mm": 400.0, "frame_period_s": 0.14, "exptime_s": 0.02,
-}  # fmt: skip
+    "pitch_um": 4.4,
+    "gain_e_per_adu": 1.0,
+    "read_noise_e": 16.0,
+    "wavelength_nm": 632.8,
+    "distance_mm": 400.0,
+    "frame_period_s": 0.14,
+    "exptime_s": 0.02,
+}
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,9 @@ PROGRAM = Path(__file__).parents[2] / "benchmarks" / "cluster.py"
 def test_a_host_that_vanishes_costs_no_bit_of_the_result() -> None:
     done = subprocess.run(
         [sys.executable, PROGRAM, "--size", "300", "--frames", "150"],
-        capture_output=True, text=True,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
     assert "vanishes" in done.stdout
     assert "4 products, the same to the bit" in done.stdout

@@ -10,10 +10,16 @@ from pixcal.model.bench import load_bench
 
 def test_the_table_counts_effects_named_and_false_causes() -> None:
     results = [
-        {"effect": "lag", "strength": 3.0, "draw": d, "verdict": "explained", "causes": causes,
-         "sigmas": 5.0 + d}
+        {
+            "effect": "lag",
+            "strength": 3.0,
+            "draw": d,
+            "verdict": "explained",
+            "causes": causes,
+            "sigmas": 5.0 + d,
+        }
         for d, causes in enumerate((["lag"], [], ["lag", "ipc"]))
-    ]  # fmt: skip
+    ]
     results += [
         {"effect": "", "strength": 0.0, "draw": d, "verdict": v, "causes": [], "sigmas": None}
         for d, v in enumerate(("no gap", "unexplained"))

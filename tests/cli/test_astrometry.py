@@ -27,14 +27,17 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
             run / "astrometry" / "astrometry.json",
             {
                 "telescope": {
-                    "diameter_m": 7.0, "focal_length_m": 130.0, "wavelength_nm": 600.0,
-                    "uas_per_px": 7000.0, "px_per_lambda_over_d": 2.5,
+                    "diameter_m": 7.0,
+                    "focal_length_m": 130.0,
+                    "wavelength_nm": 600.0,
+                    "uas_per_px": 7000.0,
+                    "px_per_lambda_over_d": 2.5,
                 },
                 "stars": {"electrons": 1e8, "positions": 4, "number": 50},
                 "axes": {"x": axis, "y": axis},
                 "warnings": ["a sentence"],
             },
-        )  # fmt: skip
+        )
 
     monkeypatch.setattr(astrometry, "run", body)
     return made
@@ -71,16 +74,28 @@ def test_what_is_printed(
     )
     rows = [line for line in lines if " px, " in line and "µas" in line][1:]
     assert [row.split("  ")[1] for row in rows[::2]] == [
-        "no photon noise", "1e8 e-", "mean of 4 positions", "between two stars",
-    ]  # fmt: skip
+        "no photon noise",
+        "1e8 e-",
+        "mean of 4 positions",
+        "between two stars",
+    ]
     assert any("positions to 5e-05 px along y" in line for line in lines)
     assert lines[-2:] == ["  note: a sentence", f"  {tmp_path / 'products' / 'astrometry.png'}"]
 
 
 @pytest.mark.parametrize(
-    "option", ["--diameter 0", "--electrons nan", "--window 2", "--obscuration 1", "--stars 1",
-               "--background inf", "--window 12", "--electrons 1e17"]
-)  # fmt: skip
+    "option",
+    [
+        "--diameter 0",
+        "--electrons nan",
+        "--window 2",
+        "--obscuration 1",
+        "--stars 1",
+        "--background inf",
+        "--window 12",
+        "--electrons 1e17",
+    ],
+)
 def test_what_cannot_be(option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert invoke(["astrometry", str(tmp_path), *option.split()]) == 2
     error = capsys.readouterr().err

@@ -35,9 +35,19 @@ STAGES = ["ingest", "reduce", "fit", "allan", "diagnose", "report"]
 SHOWN = {"diagnose": "diagnosis"}
 """Stages whose results have another name."""
 COMMANDS = [
-    "run", *STAGES[:4], "crests", "diagnose", "astrometry", "centroids", "wcs", "report",
-    "compare", "simulate", "budget", "blind",
-]  # fmt: skip
+    "run",
+    *STAGES[:4],
+    "crests",
+    "diagnose",
+    "astrometry",
+    "centroids",
+    "wcs",
+    "report",
+    "compare",
+    "simulate",
+    "budget",
+    "blind",
+]
 
 
 def shell(*args: str, **options: Any) -> subprocess.CompletedProcess[str]:
@@ -435,9 +445,16 @@ def test_a_diagnosis_tells_how_large_a_difference_is(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     large = {
-        "domain": "noise", "title": "tone", "place": "all frames", "measured": 0.5, "unit": "σ",
-        "simulated": 0.1, "after": 0.4, "size": -1506.4, "significance": 7.34,
-    }  # fmt: skip
+        "domain": "noise",
+        "title": "tone",
+        "place": "all frames",
+        "measured": 0.5,
+        "unit": "σ",
+        "simulated": 0.1,
+        "after": 0.4,
+        "size": -1506.4,
+        "significance": 7.34,
+    }
     where = [large, large | {"size": 8.34}, large | {"significance": 0.0}]
     gap = {"after": 1.0, "interval": [0.9, 1.0], "where": where}
     found = {"verdict": "unexplained", "causes": [], "gap": gap, "more_would_tell": []}
@@ -465,9 +482,13 @@ def test_a_diagnosis_names_frames_that_would_decide(
         "gap_closed_by_law": 0.7,
     }
     sure = cause | {
-        "law": "white", "gap_closed_by_law": 0.9,
-        "effect": "row_noise", "p_value": 1.1e-12, "not_told_apart_from": [], "would_decide": [],
-    }  # fmt: skip
+        "law": "white",
+        "gap_closed_by_law": 0.9,
+        "effect": "row_noise",
+        "p_value": 1.1e-12,
+        "not_told_apart_from": [],
+        "would_decide": [],
+    }
     stays = {"title": "tone", "place": "all frames", "stays": True, "significance": 0.0}
     found = {
         "verdict": "partly explained",

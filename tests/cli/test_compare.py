@@ -26,9 +26,7 @@ def test_what_is_printed(run: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert invoke(command) == 0
     text = capsys.readouterr().out
     lines = text.splitlines()
-    assert lines[:3] == [
-        f"compare: {out} (written)", "", "night, first half | night, second half"
-    ]  # fmt: skip
+    assert lines[:3] == [f"compare: {out} (written)", "", "night, first half | night, second half"]
     (total,) = (line.split() for line in lines if line.startswith("  delta_x  4087"))
     assert 0.9 < float(total[13]) < 1.1
     assert [line.split()[0] for line in lines if " px " in line][:4] == [

@@ -18,9 +18,17 @@ from pixcal.model.flags import PixelFlag
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "reference" / "products.md").read_text(encoding="utf-8")
 STRUCTURE = {
-    "SIMPLE", "BITPIX", "NAXIS", "NAXIS1", "NAXIS2", "EXTEND", "XTENSION", "PCOUNT", "GCOUNT",
+    "SIMPLE",
+    "BITPIX",
+    "NAXIS",
+    "NAXIS1",
+    "NAXIS2",
+    "EXTEND",
+    "XTENSION",
+    "PCOUNT",
+    "GCOUNT",
     "EXTNAME",
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")

@@ -380,9 +380,17 @@ def test_the_jitter_of_a_replay_is_that_of_the_fringes(
 def test_the_level_of_an_offset_shows_in_the_shot_noise_it_lacks(
     acquired: Callable[..., Evidence],
 ) -> None:
-    evidence = acquired(None, {"bias_drift": {**RUN, "tracks": [
-        {"set": "vertical", "time_s": [0.0], "value": [900.0]},
-    ]}})  # fmt: skip
+    evidence = acquired(
+        None,
+        {
+            "bias_drift": {
+                **RUN,
+                "tracks": [
+                    {"set": "vertical", "time_s": [0.0], "value": [900.0]},
+                ],
+            }
+        },
+    )
     level, error = noiseless_level(evidence, evidence.fringes["vertical"])
     none, _ = noiseless_level(evidence, evidence.fringes["horizontal"])
     assert error < 200

@@ -118,10 +118,14 @@ def test_what_moved_is_brought_back() -> None:
 def test_charge_moves_over_the_edges_of_a_window(make_effect_bench: Callable[..., Bench]) -> None:
     """A window of a larger sensor comes out as it is within a larger window, edges included."""
     quiet = {
-        "detector.chip": [60, 64], "detector.hot_fraction": 0.0, "detector.delta_rms_px": 0.0,
-        "detector.prnu_rms": 0.0, "detector.bias_pixel_rms_adu": 0.0, "frames.fringes.0.count": 7,
+        "detector.chip": [60, 64],
+        "detector.hot_fraction": 0.0,
+        "detector.delta_rms_px": 0.0,
+        "detector.prnu_rms": 0.0,
+        "detector.bias_pixel_rms_adu": 0.0,
+        "frames.fringes.0.count": 7,
         "detector.read_noise_e": 0.0,
-    }  # fmt: skip
+    }
     effect = BrighterFatter(STRONG)
 
     def moved(shape: list[int]) -> np.ndarray:
@@ -145,10 +149,15 @@ def test_frames_lose_contrast_with_their_level(make_effect_bench: Callable[..., 
     losses = []
     for peak in (10_000, 40_000):
         bench = replace(
-            make_effect_bench({"frames.fringes.0.peak_e": peak, "frames.fringes.0.count": 12,
-                               "detector.read_noise_e": 0.0}),
+            make_effect_bench(
+                {
+                    "frames.fringes.0.peak_e": peak,
+                    "frames.fringes.0.count": 12,
+                    "detector.read_noise_e": 0.0,
+                }
+            ),
             shot_noise=False,
-        )  # fmt: skip
+        )
         fringes = next(r for r in recordings(bench) if r.kind == "fringes")
         plain = frames_of(bench, fringes).astype(float)
         changed = frames_of(bench, fringes, [BrighterFatter()])

@@ -34,8 +34,9 @@ def factor(bench: Bench, **parameters: float) -> np.ndarray:
 def test_a_vibration_only_takes_contrast_by_an_exponential_of_its_energy(
     make_effect_bench: Benches,
 ) -> None:
-    found = -np.log(factor(make_effect_bench({"frames.fringes.0.count": 20_000}),
-                           vibration_rad=0.3))  # fmt: skip
+    found = -np.log(
+        factor(make_effect_bench({"frames.fringes.0.count": 20_000}), vibration_rad=0.3)
+    )
     assert found.min() >= 0
     assert found.mean() == pytest.approx(0.3**2 / 2, rel=0.03)
     assert found.std() == pytest.approx(0.3**2 / 2, rel=0.05)

@@ -53,8 +53,9 @@ def test_a_track_lays_its_charge_along_its_way() -> None:
 
 def test_the_rate_is_that_of_area_and_time(make_effect_bench: Callable[..., Bench]) -> None:
     rate = 4000.0
-    bench = make_effect_bench({"detector.shape": [64, 61], "frames.darks": [
-        {"exptime_s": 0.5, "count": 150}]})  # fmt: skip
+    bench = make_effect_bench(
+        {"detector.shape": [64, 61], "frames.darks": [{"exptime_s": 0.5, "count": 150}]}
+    )
     by_kind = {r.kind: r for r in recordings(bench)}
     hits = CosmicHits(rate)
     bias = by_kind["bias"]

@@ -637,8 +637,11 @@ def test_the_window_that_is_off_is_named(
     assert found["more_would_tell"]
     places = found["gap"]["places"]
     assert [p["window"] for p in places] == [
-        [[9, 49], [9, 49]], [[9, 49], [78, 118]], [[82, 122], [9, 49]], [[82, 122], [78, 118]],
-    ]  # fmt: skip
+        [[9, 49], [9, 49]],
+        [[9, 49], [78, 118]],
+        [[82, 122], [9, 49]],
+        [[82, 122], [78, 118]],
+    ]
     *calm, off = (p["domains"]["noise"] for p in places)
     assert off[0] > 6
     assert all(c[0] < 4 for c in calm)

@@ -26,8 +26,10 @@ def test_its_parts_have_the_size_given_and_belong_to_the_chip(
     both = FlatError(0.01, 0.01).ratio(detector, (0, 300)) - 1
     np.testing.assert_allclose(both, pixels + smooth, atol=1e-6)
     changes = {
-        "detector.shape": [40, 50], "detector.chip": [300, 500], "detector.origin_px": [7, 9],
-    }  # fmt: skip
+        "detector.shape": [40, 50],
+        "detector.chip": [300, 500],
+        "detector.origin_px": [7, 9],
+    }
     window = make_effect_bench(changes).detector
     np.testing.assert_allclose(
         FlatError().ratio(window, (0, 40)), FlatError().ratio(detector, (7, 47))[:, 9:59], atol=1e-6

@@ -48,9 +48,14 @@ def test_a_vibration_is_the_mean_over_the_exposure(make_effect_bench: Benches) -
 
 def test_frames_turn_about_the_middle_of_the_window(make_effect_bench: Benches) -> None:
     bench = make_effect_bench(
-        {"shot_noise": False, "detector.read_noise_e": 0.0, "detector.delta_rms_px": 0.0,
-         "detector.hot_fraction": 0.0, "frames.fringes.0.count": 3}
-    )  # fmt: skip
+        {
+            "shot_noise": False,
+            "detector.read_noise_e": 0.0,
+            "detector.delta_rms_px": 0.0,
+            "detector.hot_fraction": 0.0,
+            "frames.fringes.0.count": 3,
+        }
+    )
     recording = next(r for r in recordings(bench) if r.kind == "fringes")
     jitter = FringeJitter((1e-3, 0.0))
     change = states_of(recording, (jitter,)).dkx

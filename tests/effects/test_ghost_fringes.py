@@ -130,8 +130,11 @@ def test_it_is_found_with_its_parent(
         beat = np.array(one.beat_rad_px) * (-1 if turned else 1)
         own = {key: complex(*getattr(one, key)) for key in wanted}
         if turned:
-            own = {"static": own["static"].conjugate(), "forward": own["backward"],
-                   "backward": own["forward"]}  # fmt: skip
+            own = {
+                "static": own["static"].conjugate(),
+                "forward": own["backward"],
+                "backward": own["forward"],
+            }
         for axis, true in enumerate((0.35, 0.2)):
             error = found.errors[f"waves[{n}].beat_rad_px[{axis}]"]
             assert abs(beat[axis] - true) < 4 * error

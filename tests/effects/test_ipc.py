@@ -27,8 +27,12 @@ Acquired = Callable[..., Evidence]
 MakeBench = Callable[..., Bench]
 
 NO_DARKS = {"frames.darks": [], "detector.hot_fraction": 0.0}
-BASELINES = {"vertical": (11.5, 0.0), "horizontal": (0.0, 6.4),
-             "wide": (4.5, 0.0), "narrow": (0.0, 17.4)}  # fmt: skip
+BASELINES = {
+    "vertical": (11.5, 0.0),
+    "horizontal": (0.0, 6.4),
+    "wide": (4.5, 0.0),
+    "narrow": (0.0, 17.4),
+}
 FOUR_SETS = NO_DARKS | {
     "frames.fringes": [
         {"name": name, "baseline_mm": list(baseline), "count": 300, "peak_e": 45000}

@@ -218,9 +218,18 @@ def first_flats_of(frames: int, share: float, carried: float, rise: float) -> Ev
         before = level
     maps = {"bias": np.full(shape, 100.0), "dark_rate": np.zeros(shape), "flat": np.ones(shape)}
     return Evidence(
-        {}, tuple(stacks), 1.0, 5.0, 5.0, **maps, good=np.ones(shape, np.bool_),
-        saturation_adu=65535, pitch_um=5.0, wavelength_nm=600.0, distance_mm=400.0,
-    )  # fmt: skip
+        {},
+        tuple(stacks),
+        1.0,
+        5.0,
+        5.0,
+        **maps,
+        good=np.ones(shape, np.bool_),
+        saturation_adu=65535,
+        pitch_um=5.0,
+        wavelength_nm=600.0,
+        distance_mm=400.0,
+    )
 
 
 @pytest.mark.parametrize("carried", [0.0, 1.0])
@@ -275,9 +284,12 @@ def test_traps_that_fill_up_are_measured_without_their_law(
 ) -> None:
     parts, later = (2.5, 1.8, 1.1, 0.4), (0.6, 0.2, 0.1, 0.06, 0.04)
     given = {
-        "share": 0.01, "spread": 0.0, "bands": list(parts), "level_e": 45_000.0,
+        "share": 0.01,
+        "spread": 0.0,
+        "bands": list(parts),
+        "level_e": 45_000.0,
         "later": list(later),
-    }  # fmt: skip
+    }
     found = Lag.estimate(acquired(None, {"lag": given}))
     assert found is not None
     lag = found.effect

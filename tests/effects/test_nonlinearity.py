@@ -18,11 +18,16 @@ from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
 
 QUIET = {
-    "detector.shape": [9, 7], "detector.read_noise_e": 0.0, "detector.prnu_rms": 0.0,
-    "detector.hot_fraction": 0.0, "detector.bias_pixel_rms_adu": 0.0, "detector.dark_e_s": 0.0,
-    "frames.fringes.0.count": 90, "frames.fringes.0.phase_law": "ramp",
+    "detector.shape": [9, 7],
+    "detector.read_noise_e": 0.0,
+    "detector.prnu_rms": 0.0,
+    "detector.hot_fraction": 0.0,
+    "detector.bias_pixel_rms_adu": 0.0,
+    "detector.dark_e_s": 0.0,
+    "frames.fringes.0.count": 90,
+    "frames.fringes.0.phase_law": "ramp",
     "frames.fringes.0.phase_step_rad": 2 * np.pi / 30,
-}  # fmt: skip
+}
 
 
 def quiet(make: Callable[..., Bench]) -> Bench:

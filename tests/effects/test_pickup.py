@@ -42,9 +42,12 @@ def test_a_tone_is_a_wave_of_another_phase_in_each_frame(
 
 @pytest.mark.parametrize(
     ("rms", "columns", "rows"),
-    [((3.0,), (0.297,), (0.125,)), ((5.0, 2.0), (0.242, 0.082), (-0.31, 0.083)),
-     ((4.0, 3.0, 2.0), (0.297, 0.012, 0.5), (0.125, -0.45, 0.06))],
-)  # fmt: skip
+    [
+        ((3.0,), (0.297,), (0.125,)),
+        ((5.0, 2.0), (0.242, 0.082), (-0.31, 0.083)),
+        ((4.0, 3.0, 2.0), (0.297, 0.012, 0.5), (0.125, -0.45, 0.06)),
+    ],
+)
 def test_tones_are_found(
     acquired: Callable[..., Evidence],
     make_effect_bench: Callable[..., Bench],
@@ -170,6 +173,17 @@ def _evidence(frames: F64) -> Evidence:
     number, maps = np.arange(len(frames)), np.zeros(frames.shape[1:])
     stack = Stack("bias", 0.0, number, 1.0 * number, frames.astype(np.float32))
     return Evidence(
-        {}, (stack,), 1.0, 5.0, 5.0, maps, maps, maps + 1, maps == 0,
-        saturation_adu=65535, pitch_um=5.0, wavelength_nm=600.0, distance_mm=400.0,
-    )  # fmt: skip
+        {},
+        (stack,),
+        1.0,
+        5.0,
+        5.0,
+        maps,
+        maps,
+        maps + 1,
+        maps == 0,
+        saturation_adu=65535,
+        pitch_um=5.0,
+        wavelength_nm=600.0,
+        distance_mm=400.0,
+    )

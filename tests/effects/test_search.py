@@ -146,8 +146,10 @@ def test_what_maps_may_have_by_chance_is_not_taken_for_an_effect() -> None:
     """Held-out frames have the same offsets, so a pattern must be beyond chance by itself."""
     weak, strong = 1.7e-3, 1e-2
     for kind, size, accepted in (
-        (Toy, weak, ("unknown",)), (ToyOfMaps, weak, ()), (ToyOfMaps, strong, ("unknown",)),
-    ):  # fmt: skip
+        (Toy, weak, ("unknown",)),
+        (ToyOfMaps, weak, ()),
+        (ToyOfMaps, strong, ("unknown",)),
+    ):
         effect = kind("unknown", size)
         object.__setattr__(effect, "name", "unknown")
         one = Candidate("unknown", Estimate(effect, {"size": size / 5}, 5.0, "told"))
@@ -545,9 +547,15 @@ def test_an_effect_that_was_hinted_at_and_not_taken_is_told_so() -> None:
     """Seeds differ in how much likelier the unseen frames get: some lie between the two marks."""
     reasons = {}
     for seed in range(800, 840):
-        found, _ = search({"left": 0.03, "little": 0.0035}, [
-            candidate("left", 0.03), candidate("little", 0.0035, sigmas=3.0),
-        ], None, seed)  # fmt: skip
+        found, _ = search(
+            {"left": 0.03, "little": 0.0035},
+            [
+                candidate("left", 0.03),
+                candidate("little", 0.0035, sigmas=3.0),
+            ],
+            None,
+            seed,
+        )
         reasons[seed] = found.candidates["little"].reason
     told = [r for r in reasons.values() if "rises by only" in r]
     assert told

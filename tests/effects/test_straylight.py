@@ -39,8 +39,13 @@ def test_maps_lose_visibility_and_keep_their_phase() -> None:
     np.testing.assert_array_equal(seen.theta[1:], theta[1:])
 
 
-BUMP = {"share": 0.0, "slope_per_px": [0.0, 0.0], "bump": 0.04, "bump_centre_px": [40.0, 20.0],
-        "bump_radius_px": 18.0}  # fmt: skip
+BUMP = {
+    "share": 0.0,
+    "slope_per_px": [0.0, 0.0],
+    "bump": 0.04,
+    "bump_centre_px": [40.0, 20.0],
+    "bump_radius_px": 18.0,
+}
 
 
 @pytest.mark.quick(1)
@@ -69,9 +74,11 @@ def test_a_bump_is_found(acquired: Callable[..., Evidence], bump: float) -> None
 def test_unequal_fibres_are_not_taken_for_it(acquired: Callable[..., Evidence]) -> None:
     """Beams that also point apart: a gradient of the visibility along and across the baseline."""
     unequal = {
-        "optics.power_ratio": 2.0, "optics.pointing_a_mm": [6.0, 4.0],
-        "optics.offset_mm": [10.0, 18.0], "optics.beam_radius_mm": 20.0,
-    }  # fmt: skip
+        "optics.power_ratio": 2.0,
+        "optics.pointing_a_mm": [6.0, 4.0],
+        "optics.offset_mm": [10.0, 18.0],
+        "optics.beam_radius_mm": 20.0,
+    }
     found = Straylight.estimate(acquired(unequal))
     assert found is not None
     assert found.significance < 4

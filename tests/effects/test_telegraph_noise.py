@@ -14,9 +14,13 @@ from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import Recording, recordings
 
 LONG = {
-    "detector.shape": [70, 61], "detector.read_noise_e": 0.0, "detector.bias_pixel_rms_adu": 0.0,
-    "detector.bias_adu": 9000, "detector.gain_e_per_adu": 0.5, "frames.bias": 400,
-}  # fmt: skip
+    "detector.shape": [70, 61],
+    "detector.read_noise_e": 0.0,
+    "detector.bias_pixel_rms_adu": 0.0,
+    "detector.bias_adu": 9000,
+    "detector.gain_e_per_adu": 0.5,
+    "frames.bias": 400,
+}
 
 
 def bias_of(bench: Bench) -> Recording:
@@ -67,8 +71,9 @@ def test_measured_pixels_have_their_levels_and_others_follow_the_law(
 ) -> None:
     bench = make_effect_bench(LONG)
     law = TelegraphNoise(0.1, 400.0, 0.0)
-    own = MeasuredPixels((5, 66), (3, 40), 0.5, (9, 64, 65), (3, 20, 39), (2.0, 1.5, 0.75),
-                         (0.5, 0.1, 0.9))  # fmt: skip
+    own = MeasuredPixels(
+        (5, 66), (3, 40), 0.5, (9, 64, 65), (3, 20, 39), (2.0, 1.5, 0.75), (0.5, 0.1, 0.9)
+    )
     every, some = (
         frames_of(bench, bias_of(bench), [effect]).astype(float)
         for effect in (law, replace(law, measured=(own,)))

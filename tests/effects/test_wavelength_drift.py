@@ -38,10 +38,11 @@ def test_a_frame_is_as_a_bench_of_the_new_wavelength_makes_it(make_effect_bench:
     change = np.angle(phase[1] / phase[0])
     y, x = np.mgrid[: rows[1], : bench.detector.shape[1]]
     turned = (
-        states.phi[1] - plain.phi[1]
+        states.phi[1]
+        - plain.phi[1]
         + states.dkx[1] * (x - (bench.detector.shape[1] - 1) / 2)
         + states.dky[1] * (y - (rows[1] - 1) / 2)
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(np.angle(np.exp(1j * (turned - change))), 0.0, atol=2e-5)
 
 

@@ -55,14 +55,30 @@ def start(folder: Path) -> Cluster:
             return subprocess.Popen([*CLI, *args], cwd=folder, env=env, stdout=log, stderr=log)
 
     scheduler = run(
-        "scheduler", "--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0",
-        "--scheduler-file", str(file),
-    )  # fmt: skip
+        "scheduler",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "0",
+        "--dashboard-address",
+        "127.0.0.1:0",
+        "--scheduler-file",
+        str(file),
+    )
     workers = run(
-        "worker", "--scheduler-file", str(file), "--host", "127.0.0.1", "--no-dashboard",
-        "--nworkers", str(WORKERS), "--nthreads", str(THREADS),
-        "--memory-limit", f"{MEMORY_MIB}MiB",
-    )  # fmt: skip
+        "worker",
+        "--scheduler-file",
+        str(file),
+        "--host",
+        "127.0.0.1",
+        "--no-dashboard",
+        "--nworkers",
+        str(WORKERS),
+        "--nthreads",
+        str(THREADS),
+        "--memory-limit",
+        f"{MEMORY_MIB}MiB",
+    )
     made = Cluster("", scheduler, workers)
     deadline = time.monotonic() + 60
     while not made.address:

@@ -221,9 +221,14 @@ def test_encrypted_with_the_certificates_that_dask_knows() -> None:
         "distributed.comm.tls.client.key": made.tls_client_key,
     }
     with LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, host="127.0.0.1", protocol="tls://",
-        security=made, dashboard_address=None,
-    ) as local:  # fmt: skip
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        host="127.0.0.1",
+        protocol="tls://",
+        security=made,
+        dashboard_address=None,
+    ) as local:
         runtime = Runtime(local.scheduler_address)
         assert runtime.cluster.startswith("tls://")
         with dask.config.set(known):
@@ -335,9 +340,12 @@ def test_the_tasks_of_a_killed_worker_are_done_by_others(cluster: Any, tmp_path:
     before = set(cluster.pids())
     noted: list[int] = []
     results = run_tasks(
-        partial(kill, tmp_path / "mark"), range(60), cluster.runtime, label="squares",
+        partial(kill, tmp_path / "mark"),
+        range(60),
+        cluster.runtime,
+        label="squares",
         done=lambda n, _: noted.append(n),
-    )  # fmt: skip
+    )
     assert results == [n * n for n in range(60)]
     assert Counter(noted) == Counter(range(60))
     assert len(before - set(cluster.pids())) == 1
@@ -355,9 +363,12 @@ def test_processes_that_are_killed_are_replaced(tmp_path: Path) -> None:
     runtime = Runtime("processes", 2)
     noted: list[int] = []
     results = run_tasks(
-        partial(kill, tmp_path / "mark"), range(9), runtime, label="squares",
+        partial(kill, tmp_path / "mark"),
+        range(9),
+        runtime,
+        label="squares",
         done=lambda n, _: noted.append(n),
-    )  # fmt: skip
+    )
     assert results == [n * n for n in range(9)]
     assert Counter(noted) == Counter(range(9))
     with pytest.raises(ClusterError, match="--cluster processes: worker processes were killed"):

@@ -35,9 +35,13 @@ LOCAL = [
 def cluster() -> Iterator[Runtime]:
     """A Dask cluster of two workers, reached by its address."""
     with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, host="127.0.0.1",
-        protocol="tcp://", dashboard_address=None,
-    ) as local:  # fmt: skip
+        n_workers=2,
+        threads_per_worker=1,
+        processes=False,
+        host="127.0.0.1",
+        protocol="tcp://",
+        dashboard_address=None,
+    ) as local:
         yield Runtime(local.scheduler_address)
 
 
@@ -87,8 +91,13 @@ def test_an_input_error_stays_one(runtime: Runtime) -> None:
 def test_items_are_handed_over_as_they_are(runtime: Runtime) -> None:
     """Whatever they look like to Dask, whose graphs give tuples, lists and words a meaning."""
     items: list[Any] = [
-        "task-1", ["task-0", "task-2"], (len, "four"), {"a": "task-0"}, ((0, 4), (3, 9)), None,
-    ]  # fmt: skip
+        "task-1",
+        ["task-0", "task-2"],
+        (len, "four"),
+        {"a": "task-0"},
+        ((0, 4), (3, 9)),
+        None,
+    ]
     wrapped = partial(operator.contains, items[1:])
     expected = [item in items[1:] for item in items]
     assert run_tasks(wrapped, items, runtime, label="test") == expected
@@ -101,8 +110,14 @@ def test_threads_are_threads_and_processes_processes() -> None:
     items = [None] * 8
     here = os.getpid()
     assert set(run_tasks(_pid, items, Runtime("threads", 2), label="test")) == {here}
-    others = set(run_tasks(partial(eval, "__import__('os').getpid()"), [{}] * 8,
-                           Runtime("processes", 2), label="test"))  # fmt: skip
+    others = set(
+        run_tasks(
+            partial(eval, "__import__('os').getpid()"),
+            [{}] * 8,
+            Runtime("processes", 2),
+            label="test",
+        )
+    )
     assert here not in others
     assert len(others) <= 2
 

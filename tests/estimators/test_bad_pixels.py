@@ -73,8 +73,11 @@ def test_pixels_that_respond_too_little_or_too_much_are_dead() -> None:
     flat[2, 50] = 0.1
     found = dead(flat, np.full(flat.shape, 0.01), 0.5, 2.0, 0.05)
     assert {tuple(map(int, w)) for w in np.argwhere(found)} == {
-        (36, 52), (5, 6), (2, 50), *((y, x) for y in range(20, 24) for x in range(30, 34)),
-    }  # fmt: skip
+        (36, 52),
+        (5, 6),
+        (2, 50),
+        *((y, x) for y in range(20, 24) for x in range(30, 34)),
+    }
 
 
 def test_columns_without_light_are_dead_and_those_beside_them_are_not() -> None:

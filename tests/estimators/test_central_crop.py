@@ -27,18 +27,46 @@ def evidence() -> Evidence:
     g = np.stack([np.ones(T), np.cos(phi), np.sin(phi)], axis=1)
     plane = RNG.random((NY, NX))
     fringes = FringeEvidence(
-        "set", (6.0, 0.0), (1.1, 0.3), (10, 20), (100, 120), np.arange(T), 0.14 * np.arange(T),
-        0.02, RNG.random((T, NY, NX)).astype(np.float32), RNG.integers(0, 9, (T, NY, NX)), g,
-        1e-3 * RNG.standard_normal((T, 2)), np.zeros((T, 5)), np.zeros((T, 5, 5)), theta,
-        plane, plane, plane > 0.1, plane, plane,
-    )  # fmt: skip
+        "set",
+        (6.0, 0.0),
+        (1.1, 0.3),
+        (10, 20),
+        (100, 120),
+        np.arange(T),
+        0.14 * np.arange(T),
+        0.02,
+        RNG.random((T, NY, NX)).astype(np.float32),
+        RNG.integers(0, 9, (T, NY, NX)),
+        g,
+        1e-3 * RNG.standard_normal((T, 2)),
+        np.zeros((T, 5)),
+        np.zeros((T, 5, 5)),
+        theta,
+        plane,
+        plane,
+        plane > 0.1,
+        plane,
+        plane,
+    )
     stack = Stack(
         "dark", 0.5, np.arange(4), np.arange(4.0), RNG.random((4, NY, NX)).astype(np.float32)
     )
     return Evidence(
-        {"set": fringes}, (stack,), 1.0, 16.0, 16.0, plane, plane, plane, plane > 0.1, 65535.0, 4.4,
-        632.8, 400.0, origin=(10, 20),
-    )  # fmt: skip
+        {"set": fringes},
+        (stack,),
+        1.0,
+        16.0,
+        16.0,
+        plane,
+        plane,
+        plane,
+        plane > 0.1,
+        65535.0,
+        4.4,
+        632.8,
+        400.0,
+        origin=(10, 20),
+    )
 
 
 @pytest.mark.parametrize("samples", [T * 40 * 50, T * NY * NX // 2, 5000])

@@ -74,8 +74,11 @@ def test_pixels_hold_the_gaussian_averaged_over_their_squares():
     for x, y in ((0.0, 0.0), (0.3, -0.7), (2.0, 1.1)):
         expected = dblquad(
             lambda v, u: np.exp(-(u**2 + v**2) / (2 * sigma**2)) / (2 * np.pi * sigma**2),
-            x - 0.5, x + 0.5, y - 0.5, y + 0.5,
-        )[0]  # fmt: skip
+            x - 0.5,
+            x + 0.5,
+            y - 0.5,
+            y + 0.5,
+        )[0]
         assert star.psf.at(x, y)[0] == pytest.approx(expected, abs=1e-5 * star.psf.peak)
 
 

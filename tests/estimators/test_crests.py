@@ -71,9 +71,15 @@ def fibres(
     ny, nx = shape
     length = 632.8e-6 * 400.0 / (pitch * interfringe)
     return Geometry(
-        632.8e-6, pitch, (nx - 1) / 2 * pitch + offset[0], (ny - 1) / 2 * pitch + offset[1], 400.0,
-        length * np.cos(angle), length * np.sin(angle), tilt,
-    )  # fmt: skip
+        632.8e-6,
+        pitch,
+        (nx - 1) / 2 * pitch + offset[0],
+        (ny - 1) / 2 * pitch + offset[1],
+        400.0,
+        length * np.cos(angle),
+        length * np.sin(angle),
+        tilt,
+    )
 
 
 def exposed(

@@ -35,11 +35,26 @@ def fringes() -> FringeEvidence:
     good[11, 13] = False
     unknown = np.zeros((T, 5)), np.zeros((T, 5, 5))
     return FringeEvidence(
-        "set", (6.0, 0.0), k, (0, 0), (NY, NX), np.arange(T), 0.14 * np.arange(T), 0.02,
-        electrons, electrons,
-        g, np.zeros((T, 2)), *unknown, theta, np.ones((NY, NX)), np.zeros((NY, NX)), good,
-        np.full((NY, NX), 256.0), np.ones((NY, NX)),
-    )  # fmt: skip
+        "set",
+        (6.0, 0.0),
+        k,
+        (0, 0),
+        (NY, NX),
+        np.arange(T),
+        0.14 * np.arange(T),
+        0.02,
+        electrons,
+        electrons,
+        g,
+        np.zeros((T, 2)),
+        *unknown,
+        theta,
+        np.ones((NY, NX)),
+        np.zeros((NY, NX)),
+        good,
+        np.full((NY, NX), 256.0),
+        np.ones((NY, NX)),
+    )
 
 
 def test_nothing_is_left_of_what_the_fit_can_follow(fringes: FringeEvidence) -> None:

@@ -24,10 +24,27 @@ def test_model_and_variance_are_the_formulae(size: float) -> None:
     model = np.einsum("ti,iyx->tyx", g, theta) + turn * slope
     samples = (model + 1).astype(np.float32)
     found = FringeEvidence(
-        "vertical", (0.3, 0.0), (0.3, 0.0), (0, 0), SHAPE, np.arange(n), np.arange(n, dtype=float),
-        0.02, samples, samples, g, dk, np.zeros((n, 5)), np.zeros((n, 5, 5)), theta, np.ones(SHAPE),
-        np.zeros(SHAPE), np.isfinite(theta[0]), read, shot,
-    )  # fmt: skip
+        "vertical",
+        (0.3, 0.0),
+        (0.3, 0.0),
+        (0, 0),
+        SHAPE,
+        np.arange(n),
+        np.arange(n, dtype=float),
+        0.02,
+        samples,
+        samples,
+        g,
+        dk,
+        np.zeros((n, 5)),
+        np.zeros((n, 5, 5)),
+        theta,
+        np.ones(SHAPE),
+        np.zeros(SHAPE),
+        np.isfinite(theta[0]),
+        read,
+        shot,
+    )
     assert found.model.dtype == found.residual.dtype == found.variance.dtype == np.float32
     np.testing.assert_allclose(found.model, model, atol=3e-7 * np.nanmax(model), rtol=0)
     variance = shot * np.maximum(model, 0) + read

@@ -18,9 +18,16 @@ def flagged(chi2: np.ndarray, noise: float, excess: float, limit: float = 1.1) -
     ones = np.ones(SHAPE, np.float32)
     count = (FREEDOM + 3) * ones
     found = fit_flags(
-        np.zeros(SHAPE, np.uint8), 100 * ones, 80 * ones, 0.01 * ones, chi2, count, noise, excess,
+        np.zeros(SHAPE, np.uint8),
+        100 * ones,
+        80 * ones,
+        0.01 * ones,
+        chi2,
+        count,
+        noise,
+        excess,
         limit,
-    )  # fmt: skip
+    )
     return found == PixelFlag.BAD_FIT
 
 

@@ -83,13 +83,27 @@ def fringes(seed: int, frames: int = 80) -> FringeEvidence:
     coding = Coding(1.0, 0.0, NO_SAMPLE)
     (free, covariance), *_ = free_frames(electrons, coding, g, dk, theta, read, shot, good)
     return FringeEvidence(
-        name="a", baseline_mm=(6.0, 0.0), k=(1.21, 0.02), origin=(0, 0), window=shape,
-        frame=np.arange(frames), time_s=0.14 * np.arange(frames), exptime_s=0.02,
+        name="a",
+        baseline_mm=(6.0, 0.0),
+        k=(1.21, 0.02),
+        origin=(0, 0),
+        window=shape,
+        frame=np.arange(frames),
+        time_s=0.14 * np.arange(frames),
+        exptime_s=0.02,
         electrons=electrons,
-        adu=electrons.astype(np.uint16), g=g, dk=dk, free=free, free_covariance=covariance,
-        theta=theta, sigma=np.ones(shape), delta=np.zeros(shape), good=good, read_variance=read,
+        adu=electrons.astype(np.uint16),
+        g=g,
+        dk=dk,
+        free=free,
+        free_covariance=covariance,
+        theta=theta,
+        sigma=np.ones(shape),
+        delta=np.zeros(shape),
+        good=good,
+        read_variance=read,
         shot_factor=shot,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("series_of_set", [motion_series, light_series])

@@ -18,9 +18,13 @@ def test_they_are_those_of_the_definition(step: tuple[int, int]) -> None:
     covariance = root @ root.swapaxes(1, 2)
     given = [a.astype(np.float32) for a in (residual, variance, charge, *shared)]
     found, right = pair_sums(
-        *given[:3], (given[3], given[4]), covariance.astype(np.float32),
-        of_place.astype(np.float32), step, MARGIN,
-    )  # fmt: skip
+        *given[:3],
+        (given[3], given[4]),
+        covariance.astype(np.float32),
+        of_place.astype(np.float32),
+        step,
+        MARGIN,
+    )
 
     normal, expected = np.zeros((4, 4)), np.zeros(4)
     for t in range(T):

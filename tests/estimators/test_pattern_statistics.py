@@ -116,11 +116,13 @@ def test_of_white_noise_patterns_are_as_strong_as_those_of_a_random_matrix() -> 
         phi = 2 * np.pi * np.arange(FRAMES) / phases
         found = np.array(
             [
-                [float(one.measure(a_look(noise(seed), phi)).value[0])
-                 for one in (smooth_patterns, smooth_patterns_by_phase)]
+                [
+                    float(one.measure(a_look(noise(seed), phi)).value[0])
+                    for one in (smooth_patterns, smooth_patterns_by_phase)
+                ]
                 for seed in range(60)
             ]
-        )  # fmt: skip
+        )
         rng = np.random.default_rng(1)
         by_frame = [strongest(rng.standard_normal((FRAMES - 1, 9))) for _ in range(400)]
         by_phase = [strongest(rng.standard_normal((shapes, 9))) for _ in range(400)]

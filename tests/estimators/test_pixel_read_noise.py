@@ -21,9 +21,13 @@ def test_variances_seen_again_scatter_as_those_that_were_measured(
     spread: float, counts: tuple[int, ...]
 ) -> None:
     """Of frames with the noise drawn, quantiles of the pixels' variances are those of the data."""
-    stacks = [frames(spread, n, seed) for seed, n in enumerate(counts)] if len(counts) == 1 else [
-        frames(spread, sum(counts))[a:b] for a, b in ((0, counts[0]), (counts[0], sum(counts)))
-    ]  # fmt: skip
+    stacks = (
+        [frames(spread, n, seed) for seed, n in enumerate(counts)]
+        if len(counts) == 1
+        else [
+            frames(spread, sum(counts))[a:b] for a, b in ((0, counts[0]), (counts[0], sum(counts)))
+        ]
+    )
     noise = PixelNoise.of(stacks, GOOD)
     rng = np.random.default_rng(1)
     drawn = noise.drawn(rng)

@@ -41,9 +41,13 @@ def test_frames_are_found_whatever_the_interfringe(bench, interfringe):
 
 def test_error_is_at_the_bound_with_everything_free(bench):
     made = bench(
-        shape=(67, 83), frames=250, laser_noise=0.02, visibility_noise=0.05, vector_noise=1e-2,
+        shape=(67, 83),
+        frames=250,
+        laser_noise=0.02,
+        visibility_noise=0.05,
+        vector_noise=1e-2,
         visibility=0.9,
-    )  # fmt: skip
+    )
     scout, codes = scout_of(made)
     frames = scout.prime([codes])
     assert scout.moving

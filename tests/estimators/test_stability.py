@@ -85,9 +85,11 @@ WHITE_CASES: dict[str, tuple[int, int, dict[str, Any]]] = {
     "few pixels": (24, 30, {}),
     "gap": (41, 200, {"gap": slice(15, 22)}),
     "uneven noise": (
-        30, 300, {"noise": np.exp(0.5 * np.random.default_rng(1).normal(size=300))},
+        30,
+        300,
+        {"noise": np.exp(0.5 * np.random.default_rng(1).normal(size=300))},
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.long

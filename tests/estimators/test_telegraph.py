@@ -213,9 +213,11 @@ def test_levels_of_single_pixels_are_those_that_they_have() -> None:
         x = up * amplitude + noise * rng.standard_normal(up.shape)
         series.append(lit_series(x, noise**-2, 3 * np.arange(len(amplitude))))
     lacking = replace(
-        series[2], charge=series[2].charge[:, 5:], weight=series[2].weight[:, 5:],
+        series[2],
+        charge=series[2].charge[:, 5:],
+        weight=series[2].weight[:, 5:],
         pixel=series[2].pixel[5:],
-    )  # fmt: skip
+    )
     found = own_levels([*series[:2], lacking], 1.0)
     number = found.pixel // 3
     assert set(range(100)) <= set(number.tolist())

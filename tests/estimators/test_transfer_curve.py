@@ -59,14 +59,23 @@ def evidence(
     return Evidence(
         fringes={},
         stacks=(
-            stack("bias", 40, 0.0, 0), stack("dark", 10, 1.0, 0),
+            stack("bias", 40, 0.0, 0),
+            stack("dark", 10, 1.0, 0),
             *(stack("flat", 2, *one) for one in zip(times, lights, strict=True)),
         ),
-        gain=GAIN, read_noise=float(np.hypot(read, GAIN / np.sqrt(12))), amplifier_noise=read,
-        bias=np.full(SHAPE, BIAS), dark_rate=np.full(SHAPE, DARK), flat=pattern,
-        good=np.ones(SHAPE, np.bool_), saturation_adu=65535.0, pitch_um=5.0, wavelength_nm=600.0,
-        distance_mm=1000.0, photon_transfer=(GAIN, 0.01, 1.0),
-    )  # fmt: skip
+        gain=GAIN,
+        read_noise=float(np.hypot(read, GAIN / np.sqrt(12))),
+        amplifier_noise=read,
+        bias=np.full(SHAPE, BIAS),
+        dark_rate=np.full(SHAPE, DARK),
+        flat=pattern,
+        good=np.ones(SHAPE, np.bool_),
+        saturation_adu=65535.0,
+        pitch_um=5.0,
+        wavelength_nm=600.0,
+        distance_mm=1000.0,
+        photon_transfer=(GAIN, 0.01, 1.0),
+    )
 
 
 def test_dark_signal_of_the_order_of_the_read_noise_leaves_the_photon_transfer_right() -> None:
@@ -159,8 +168,11 @@ def test_what_every_second_row_has_in_common_is_no_shot_noise(seed: int) -> None
 def test_pairs_of_flats_without_shared_charge_show_none_within_the_error() -> None:
     shifts = boundary_shifts(0.5)
     found = [shared_charge(evidence(seed, count=4), shifts) for seed in range(60)]
-    pulls = [[one.size / one.variance**0.5, *(one.axes / np.diag(one.covariance) ** 0.5)]
-             for one in found if one is not None]  # fmt: skip
+    pulls = [
+        [one.size / one.variance**0.5, *(one.axes / np.diag(one.covariance) ** 0.5)]
+        for one in found
+        if one is not None
+    ]
     scatter = np.std(pulls, axis=0)
     # Of 60 a standard deviation is known to a tenth.
     assert (scatter > 0.78).all()
@@ -184,8 +196,9 @@ def test_a_coupling_of_flats_is_shared_charge_where_it_rises_with_the_level() ->
     for rising in (True, False):
         # The correlation of neighbours in the brightest flats is the same.
         response = shared(0.013 if rising else 0.026, rising)
-        found = [shared_charge(evidence(n, response=response), boundary_shifts(0.5))
-                 for n in range(12)]  # fmt: skip
+        found = [
+            shared_charge(evidence(n, response=response), boundary_shifts(0.5)) for n in range(12)
+        ]
         sigmas[rising] = [one.axes[0] / one.covariance[0, 0] ** 0.5 for one in found if one]
     # The correlation rises to 5.2 %, 0.0103 known from a pair: 8.3 sigma of eight pairs.
     assert np.median(sigmas[True]) > 6

@@ -16,12 +16,35 @@ FILES = sorted(
     for file in (ROOT / folder).rglob("*.py")
 )
 FORBIDDEN = {
-    "eval", "exec", "compile", "__import__", "os.system", "os.popen", "os.exec", "os.spawn",
-    "yaml.load", "yaml.load_all", "yaml.full_load", "yaml.unsafe_load", "yaml.Loader",
-    "yaml.UnsafeLoader", "yaml.FullLoader", "numpy.load", "np.load", "marshal", "shelve", "dill",
-    "joblib", "subprocess", "LocalCluster", "Scheduler", "Server", "socketserver", "http.server",
+    "eval",
+    "exec",
+    "compile",
+    "__import__",
+    "os.system",
+    "os.popen",
+    "os.exec",
+    "os.spawn",
+    "yaml.load",
+    "yaml.load_all",
+    "yaml.full_load",
+    "yaml.unsafe_load",
+    "yaml.Loader",
+    "yaml.UnsafeLoader",
+    "yaml.FullLoader",
+    "numpy.load",
+    "np.load",
+    "marshal",
+    "shelve",
+    "dill",
+    "joblib",
+    "subprocess",
+    "LocalCluster",
+    "Scheduler",
+    "Server",
+    "socketserver",
+    "http.server",
     "allow_pickle",
-}  # fmt: skip
+}
 PICKLES = {"pipeline/pixcal/engine/parcel.py", "pipeline/pixcal/engine/cluster.py"}
 """Tasks on their way to Dask's workers, made by this process; nothing else is ever unpickled."""
 STARTS = {"bench/blind_examination/second.py"}

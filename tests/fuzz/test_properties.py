@@ -41,9 +41,25 @@ def check_line(error: InputError, begin: str, *names: str) -> None:
 # Headers
 
 KEYS = st.sampled_from(
-    ["BITPIX", "NAXIS", "NAXIS1", "NAXIS2", "NAXIS3", "BSCALE", "BZERO", "BLANK", "EXPTIME",
-     "MJD-OBS", "DATE-OBS", "TIME-OBS", "CCD-TEMP", "PCOUNT", "GCOUNT", "EXTEND"]
-)  # fmt: skip
+    [
+        "BITPIX",
+        "NAXIS",
+        "NAXIS1",
+        "NAXIS2",
+        "NAXIS3",
+        "BSCALE",
+        "BZERO",
+        "BLANK",
+        "EXPTIME",
+        "MJD-OBS",
+        "DATE-OBS",
+        "TIME-OBS",
+        "CCD-TEMP",
+        "PCOUNT",
+        "GCOUNT",
+        "EXTEND",
+    ]
+)
 printable = st.characters(min_codepoint=32, max_codepoint=126)
 values = st.one_of(
     st.integers().map(str),
@@ -176,11 +192,17 @@ stamps = st.none() | st.floats(allow_nan=False, allow_infinity=False)
 def test_any_stamps_give_every_frame_a_finite_time(times: list[Any], period: float | None) -> None:
     files = [
         FrameFile(
-            SourceFile(Path(f"{n}.fits"), f"{n}.fits", 1, 1), "plain", 0, 0, (planes, 7, 5),
-            SampleFormat(16), mjd=mjd, exptime_s=exptime,
+            SourceFile(Path(f"{n}.fits"), f"{n}.fits", 1, 1),
+            "plain",
+            0,
+            0,
+            (planes, 7, 5),
+            SampleFormat(16),
+            mjd=mjd,
+            exptime_s=exptime,
         )
         for n, (planes, mjd, exptime) in enumerate(times)
-    ]  # fmt: skip
+    ]
     frames, _ = tabulate("bias", files, period)
     assert len(frames) == sum(planes for planes, _, _ in times)
     assert all(math.isfinite(frame.time_s) for frame in frames)

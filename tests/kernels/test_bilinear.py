@@ -47,9 +47,22 @@ def add_block(sums, codes, scale, offset, g, dk, y0, x0, *maps):
     fixed = (m.astype(f) for m in maps)
     stops, closes = np.array([n]), np.array([GOES_ON])
     sweep_batches(
-        codes, scale, offset, 65535, g.astype(f), dk.astype(f), y0, x0, *fixed,
-        stops, closes, part, total, none, none,
-    )  # fmt: skip
+        codes,
+        scale,
+        offset,
+        65535,
+        g.astype(f),
+        dk.astype(f),
+        y0,
+        x0,
+        *fixed,
+        stops,
+        closes,
+        part,
+        total,
+        none,
+        none,
+    )
     sums += np.moveaxis(part, 1, 0)
 
 
@@ -121,9 +134,20 @@ def test_frame_sums_give_each_frame_its_parameters(far):
     normal, right = np.zeros((t, 15)), np.zeros((t, 5))
     codes = np.rint((model + 20_000) * 0.5).astype(f)
     frame_sums(
-        codes, 2.0, -20_000.0, 65535, start_g, start_dk, y.astype(f), x.astype(f), theta.astype(f),
-        np.full(n, 256, f), np.ones(n, f), normal, right,
-    )  # fmt: skip
+        codes,
+        2.0,
+        -20_000.0,
+        65535,
+        start_g,
+        start_dk,
+        y.astype(f),
+        x.astype(f),
+        theta.astype(f),
+        np.full(n, 256, f),
+        np.ones(n, f),
+        normal,
+        right,
+    )
     upper = np.triu_indices(5)
     for frame in range(t):
         matrix = np.zeros((5, 5))

@@ -82,8 +82,9 @@ def test_the_light_in_the_window_is_that_of_the_airy_pattern(
     psf = diffraction_psf(sampling, 0.0, half)
     total = psf.at(at[None, :] - place[0], at[:, None] - place[1])[0].sum()
     inner, outer = half + 0.5 - max(map(abs, place)), np.sqrt(2) * (half + 0.5) + 0.5
-    low, high = (1 - j0(np.pi * r / sampling) ** 2 - j1(np.pi * r / sampling) ** 2
-                 for r in (inner, outer))  # fmt: skip
+    low, high = (
+        1 - j0(np.pi * r / sampling) ** 2 - j1(np.pi * r / sampling) ** 2 for r in (inner, outer)
+    )
     assert low < total < high
     assert high - low < 0.04
 

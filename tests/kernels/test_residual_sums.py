@@ -38,7 +38,12 @@ def test_they_are_those_of_the_definition() -> None:
         second = ((still[one] + still[two])[both]) / 2 / root
         product = size[one][both] * size[two][both] + lost
         wanted = [
-            both.sum(), first @ first, first @ second, second @ second,
-            first @ product, second @ product, product @ product,
-        ]  # fmt: skip
+            both.sum(),
+            first @ first,
+            first @ second,
+            second @ second,
+            first @ product,
+            second @ product,
+            product @ product,
+        ]
         assert sums == pytest.approx(wanted, rel=1e-4, abs=1e-3)

@@ -18,15 +18,19 @@ SCALE = 6981.0
 
 def number(px: float | None) -> dict[str, float | None]:
     return {
-        "px": px, "err_px": None if px is None else 0.02 * px,
-        "uas": None if px is None else SCALE * px, "err_uas": None,
-    }  # fmt: skip
+        "px": px,
+        "err_px": None if px is None else 0.02 * px,
+        "uas": None if px is None else SCALE * px,
+        "err_uas": None,
+    }
 
 
 def an_axis(perfect: float | None, measured: float) -> dict[str, Any]:
     pair = {"perfect": number(perfect), "measured": number(measured)}
     return {
-        "floor": pair, "photons": pair, "photon_bound": number(1.1e-4),
+        "floor": pair,
+        "photons": pair,
+        "photon_bound": number(1.1e-4),
         "averaging": {
             "positions": [1, 2, 4, 5],
             "perfect_px": [None if perfect is None else perfect / n for n in (1, 1.4, 2, 2.2)],
@@ -34,7 +38,7 @@ def an_axis(perfect: float | None, measured: float) -> dict[str, Any]:
             "measured_px": [measured / n for n in (1, 1.4, 2, 2.2)],
             "measured_err_px": [1e-6, 1e-6, None, 1e-6],
         },
-    }  # fmt: skip
+    }
 
 
 def a_view(perfect: float | None = 3e-3, **changes: Any) -> AstrometryView:
@@ -46,8 +50,11 @@ def a_view(perfect: float | None = 3e-3, **changes: Any) -> AstrometryView:
         "result": {
             "axes": {"x": an_axis(perfect, 2e-4), "y": an_axis(perfect, 2e-4)},
             "telescope": {
-                "diameter_m": 7.0, "focal_length_m": 130.0, "wavelength_nm": 600.0,
-                "uas_per_px": SCALE, "px_per_lambda_over_d": 2.53,
+                "diameter_m": 7.0,
+                "focal_length_m": 130.0,
+                "wavelength_nm": 600.0,
+                "uas_per_px": SCALE,
+                "px_per_lambda_over_d": 2.53,
             },
             "stars": {"number": 100, "positions": 5, "electrons": 1e8, "window_px": 23},
             "detector": {"pixels": "the maps plus random errors of size SIGMA", "shape": [50, 70]},
@@ -60,7 +67,7 @@ def a_view(perfect: float | None = 3e-3, **changes: Any) -> AstrometryView:
         "detail_at": (3, 9),
         "rms": np.abs(detail[:, ::8, ::8]),
         "block": 8,
-    }  # fmt: skip
+    }
     return AstrometryView(**(settings | changes))
 
 
@@ -115,8 +122,12 @@ def test_the_maps_of_errors_share_their_colours_and_lie_in_their_place() -> None
 
 def test_the_table_is_all_there() -> None:
     figure = astrometry_figure(a_view())
-    texts = [cell.get_text().get_text() for a in figure.axes for t in a.tables
-             for cell in t.get_celld().values()]  # fmt: skip
+    texts = [
+        cell.get_text().get_text()
+        for a in figure.axes
+        for t in a.tables
+        for cell in t.get_celld().values()
+    ]
     assert texts.count("3e-3 px, 21 µas") == 8
     assert {"perfect grid", "measured maps", "gain"} <= set(texts)
 

@@ -15,18 +15,25 @@ NOTHING = np.full(120, np.nan)
 
 def amount(px: float, error: float) -> dict[str, float]:
     return {
-        "px": px, "error_px": error, "upper_px": px + 2 * error, "variance_px2": px**2,
+        "px": px,
+        "error_px": error,
+        "upper_px": px + 2 * error,
+        "variance_px2": px**2,
         "variance_error_px2": 2 * px * error if px else error**2,
-    }  # fmt: skip
+    }
 
 
 def a_scale(side: int, beyond: float = 0.0) -> dict[str, Any]:
     noise = 1e-3 / side
     return {
-        "side_px": side, "common": amount(2e-3 / side, 1e-5), "expected_px": noise,
-        "difference_px": np.hypot(noise, beyond), "ratio_error": 0.02 * side**0.5,
-        "significance": 9.0 if beyond else 0.5, "beyond_noise": amount(beyond, 1e-5),
-    }  # fmt: skip
+        "side_px": side,
+        "common": amount(2e-3 / side, 1e-5),
+        "expected_px": noise,
+        "difference_px": np.hypot(noise, beyond),
+        "ratio_error": 0.02 * side**0.5,
+        "significance": 9.0 if beyond else 0.5,
+        "beyond_noise": amount(beyond, 1e-5),
+    }
 
 
 def a_component(shape: tuple[int, int] = (90, 120), **changes: Any) -> ComponentView:
@@ -39,14 +46,19 @@ def a_component(shape: tuple[int, int] = (90, 120), **changes: Any) -> Component
         "blocks": {"side_px": 8},
     }
     settings: dict[str, Any] = {
-        "name": "delta_x", "window": shape, "facts": facts, "reach": 0.01,
-        "picture": rng.poisson(2.0, (96, 96)), "far": (),
-        "shift": rng.normal(size=blocks), "scatter": rng.normal(size=blocks),
+        "name": "delta_x",
+        "window": shape,
+        "facts": facts,
+        "reach": 0.01,
+        "picture": rng.poisson(2.0, (96, 96)),
+        "far": (),
+        "shift": rng.normal(size=blocks),
+        "scatter": rng.normal(size=blocks),
         "profiles": {
             name: (rng.normal(0, 1e-4, n), np.full(n, 1e-4))
             for name, n in (("columns", nx), ("rows", ny))
         },
-    }  # fmt: skip
+    }
     return ComponentView(**(settings | changes))
 
 

@@ -23,19 +23,30 @@ def a_view(angle: float = 0.0, paths: int = 9, points: int = 7, **changes: Any) 
     arrays: dict[str, Any] = {
         "x": across * np.cos(angle) - along * np.sin(angle),
         "y": across * np.sin(angle) + along * np.cos(angle),
-        "k": 5 * k - 20, "used": np.ones(len(k), bool),
-        "distance": distance, "baseline": distance * 0.015,
-        "ratio": 0.015 * (1 + np.linspace(-1e-5, 1e-5, 5)), "cost_baseline": bowl,
-        "cost_ratio": bowl, "valley_ratio": np.full(5, 0.015), "valley_cost": bowl[:, 2],
-    }  # fmt: skip
+        "k": 5 * k - 20,
+        "used": np.ones(len(k), bool),
+        "distance": distance,
+        "baseline": distance * 0.015,
+        "ratio": 0.015 * (1 + np.linspace(-1e-5, 1e-5, 5)),
+        "cost_baseline": bowl,
+        "cost_ratio": bowl,
+        "valley_ratio": np.full(5, 0.015),
+        "valley_cost": bowl[:, 2],
+    }
     arrays |= {name: changes.pop(name) for name in arrays.keys() & changes.keys()}
     settings: dict[str, Any] = {
-        "name": "vertical", "frame": (140, 230), "direction": (np.cos(angle), np.sin(angle)),
-        "arrays": arrays, "sigma_px": np.full(len(k), 0.01), "residual_px": np.full(len(k), -0.02),
+        "name": "vertical",
+        "frame": (140, 230),
+        "direction": (np.cos(angle), np.sin(angle)),
+        "arrays": arrays,
+        "sigma_px": np.full(len(k), 0.01),
+        "residual_px": np.full(len(k), -0.02),
         "fibres": (np.array([-500.0, 40.0]), np.array([800.0, 40.0])),
         "extracts": (Extract(np.ones((40, 30)), (0, 0)), Extract(np.ones((40, 30)), (90, 200))),
-        "best": (400.0, 6.0), "distance_sigma": 0.25, "distance_from_prior": False,
-    }  # fmt: skip
+        "best": (400.0, 6.0),
+        "distance_sigma": 0.25,
+        "distance_from_prior": False,
+    }
     return CrestView(**(settings | changes))
 
 

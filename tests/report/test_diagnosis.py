@@ -36,9 +36,14 @@ def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def a_curve(
-    statistic: str = "lines", of: str = "one", domain: str = "noise", sigma: float = 9.0,
-    after: float = 0.5, values: int = 2, **changes: Any,
-) -> dict[str, Any]:  # fmt: skip
+    statistic: str = "lines",
+    of: str = "one",
+    domain: str = "noise",
+    sigma: float = 9.0,
+    after: float = 0.5,
+    values: int = 2,
+    **changes: Any,
+) -> dict[str, Any]:
     """A curve whose last value differs by so many sigma, before and after."""
     last = np.arange(values) == values - 1
 
@@ -47,71 +52,129 @@ def a_curve(
         return {"value": list(middle), "low": list(middle - 0.01), "high": list(middle + 0.01)}
 
     return {
-        "statistic": statistic, "set": of, "title": f"title of {statistic}", "domain": domain,
-        "quantity": "values", "unit": "", "x_label": "bin", "kind": "power",
+        "statistic": statistic,
+        "set": of,
+        "title": f"title of {statistic}",
+        "domain": domain,
+        "quantity": "values",
+        "unit": "",
+        "x_label": "bin",
+        "kind": "power",
         "x": [float(n) for n in range(values)],
-        "measured": list(1 + 0.01 * sigma * last), "nominal": band(0.0),
-        "with_effects": band(sigma - after), "z": list(sigma * last),
-        "z_after": list(after * last), "in_gap": sigma > NOTICED, "weight": sigma**2,
-        "left": min(1.0, (after / sigma) ** 2) if after > 2 else 0.0, "size": -2 * sigma,
-        "significance": sigma, "significance_after": after if after > 1 else -37.0,
-    } | changes  # fmt: skip
+        "measured": list(1 + 0.01 * sigma * last),
+        "nominal": band(0.0),
+        "with_effects": band(sigma - after),
+        "z": list(sigma * last),
+        "z_after": list(after * last),
+        "in_gap": sigma > NOTICED,
+        "weight": sigma**2,
+        "left": min(1.0, (after / sigma) ** 2) if after > 2 else 0.0,
+        "size": -2 * sigma,
+        "significance": sigma,
+        "significance_after": after if after > 1 else -37.0,
+    } | changes
 
 
 def a_cause(effect: str = "lag", **changes: Any) -> dict[str, Any]:
     return {
-        "effect": effect, "title": f"what {effect} is", "parameters": {"share": 0.002},
-        "uncertainty": {"share": 2e-5}, "units": {"share": "e-/um"}, "strengths": ["share"],
-        "meanings": {"share": "left behind"}, "about": "Charge stays.",
-        "gap_closed": 0.8, "gap_closed_interval": [0.75, 0.83],
-        "gain_over_rest": 0.61, "p_value": 2e-40, "sigmas": 80.0, "why": "frames follow others",
-        "given_away_by": [{"statistic": "lines", "set": "one"}], "not_told_apart_from": [],
+        "effect": effect,
+        "title": f"what {effect} is",
+        "parameters": {"share": 0.002},
+        "uncertainty": {"share": 2e-5},
+        "units": {"share": "e-/um"},
+        "strengths": ["share"],
+        "meanings": {"share": "left behind"},
+        "about": "Charge stays.",
+        "gap_closed": 0.8,
+        "gap_closed_interval": [0.75, 0.83],
+        "gain_over_rest": 0.61,
+        "p_value": 2e-40,
+        "sigmas": 80.0,
+        "why": "frames follow others",
+        "given_away_by": [{"statistic": "lines", "set": "one"}],
+        "not_told_apart_from": [],
         "would_decide": [],
-    } | changes  # fmt: skip
+    } | changes
 
 
 def a_diagnosis(
-    verdict: str = "explained", causes: tuple[dict[str, Any], ...] | None = None,
-    curves: tuple[dict[str, Any], ...] | None = None, **gap: Any,
-) -> DiagnosisContents:  # fmt: skip
+    verdict: str = "explained",
+    causes: tuple[dict[str, Any], ...] | None = None,
+    curves: tuple[dict[str, Any], ...] | None = None,
+    **gap: Any,
+) -> DiagnosisContents:
     if causes is None:
         causes = (a_cause(),) if "explained" in verdict.split() else ()
     if curves is None:
         curves = (a_curve(), a_curve("repeat", domain="space", sigma=5.0), a_curve("o", sigma=1.0))
     facts = {
-        "verdict": verdict, "causes": list(causes), "statistics": 102,
+        "verdict": verdict,
+        "causes": list(causes),
+        "statistics": 102,
         "more_would_tell": ["dark frames"],
         "gap": {
-            "total": 1.0, "after": 0.03, "interval": [0.01, 0.06], "where": [],
-            "domains": {"space": [0.3, 0.02], "time": [0.0, 0.0], "intensity": [0.0, 0.0],
-                        "noise": [0.7, 0.01]},
-            "absolute": [{"quantity": "offset rows", "unit": "px", "measured": 2e-3,
-                          "simulated": 3e-5, "after": 1.9e-3,
-                          "simulated_interval": [2e-5, 4e-5], "after_interval": [1.8e-3, 2.1e-3],
-                          "with_only": {"lag": 1.7e-3, "mine": 4e-5}}],
-        } | gap,
+            "total": 1.0,
+            "after": 0.03,
+            "interval": [0.01, 0.06],
+            "where": [],
+            "domains": {
+                "space": [0.3, 0.02],
+                "time": [0.0, 0.0],
+                "intensity": [0.0, 0.0],
+                "noise": [0.7, 0.01],
+            },
+            "absolute": [
+                {
+                    "quantity": "offset rows",
+                    "unit": "px",
+                    "measured": 2e-3,
+                    "simulated": 3e-5,
+                    "after": 1.9e-3,
+                    "simulated_interval": [2e-5, 4e-5],
+                    "after_interval": [1.8e-3, 2.1e-3],
+                    "with_only": {"lag": 1.7e-3, "mine": 4e-5},
+                }
+            ],
+        }
+        | gap,
         "candidates": [
-            {"effect": "ipc", "gap_closed": 0.0, "rejected_because": "not seen (0.4 sigma)",
-             "tried_on_unseen_frames": False, "sigmas": 0.4},
-            {"effect": "mine", "gap_closed": 0.11, "rejected_because": "no likelier with it",
-             "tried_on_unseen_frames": True, "sigmas": 5.0},
+            {
+                "effect": "ipc",
+                "gap_closed": 0.0,
+                "rejected_because": "not seen (0.4 sigma)",
+                "tried_on_unseen_frames": False,
+                "sigmas": 0.4,
+            },
+            {
+                "effect": "mine",
+                "gap_closed": 0.11,
+                "rejected_because": "no likelier with it",
+                "tried_on_unseen_frames": True,
+                "sigmas": 5.0,
+            },
         ],
         "looked_at": {
-            "fitted_on": {"window": [[0, 64], [10, 74]],
-                          "frames": {"flat": [0, 18, 10], "fringes/one": [0, 99, 100]}},
-            "tried_on": {"windows": [[[0, 64], [10, 74]], [[70, 134], [0, 64]]],
-                         "frames": {"fringes/one": [100, 199, 100]}},
+            "fitted_on": {
+                "window": [[0, 64], [10, 74]],
+                "frames": {"flat": [0, 18, 10], "fringes/one": [0, 99, 100]},
+            },
+            "tried_on": {
+                "windows": [[[0, 64], [10, 74]], [[70, 134], [0, 64]]],
+                "frames": {"fringes/one": [100, 199, 100]},
+            },
         },
-    }  # fmt: skip
+    }
     titles = {"lag": "words", "ipc": "crosstalk"}
     return DiagnosisContents(facts, list(curves), titles, NOTICED)
 
 
 def contents(found: DiagnosisContents | None, **changes: Any) -> Contents:
     frames = {
-        "bias": ["b"], "dark": ["d"], "flat": ["f"],
+        "bias": ["b"],
+        "dark": ["d"],
+        "flat": ["f"],
         "fringes": [{"name": "one", "files": ["x"], "baseline_mm": [6.0, 0.0]}],
-    }  # fmt: skip
+    }
     acquisition = {
         "detector": {"pitch_um": 4.4, "gain_e_per_adu": 1.0, "read_noise_e": 16.0},
         "optics": {"wavelength_nm": 632.8, "distance_mm": 400.0},
@@ -261,13 +324,17 @@ def test_causes_come_with_their_numbers() -> None:
     units = table(shown, "Differences in physical units (1σ intervals)")
     assert units.header[2:] == ["measured", "nominal", "with causes", "lag only", "mine only"]
     assert list(units.rows[0])[2:] == [
-        "0.00200", "3.00\u00a0×\u00a010⁻⁵ [2.00\u00a0×\u00a010⁻⁵, 4.00\u00a0×\u00a010⁻⁵]",
+        "0.00200",
+        "3.00\u00a0×\u00a010⁻⁵ [2.00\u00a0×\u00a010⁻⁵, 4.00\u00a0×\u00a010⁻⁵]",
         "0.00190 [0.00180, 0.00210]",
-        "0.00170", "4.00\u00a0×\u00a010⁻⁵",
-    ]  # fmt: skip
+        "0.00170",
+        "4.00\u00a0×\u00a010⁻⁵",
+    ]
     assert shown.plates == [
-        "The gap", "Evidence for what lag is (lag)", "Evidence for what mine is (mine)",
-    ]  # fmt: skip
+        "The gap",
+        "Evidence for what lag is (lag)",
+        "Evidence for what mine is (mine)",
+    ]
     assert "No statistic differs significantly any more." in text_of(shown)
 
 
@@ -275,14 +342,21 @@ def test_causes_come_with_their_numbers() -> None:
 def test_parameters_of_any_shape_are_listed() -> None:
     couplings = [{"dy": n, "share": 0.01 * n, "every": 4} for n in range(1, 21)]
     cause = a_cause(
-        parameters={"couplings": couplings, "pair": [1.0, 2.0], "on": True, "kind": "slow",
-                    "none": None},
+        parameters={
+            "couplings": couplings,
+            "pair": [1.0, 2.0],
+            "on": True,
+            "kind": "slow",
+            "none": None,
+        },
         uncertainty={"couplings[3].share": 0.001, "pair[1]": 0.1},
-    )  # fmt: skip
+    )
     shown = diagnosis(contents(a_diagnosis(causes=(cause,))))
     assert [row[:2] for row in table(shown, "Parameters").rows] == [
-        ["pair", "1 (not fitted), 2.00 ± 0.10"], ["on", "yes"], ["kind", "slow"],
-    ]  # fmt: skip
+        ["pair", "1 (not fitted), 2.00 ± 0.10"],
+        ["on", "yes"],
+        ["kind", "slow"],
+    ]
     assert "Common to all: every 4." in text_of(shown)
     first, rest = shown.tables("coupl")
     assert list(first.header) == ["dy", "share"]
@@ -345,13 +419,17 @@ def test_values_that_hardly_differ_are_shown_with_the_digits_that_tell() -> None
 @pytest.mark.usefixtures("without_figures")
 def test_what_remains_is_named_and_what_is_new_is_a_warning() -> None:
     curves = (
-        a_curve("gone"), a_curve("stays", domain="time", sigma=9.0, after=8.0),
+        a_curve("gone"),
+        a_curve("stays", domain="time", sigma=9.0, after=8.0),
         a_curve("new", domain="intensity", sigma=0.5, after=-6.0, significance_after=5.0),
-    )  # fmt: skip
+    )
     found = a_diagnosis(
-        "partly explained", curves=curves, after=0.31, interval=[0.25, 0.36],
+        "partly explained",
+        curves=curves,
+        after=0.31,
+        interval=[0.25, 0.36],
         domains={"space": [0.5, 0.0], "time": [0.5, 0.2], "intensity": [0, 0], "noise": [0, 0]},
-    )  # fmt: skip
+    )
     shown = diagnosis(contents(found))
     assert "69\u00a0% of the gap" in shown.answer
     assert "31\u00a0% (90\u00a0% interval 25 to 36\u00a0%), mostly in time, " in shown.answer
@@ -374,9 +452,10 @@ def test_what_was_considered_and_looked_at_is_folded() -> None:
     ]
     frames = table(shown, "Frames and windows")
     assert frames.rows[0] == [
-        "window", "rows 0 to 63, columns 10 to 73",
+        "window",
+        "rows 0 to 63, columns 10 to 73",
         "rows 0 to 63, columns 10 to 73; rows 70 to 133, columns 0 to 63",
-    ]  # fmt: skip
+    ]
     assert frames.rows[1] == ["flat", "10 of the frames 0 to 18", "–"]
     assert frames.rows[2] == ["fringes/one", "frames 0 to 99", "frames 100 to 199"]
 
@@ -555,17 +634,22 @@ def test_bars_are_as_long_as_their_shares() -> None:
 @pytest.mark.filterwarnings("ignore:Glyph:UserWarning")
 def test_hostile_text_is_shown_as_it_is_and_does_nothing() -> None:
     cause = a_cause(
-        NASTY, title=NASTY, why=NASTY, not_told_apart_from=[NASTY],
+        NASTY,
+        title=NASTY,
+        why=NASTY,
+        not_told_apart_from=[NASTY],
         would_decide=[NASTY],
         parameters={NASTY: NASTY, "list": [{NASTY: NASTY}]},
-    )  # fmt: skip
+    )
     curves = (a_curve("lines", title=NASTY), a_curve("b", of=NASTY, domain=NASTY, x_label=NASTY))
     found = a_diagnosis(
-        causes=(cause,), curves=curves,
+        causes=(cause,),
+        curves=curves,
         domains={NASTY: [0.6, 0.0], "noise": [0.4, 0.0]},
-        absolute=[{"quantity": NASTY, "unit": NASTY, "measured": 1.0, "simulated": 2.0,
-                   "after": 1.0}],
-    )  # fmt: skip
+        absolute=[
+            {"quantity": NASTY, "unit": NASTY, "measured": 1.0, "simulated": 2.0, "after": 1.0}
+        ],
+    )
     found.facts["candidates"][0] |= {"effect": NASTY, "rejected_because": NASTY}
     page = render(contents(found))
     assert "<script" not in page

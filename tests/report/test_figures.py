@@ -178,10 +178,16 @@ def test_long_runs_are_thinned_and_say_so() -> None:
 def allan_entry(**changes: Any) -> dict[str, Any]:
     law = [1e-3, 7.1e-4, 5e-4]
     return {
-        "frames": [500, 1000, 2000], "seconds": [70.0, 140.0, 280.0], "adev_px": law,
-        "adev_lo_px": [0.9 * v for v in law], "adev_hi_px": [1.1 * v for v in law],
-        "white_expected_px": law, "slope": -0.5, "slope_err": 0.01, "knee_frames": None,
-    } | changes  # fmt: skip
+        "frames": [500, 1000, 2000],
+        "seconds": [70.0, 140.0, 280.0],
+        "adev_px": law,
+        "adev_lo_px": [0.9 * v for v in law],
+        "adev_hi_px": [1.1 * v for v in law],
+        "white_expected_px": law,
+        "slope": -0.5,
+        "slope_err": 0.01,
+        "knee_frames": None,
+    } | changes
 
 
 @pytest.mark.parametrize(

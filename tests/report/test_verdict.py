@@ -27,9 +27,12 @@ def contents(
     flags.ravel()[:masked] = 1
     delta = np.random.default_rng(0).normal(0, 6e-3, shape)
     chosen = {
-        "frames": 600, "sigma_median_px": 2e-4, "crb_median_px": 2e-4, "sigma_scale": 1.0,
+        "frames": 600,
+        "sigma_median_px": 2e-4,
+        "crb_median_px": 2e-4,
+        "sigma_scale": 1.0,
         "batch_period_s": 0.14,
-    } | (facts or {})  # fmt: skip
+    } | (facts or {})
     one = summarise(ArraySource(np.ones(shape)))
     zeros = np.zeros(3)
     series = FrameHistory(zeros, zeros, zeros, zeros, zeros, zeros)

@@ -88,9 +88,9 @@ def test_a_ghost_stands_still_with_its_own_fibre_and_moves_with_the_other() -> N
     with_it, without = (light_of(b, b.sets[0]) for b in (bench, plain))
     standing = with_it.first / with_it.first.mean() - without.first / without.first.mean()
     assert standing.std() * np.sqrt(2) == pytest.approx(2 * size, rel=0.3)
-    following = with_it.cross / np.abs(with_it.cross).mean() - without.cross / np.abs(
-        without.cross
-    ).mean()  # fmt: skip
+    following = (
+        with_it.cross / np.abs(with_it.cross).mean() - without.cross / np.abs(without.cross).mean()
+    )
     assert np.abs(following).std() < np.abs(following).mean() + size
     assert np.abs(following).max() > 0.5 * size
 

@@ -71,11 +71,14 @@ class Detector:
             arrays[kind] = np.stack([frame(*one) for one in each])
             n = len(each)
             tables[kind] = {
-                "file": [f"{kind}-{i}.fits" for i in range(n)], "plane": [0] * n,
-                "mjd": [None] * n, "exptime_s": [t for t, _ in each],
-                "temperature_c": [None] * n, "time_s": [float(i) for i in range(n)],
+                "file": [f"{kind}-{i}.fits" for i in range(n)],
+                "plane": [0] * n,
+                "mjd": [None] * n,
+                "exptime_s": [t for t, _ in each],
+                "temperature_c": [None] * n,
+                "time_s": [float(i) for i in range(n)],
                 "time_source": ["number"] * n,
-            }  # fmt: skip
+            }
         return arrays, tables
 
     def described(self, **detector: float) -> Acquisition:
@@ -86,10 +89,12 @@ class Detector:
             | detector,
             "optics": {"wavelength_nm": 632.8, "distance_mm": 400.0},
             "frames": {
-                "bias": ["bias*"], "dark": ["dark*"], "flat": ["flat*"] if self.flats else [],
+                "bias": ["bias*"],
+                "dark": ["dark*"],
+                "flat": ["flat*"] if self.flats else [],
                 "fringes": [],
             },
-        }  # fmt: skip
+        }
         return parse(Acquisition, plain, "acquisition")
 
 

@@ -26,8 +26,14 @@ SYNC = Runtime(cluster="sync")
 DEFAULT = Config()
 SIGMA = 2e-3
 PER_LENGTH = (
-    "frames", "seconds", "adev_px", "adev_err_px", "adev_lo_px", "adev_hi_px", "white_expected_px",
-)  # fmt: skip
+    "frames",
+    "seconds",
+    "adev_px",
+    "adev_err_px",
+    "adev_lo_px",
+    "adev_hi_px",
+    "white_expected_px",
+)
 
 
 def noise(n: int = 36, shape: tuple[int, int] = (23, 31), seed: int = 1) -> F64:

@@ -69,11 +69,14 @@ def make_run(
     description = {
         "schema": "pixcal/acquisition/1",
         "detector": {
-            "pitch_um": 4.4, "gain_e_per_adu": 1.0, "read_noise_e": 16.0, "full_well_e": 50_000.0,
+            "pitch_um": 4.4,
+            "gain_e_per_adu": 1.0,
+            "read_noise_e": 16.0,
+            "full_well_e": 50_000.0,
         },
         "optics": {"wavelength_nm": 632.8, "distance_mm": 400.0},
         "frames": {"bias": ["bias.fits"]},
-    }  # fmt: skip
+    }
     with build(run, "ingest", 1, {}, {}) as made:
         write_json(made.folder / "acquisition.json", description)
     with build(run, "fit", 1, {}, {}) as made:
@@ -249,16 +252,20 @@ def test_maps_of_noise_are_told_from_maps_that_help(tmp_path: Path) -> None:
 
 GEOMETRY = Geometry(632.8e-6, 4.4e-3, 18.0, 12.0, 400.0, 6.0, 0.0, 0.0)
 HYPERBOLIC = {
-    "model": "hyperbolic", "kx": 0.1, "ky": 0.0, "axis": [1.0, 0.0],
+    "model": "hyperbolic",
+    "kx": 0.1,
+    "ky": 0.0,
+    "axis": [1.0, 0.0],
     "phase_at_origin_rad": 0.0,
     "geometry": {
         f"{n}_mm": float(v)
         for n, v in zip(
             ("centre_x", "centre_y", "distance", "baseline_x", "baseline_y", "baseline_z"),
-            GEOMETRY.vector(), strict=True,
+            GEOMETRY.vector(),
+            strict=True,
         )
     },
-}  # fmt: skip
+}
 
 
 @pytest.mark.long
@@ -326,8 +333,9 @@ def test_the_map_of_errors_is_what_fits_give(case: Path) -> None:
 
 def test_first_order_predicts_every_star(case: Path) -> None:
     plan = Observation(the_star(), 30, 4, 20.0)
-    errors = dict(zip(KINDS, np.moveaxis(observe(the_detector(case / "run"), plan, SYNC), 2, 0),
-                      strict=True))  # fmt: skip
+    errors = dict(
+        zip(KINDS, np.moveaxis(observe(the_detector(case / "run"), plan, SYNC), 2, 0), strict=True)
+    )
     good = np.isfinite(errors["perfect"])
     for kind, linear in (("perfect", "linear"), ("measured", "linear_measured")):
         assert np.all(np.isfinite(errors[kind]) == good)
@@ -468,13 +476,15 @@ def test_mistakes_are_told(case: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"other/delta_x\.fits.*31, 33.*97, 131"):
         astrometry.run(run, Config(truth=other), SYNC)
     with pytest.raises(InputError, match="pixcal fit"):
-        astrometry.run(broken(case, tmp_path / "1", lambda r: shutil.rmtree(r / "fit")), Config(),
-                       SYNC)  # fmt: skip
+        astrometry.run(
+            broken(case, tmp_path / "1", lambda r: shutil.rmtree(r / "fit")), Config(), SYNC
+        )
     with pytest.raises(InputError, match=r"delta_y\.fits.*pixcal fit"):
         astrometry.run(
             broken(case, tmp_path / "2", lambda r: (r / "products" / "delta_y.fits").unlink()),
-            Config(), SYNC,
-        )  # fmt: skip
+            Config(),
+            SYNC,
+        )
     with pytest.raises(PlanError, match="--memory"):
         astrometry.run(run, Config(stars=10), Runtime("sync", memory=300 << 20))
 
@@ -557,5 +567,8 @@ def test_numbers_with_their_errors(value: float, error: float | None, text: str)
 
 def test_short_exponents() -> None:
     assert [scientific(v) for v in (1e8, 2.5e11, 3000.0, 12345.0)] == [
-        "1e8", "2.5e11", "3e3", "1.23e4",
-    ]  # fmt: skip
+        "1e8",
+        "2.5e11",
+        "3e3",
+        "1.23e4",
+    ]

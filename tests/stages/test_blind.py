@@ -85,8 +85,11 @@ def test_a_way_is_an_effect_at_any_strength(way: Variant) -> None:
 def test_the_parts_of_the_self_check() -> None:
     examination = draw_examination(100, 5, "small", "own")
     assert Counter(t.part for t in examination.truths) == {
-        ONE: 50, NOTHING: 16, SEVERAL: 17, LEFT_OUT: 17,
-    }  # fmt: skip
+        ONE: 50,
+        NOTHING: 16,
+        SEVERAL: 17,
+        LEFT_OUT: 17,
+    }
     assert [t.part for t in examination.truths] != sorted(t.part for t in examination.truths)
     for truth in examination.truths:
         assert (truth.left_out in truth.names) == (truth.part == LEFT_OUT)
@@ -104,8 +107,11 @@ def test_half_of_the_cases_are_of_the_second_bench() -> None:
     examination = draw_examination(200, 5, "small")
     second = [t for t in examination.truths if t.part in SECOND]
     assert Counter(t.part for t in second) == {
-        SECOND_ONE: 55, SECOND_NOTHING: 25, SECOND_PAIR: 10, SECOND_OTHER: 10,
-    }  # fmt: skip
+        SECOND_ONE: 55,
+        SECOND_NOTHING: 25,
+        SECOND_PAIR: 10,
+        SECOND_OTHER: 10,
+    }
     assert all((t.second is None) == (t.part not in SECOND) for t in examination.truths)
     assert len({t.second.seed for t in second if t.second}) == 100
     known = {law.effect for law in laws if law.known}
@@ -381,9 +387,11 @@ def test_each_case_gets_the_memory_that_it_asks_for(
     assert over.workers == at_once
     half, sets = 128 * 128 * 300, 3
     make_plan(
-        "diagnose", look.ESTIMATE_BYTES * half,
-        look.EVIDENCE_BYTES * half * sets, each,
-    )  # fmt: skip
+        "diagnose",
+        look.ESTIMATE_BYTES * half,
+        look.EVIDENCE_BYTES * half * sets,
+        each,
+    )
     with pytest.raises(PlanError, match="cases"):
         share("cases", "standard", 10, replace(runtime, memory=1 << 30))
 
@@ -523,11 +531,18 @@ def test_a_score_counts_and_is_shown(tmp_path: Path) -> None:
     assert [q["right"] for q in stranger.values()] == [1, 0, 1]
     assert found["second"]["effects"]["lag"]["right"]["of"] == 1
     about = {
-        "purpose": "development", "size": "small", "seed": 3, "notes": [],
-        "made": 10, "missing": ["case-0007", "case-0008"],
-        "sittings": {"codes": ["a", "b"], "median_seconds": {"diagnosis": 60.2, "maps": 1.9},
-                     "without_maps": 0},
-    }  # fmt: skip
+        "purpose": "development",
+        "size": "small",
+        "seed": 3,
+        "notes": [],
+        "made": 10,
+        "missing": ["case-0007", "case-0008"],
+        "sittings": {
+            "codes": ["a", "b"],
+            "median_seconds": {"diagnosis": 60.2, "maps": 1.9},
+            "without_maps": 0,
+        },
+    }
     text = as_markdown(found | about)
     assert text.index("The second bench") < text.index("Self-check")
     assert "2 of 10 are not diagnosed yet" in text
@@ -586,7 +601,7 @@ def test_offsets_are_held_against_the_truth_in_bounds(
     correct.run(run_dir, correct.Config(), SYNC)
     found = offset_errors(
         run_dir / "products", folder / "case-0001", truth, examination.bench(0), LAYOUTS["tiny"]
-    )  # fmt: skip
+    )
     assert [one.axis for one in found] == ["x", "y"]
     worst = max(one.before for one in found)
     assert before[0] < worst < before[1]

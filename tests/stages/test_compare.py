@@ -63,10 +63,15 @@ class Maps:
             delta = (kx * self.delta_x + ky * self.delta_y) / k + patterns.get(name, 0.0)
             self._write_set(run / "fit" / "fit.zarr" / name, delta, self.sigma[name], rng)
             sets[name] = {
-                "frames": 200, "interfringe_px": 2 * np.pi / k, "model": self.model,
-                "axis": [kx / k, ky / k], "kx": kx, "ky": ky,
-                "phase_at_origin_rad": self.phases.get(name, 0.0), "geometry": self.geometry,
-            }  # fmt: skip
+                "frames": 200,
+                "interfringe_px": 2 * np.pi / k,
+                "model": self.model,
+                "axis": [kx / k, ky / k],
+                "kx": kx,
+                "ky": ky,
+                "phase_at_origin_rad": self.phases.get(name, 0.0),
+                "geometry": self.geometry,
+            }
         write_json(run / "fit" / "fit.json", {"sets": sets, "shape": list(shape)})
         manifest = Manifest("fit", 1, f"key of {run.name}", {}, {})
         write_json(run / "fit" / "manifest.json", asdict(manifest))
@@ -151,8 +156,10 @@ def test_simulated_and_fitted_runs_agree_within_their_noise(
     make_bench: Any, write_reduced: Any, tmp_path: Path
 ) -> None:
     """The same pixels under other baselines, other frames, other noise; and one against itself."""
-    benches = [make_bench(shape=(81, 95), frames=140, interfringe=i, seed=s, laser_noise=0.02)
-               for i, s in ((6.0, 4), (8.5, 5))]  # fmt: skip
+    benches = [
+        make_bench(shape=(81, 95), frames=140, interfringe=i, seed=s, laser_noise=0.02)
+        for i, s in ((6.0, 4), (8.5, 5))
+    ]
     benches[1].delta_x, benches[1].delta_y = benches[0].delta_x, benches[0].delta_y
     runs = [write_reduced(b, tmp_path / f"run{n}") for n, b in enumerate(benches)]
     for run in runs:
@@ -367,8 +374,11 @@ def test_a_drift_shows_between_halves_and_not_between_odd_and_even(
 def test_three_runs_tell_which_is_odd(make: Any, tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     steps = np.kron(rng.normal(0, 1e-3, (18, 24)), np.ones((8, 8)))[: SHAPE[0], : SHAPE[1]]
-    runs = [make("one", seed=1), make("two", seed=2, patterns={"vertical": steps}),
-            make("three", seed=3)]  # fmt: skip
+    runs = [
+        make("one", seed=1),
+        make("two", seed=2, patterns={"vertical": steps}),
+        make("three", seed=3),
+    ]
     whole = result(tmp_path / "out", *runs)
     assert [p["sides"] for p in whole["pairs"]] == [[0, 1], [0, 2], [1, 2]]
     own = whole["summary"]["delta_x"]["own"]
@@ -447,8 +457,9 @@ def test_mistakes_are_named(make: Any, truth: Any, tmp_path: Path) -> None:
         InputError, match=r"small: a window of 187 x 99 px, .*187 x 141.*same shape"
     ):
         compare.run([one, small], out, Config(), SYNC)
-    lone = [make(n, vectors={n: v}, sigma={n: 1e-3}) for n, v in
-            (("a", (0.6, 0.0)), ("b", (0.3, 0.5)))]  # fmt: skip
+    lone = [
+        make(n, vectors={n: v}, sigma={n: 1e-3}) for n, v in (("a", (0.6, 0.0)), ("b", (0.3, 0.5)))
+    ]
     with pytest.raises(InputError, match="b: its fringes are rotated by 59 degrees"):
         compare.run(lone, out, Config(), SYNC)
     with pytest.raises(InputError, match="single: set 'vertical' has too few batches"):

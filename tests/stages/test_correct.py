@@ -81,9 +81,11 @@ def with_calibration(run: Path, bench: Any, reseal: Callable[..., None]) -> Path
     create_group(run / "reduce" / "calibration.zarr")
     for name, value in (("flat", bench.flat), ("dark_rate", np.zeros(bench.shape))):
         write_array(
-            run / "reduce" / "calibration.zarr" / name, value.astype(np.float32),
-            dims=("y", "x"), chunks=(128, 128),
-        )  # fmt: skip
+            run / "reduce" / "calibration.zarr" / name,
+            value.astype(np.float32),
+            dims=("y", "x"),
+            chunks=(128, 128),
+        )
     columns = {"exptime_s": [0.02] * bench.frames, "time_s": [*range(bench.frames)]}
     times = {f"fringes/{name}": columns for name in bench.sets}
     write_json(run / "ingest" / "frames.json", times)
@@ -251,8 +253,10 @@ def test_what_the_fit_takes_up_is_said(coupled, tmp_path):
     correct.run(again, correct.Config(), SYNC)
     found = json.loads((again / "products" / "correction.json").read_text())
     assert [e["treatment"] for e in found["effects"]] == [
-        "absorbed by the fit", "not corrected", "not corrected"
-    ]  # fmt: skip
+        "absorbed by the fit",
+        "not corrected",
+        "not corrected",
+    ]
     assert found["outputs"] == []
 
 
@@ -349,9 +353,13 @@ def test_a_file_of_the_users_own_may_be_in_any_encoding_of_python(coupled, tmp_p
 def bent(make_bench, write_reduced, reseal, tmp_path_factory):
     """A response that is not linear: few frames, and more of it than there is, to see it well."""
     bench = make_bench(
-        shape=(50, 61), frames=60, delta=2e-3, response=0.01,
-        sets={"low": (0.0, 4.0), "high": (0.0, 6.0)}, interfringe=None,
-    )  # fmt: skip
+        shape=(50, 61),
+        frames=60,
+        delta=2e-3,
+        response=0.01,
+        sets={"low": (0.0, 4.0), "high": (0.0, 6.0)},
+        interfringe=None,
+    )
     effect = Nonlinearity(quadratic=-0.08)
     seen_through(bench, lambda charge: effect.response(charge.astype(np.float32)).astype(float))
     run = write_reduced(bench, tmp_path_factory.mktemp("correct") / "run")
@@ -485,9 +493,12 @@ def test_a_correction_that_leaves_a_larger_pattern_is_refused() -> None:
 def test_a_correction_that_moves_sets_apart_is_refused() -> None:
     sets = {n: {"pixels": 10_000, "rows": None, "columns": None} for n in ("short", "long")}
     pair = {
-        "sets": ["short", "long"], "before_px": 1.2e-3, "before_expected_px": 1e-3,
-        "after_px": 1.0e-3, "after_expected_px": 1e-3,
-    }  # fmt: skip
+        "sets": ["short", "long"],
+        "before_px": 1.2e-3,
+        "before_expected_px": 1e-3,
+        "after_px": 1.0e-3,
+        "after_expected_px": 1e-3,
+    }
     assert worsened(sets, [pair]) == ""
     assert worsened(sets, [pair | {"after_px": 1.21e-3}]) == ""
     assert "differ by 0.0013 px" in worsened(sets, [pair | {"after_px": 1.3e-3}])

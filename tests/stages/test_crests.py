@@ -34,9 +34,14 @@ def _coarse_maps() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def bench(make_bench: Any) -> Any:
     return make_bench(
-        shape=(137, 150), frames=70, sets=SETS, interfringe=9.0, delta=2e-3, offset=(4.0, -3.0),
+        shape=(137, 150),
+        frames=70,
+        sets=SETS,
+        interfringe=9.0,
+        delta=2e-3,
+        offset=(4.0, -3.0),
         laser_noise=0.02,
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -74,8 +79,12 @@ def test_the_fibres_are_where_they_are(bench: Any, fitted: Path, name: str) -> N
     bx, by = bench.sets[name]
     truth = [
         (nx - 1) / 2 * bench.pitch + bench.offset[0],
-        (ny - 1) / 2 * bench.pitch + bench.offset[1], bench.distance, bx, by, 0.0,
-    ]  # fmt: skip
+        (ny - 1) / 2 * bench.pitch + bench.offset[1],
+        bench.distance,
+        bx,
+        by,
+        0.0,
+    ]
     for parameter, value in zip(PARAMETERS, truth, strict=True):
         error = geometry[f"{parameter}_mm"] - value
         assert abs(error) < 4 * geometry[f"{parameter}_sigma_mm"], parameter

@@ -145,8 +145,9 @@ def test_the_step_of_the_codes_is_found(tmp_path: Path) -> None:
     found = camera_run(tmp_path, {"bias": (0, 60, 4, 0), "flat": (30000, 8, 4, 0)})
     rounding = 4 * GAIN / np.sqrt(12)
     for name, true in (
-        ("read_noise", READ), ("read_noise_with_rounding", np.hypot(READ, rounding))
-    ):  # fmt: skip
+        ("read_noise", READ),
+        ("read_noise_with_rounding", np.hypot(READ, rounding)),
+    ):
         assert abs(found[name]["value"] - true) < 4 * found[name]["error"], name
     assert "steps of 4 ADU" in found["read_noise_with_rounding"]["note"]
 
@@ -211,9 +212,14 @@ def test_without_flats_and_darks_the_rest_is_there(tmp_path: Path) -> None:
     made = pixcal.run(acquisition, tmp_path / "run", diagnosed=False)
     found = made.reduction["figures_of_merit"]
     assert set(found) == {
-        "conversion_gain", "read_noise_with_rounding", "read_noise", "dsnu", "dsnu_row",
-        "dsnu_column", "dsnu_pixel",
-    }  # fmt: skip
+        "conversion_gain",
+        "read_noise_with_rounding",
+        "read_noise",
+        "dsnu",
+        "dsnu_row",
+        "dsnu_column",
+        "dsnu_pixel",
+    }
     assert found["conversion_gain"]["note"] == "declared, not measured"
     curves = json.loads((made.path / "reduce" / "figures_of_merit.json").read_text())
     assert curves["dsnu"]["rows"]["frequency"][-1] == 0.5

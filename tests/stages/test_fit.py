@@ -231,9 +231,13 @@ def test_masked_pixels_are_nan_with_their_flag(make_bench, write_reduced, reseal
 def test_hyperbolic_fringes_are_seen_and_fitted(make_bench, write_reduced, reseal, tmp_path):
     """Fibres 18 mm aside and 10 mm farther than nominal, baseline 5 % longer."""
     bench = make_bench(
-        shape=(120, 140), frames=150, distance=410.0, offset=(18.0, -18.0),
-        sets={"vertical": (6.3, 0.0), "horizontal": (0.0, 6.3)}, interfringe=None,
-    )  # fmt: skip
+        shape=(120, 140),
+        frames=150,
+        distance=410.0,
+        offset=(18.0, -18.0),
+        sets={"vertical": (6.3, 0.0), "horizontal": (0.0, 6.3)},
+        interfringe=None,
+    )
     run = write_reduced(bench, tmp_path / "run")
     config = run / "ingest" / "acquisition.json"
     acquisition = json.loads(config.read_text())
@@ -260,9 +264,11 @@ def test_hyperbolic_fringes_are_seen_and_fitted(make_bench, write_reduced, resea
 
 def test_three_sets_are_consistent(make_bench, write_reduced, tmp_path):
     bench = make_bench(
-        shape=(50, 55), frames=120,
-        sets={"a": (6.0, 0.0), "b": (0.0, 6.0), "c": (4.0, 4.0)}, interfringe=None,
-    )  # fmt: skip
+        shape=(50, 55),
+        frames=120,
+        sets={"a": (6.0, 0.0), "b": (0.0, 6.0), "c": (4.0, 4.0)},
+        interfringe=None,
+    )
     run = write_reduced(bench, tmp_path / "run")
     fit.run(run, fit.Config(), Runtime())
     result = fit_json(run)
@@ -383,9 +389,11 @@ def test_the_consistency_of_sets_counts_pixels_that_one_set_lacks(
     make_bench, write_reduced, reseal, tmp_path
 ):
     bench = make_bench(
-        shape=(50, 55), frames=80,
-        sets={"a": (6.0, 0.0), "b": (0.0, 6.0), "c": (4.0, 4.0)}, interfringe=None,
-    )  # fmt: skip
+        shape=(50, 55),
+        frames=80,
+        sets={"a": (6.0, 0.0), "b": (0.0, 6.0), "c": (4.0, 4.0)},
+        interfringe=None,
+    )
     run = write_reduced(bench, tmp_path / "run")
     mask = np.zeros(bench.shape, np.uint8)
     mask[5:] = PixelFlag.DEAD

@@ -79,9 +79,10 @@ def test_levels_that_bend_without_their_noise_are_the_lamp(
 ) -> None:
     flats = ladder([(t, 1 - lamp * t) for t in LEVELS], 4)
     camera = Detector(
-        **(CAMERA | {"shape": (160, 160)}), flats=flats,
+        **(CAMERA | {"shape": (160, 160)}),
+        flats=flats,
         response=lambda e: e * (1 + quadratic * e / 8000),
-    )  # fmt: skip
+    )
     evidence, _ = reduced(camera, 11, tmp_path)
     found = Nonlinearity.estimate(evidence)
     assert found is not None
@@ -113,10 +114,10 @@ def test_a_level_of_another_lamp_is_not_of_the_ladder(tmp_path: Path) -> None:
 
 def test_a_knee_at_the_highest_level_is_of_the_ladder(tmp_path: Path) -> None:
     camera = Detector(
-        **CAMERA, flats=ladder([(t, 1) for t in LEVELS]), response=lambda e: e - 0.5 * (
-            np.maximum(e - 0.93 * 8000, 0)
-        ),
-    )  # fmt: skip
+        **CAMERA,
+        flats=ladder([(t, 1) for t in LEVELS]),
+        response=lambda e: e - 0.5 * (np.maximum(e - 0.93 * 8000, 0)),
+    )
     evidence, _ = reduced(camera, 17, tmp_path)
     levels = ladder_of(evidence)
     assert levels is not None
@@ -178,9 +179,16 @@ def test_a_gain_does_not_hang_on_noise_that_is_cut_off_at_code_zero(tmp_path: Pa
     """Of noise below a code hardly anything is left; the flats tell what it is, and the gain."""
     flats = ladder([(t, 1) for t in LEVELS], 10)
     camera = Detector(
-        gain=45.0, noise=20.0, bias=0.0, top=255, dark=0.0, rate=9000.0, prnu=0.008,
-        shape=(192, 192), flats=flats,
-    )  # fmt: skip
+        gain=45.0,
+        noise=20.0,
+        bias=0.0,
+        top=255,
+        dark=0.0,
+        rate=9000.0,
+        prnu=0.008,
+        shape=(192, 192),
+        flats=flats,
+    )
     _, report = reduced(camera, 15, tmp_path)
     gain, noise = report["gain_e_per_adu"], report["read_noise_e"]
     assert gain["measured"] == pytest.approx(45.0, abs=max(0.45, 3 * gain["error"]))
@@ -207,9 +215,11 @@ def test_saturation_is_found_and_what_is_below_it_used(tmp_path: Path) -> None:
 def test_levels_that_some_pixels_fill_are_left_out(tmp_path: Path) -> None:
     """The brightest pixels are full, and have no photon noise, where the mean is well below."""
     camera = Detector(
-        **CAMERA, flats=ladder([(1.1 * t, 1) for t in LEVELS], 4), prnu=0.03,
+        **CAMERA,
+        flats=ladder([(1.1 * t, 1) for t in LEVELS], 4),
+        prnu=0.03,
         response=lambda e: np.minimum(e, 8000 * 1.02),
-    )  # fmt: skip
+    )
     _, report = reduced(camera, 6, tmp_path)
     # At the last but one level the usual pixel is at 0.99 of its full well, at the one before 0.89.
     assert report["saturation_adu"]["full_frames"] == list(range(4 * 10, 4 * 12))
@@ -219,9 +229,16 @@ def test_dim_levels_are_not_full_where_the_wells_are(tmp_path: Path) -> None:
     """At the dimmest level the read noise is as large as the signal, and outweighs the photons'."""
     well, lamps = 10_000.0, np.linspace(0.01, 1.08, 23)
     camera = Detector(
-        gain=50.0, noise=103.0, bias=40.4, top=255, dark=0.0, rate=well, shape=(160, 160),
-        flats=ladder([(1.0, lamp) for lamp in lamps]), response=lambda e: np.minimum(e, well),
-    )  # fmt: skip
+        gain=50.0,
+        noise=103.0,
+        bias=40.4,
+        top=255,
+        dark=0.0,
+        rate=well,
+        shape=(160, 160),
+        flats=ladder([(1.0, lamp) for lamp in lamps]),
+        response=lambda e: np.minimum(e, well),
+    )
     _, report = reduced(camera, 3, tmp_path)
     bright = np.flatnonzero(np.repeat(lamps, 2) > 0.93).tolist()
     assert set(report["saturation_adu"]["full_frames"]) <= set(bright)

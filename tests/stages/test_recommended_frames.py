@@ -56,15 +56,16 @@ def missing(
         (missing(((6, 0), (0, 6)), LADDER), ("ipc",), ["a second baseline along x and y"]),
         (missing(((6, 0), (9, 0), (0, 6)), LADDER), ("ipc",), ["a second baseline along y"]),
         (missing(((4, 4),), LADDER), ("intra_pixel_response",), ["a second baseline along 45°"]),
-        (missing(((6, 0), (9, 0)), LADDER), ("ghost_fringes",),
-         ["a fringe set along another axis"]),
-        (missing(FOUR, LADDER[:1]), ("nonlinearity",),
-         ["flats at 3 or more exposure times"]),
+        (
+            missing(((6, 0), (9, 0)), LADDER),
+            ("ghost_fringes",),
+            ["a fringe set along another axis"],
+        ),
+        (missing(FOUR, LADDER[:1]), ("nonlinearity",), ["flats at 3 or more exposure times"]),
         (missing(FOUR, LADDER[:1]), ("row_noise",), [MORE]),
-        (missing(FOUR, ()), ("mine",),
-         ["flat frames", "flats at 3 or more exposure times"]),
+        (missing(FOUR, ()), ("mine",), ["flat frames", "flats at 3 or more exposure times"]),
     ],
-)  # fmt: skip
+)
 def test_frames_that_would_decide_are_those_that_are_missing(
     lacking: dict[str, str], names: tuple[str, ...], words: list[str]
 ) -> None:

@@ -77,9 +77,13 @@ def same_but_for_the_cubes(bucket: Any, run: Path, local: Path, stage: str) -> N
 @pytest.fixture
 def cluster() -> Iterator[Runtime]:
     with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, host="127.0.0.1",
-        protocol="tcp://", dashboard_address=None,
-    ) as made:  # fmt: skip
+        n_workers=2,
+        threads_per_worker=1,
+        processes=False,
+        host="127.0.0.1",
+        protocol="tcp://",
+        dashboard_address=None,
+    ) as made:
         yield Runtime(made.scheduler_address)
 
 
@@ -161,9 +165,15 @@ RAW, SIGNAL = "raw.zarr/fringes/vertical", "reduced.zarr/vertical/signal"
 @pytest.mark.parametrize("file", ["c/1/0/1", "zarr.json"])
 @pytest.mark.parametrize(("stage", "array"), [("ingest", RAW), ("reduce", SIGNAL)])
 def test_damage_is_refused(
-    far: Path, store: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-    damage: str, file: str, stage: str, array: str,
-) -> None:  # fmt: skip
+    far: Path,
+    store: Any,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    damage: str,
+    file: str,
+    stage: str,
+    array: str,
+) -> None:
     shutil.copytree(far, tmp_path / "run")
     key = f"{at(store, far, stage)}{array}/{file}"
     body = store.get(key)
@@ -197,9 +207,13 @@ class Cut:
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RemoteError])
 def test_an_ingest_cut_short_goes_on(
-    night: Path, local: Path, bucket: Any, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, error: type[BaseException],
-) -> None:  # fmt: skip
+    night: Path,
+    local: Path,
+    bucket: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    error: type[BaseException],
+) -> None:
     run, config = tmp_path / "run", ingest.Config(copy=True, cubes=f"{bucket.url}/x")
     with monkeypatch.context() as patch:
         cut = Cut(2 * 3, error)  # each block, and what the catalogue holds of it
@@ -258,9 +272,13 @@ def test_a_reduction_cut_short_goes_on(
 
 @pytest.mark.long
 def test_where_cubes_are_is_remembered(
-    night: Path, far: Path, store: Any, ingested: Path, tmp_path: Path,
+    night: Path,
+    far: Path,
+    store: Any,
+    ingested: Path,
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     with monkeypatch.context() as patch:
         patch.setattr("pixcal.storage.stage.build", None)
         for cubes in (None, f"{store.url}/x", f"{store.url}/x/"):
@@ -341,9 +359,13 @@ def shell(*args: str, **env: str | None) -> subprocess.CompletedProcess[str]:
     patient = {"AWS_MAX_ATTEMPTS": "1", "FSSPEC_S3": '{"config_kwargs": {"connect_timeout": 1}}'}
     wanted = {**os.environ, **patient, **env}
     return subprocess.run(
-        args, env={k: v for k, v in wanted.items() if v is not None},
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
+        args,
+        env={k: v for k, v in wanted.items() if v is not None},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
 
 
 NO_CREDENTIALS = {"AWS_ACCESS_KEY_ID": None, "AWS_SECRET_ACCESS_KEY": None}

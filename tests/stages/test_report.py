@@ -26,7 +26,7 @@ DIAGNOSIS_FORMAT = STAGES["diagnose"].format
 SECTIONS = (
     "maps", "allan", "diagnosis", "levels", "temporal", "noise", "detector", "masks", "removed",
     "provenance",
-)  # fmt: skip  # fmt: skip
+)  # fmt: skip
 RUNTIME = Runtime(cluster="sync")
 NASTY = "<script>alert('x')</script> & \"quotes\""
 
@@ -78,10 +78,14 @@ def write_ingest(run: Path, sets: tuple[str, ...], name: str) -> None:
         "frames": {"bias": ["bias/*.fits"], "dark": [], "flat": [], "fringes": fringes},
     }
     table = {
-        "file": ["a.fits", "a.fits", "b.fits"], "plane": [0, 1, 0], "mjd": [60000.0, None, 60000.1],
-        "exptime_s": [0.02, 0.02, 0.02], "temperature_c": [None, 21.0, 22.0],
-        "time_s": [0.0, 4320.0, 8640.0], "time_source": ["header"] * 3,
-    }  # fmt: skip
+        "file": ["a.fits", "a.fits", "b.fits"],
+        "plane": [0, 1, 0],
+        "mjd": [60000.0, None, 60000.1],
+        "exptime_s": [0.02, 0.02, 0.02],
+        "temperature_c": [None, 21.0, 22.0],
+        "time_s": [0.0, 4320.0, 8640.0],
+        "time_source": ["header"] * 3,
+    }
     with build(run, "ingest", 1, {}, {}) as made:
         write_json(made.folder / "acquisition.json", acquisition)
         write_json(made.folder / "frames.json", {"bias": table})
@@ -112,27 +116,44 @@ def write_reduce(
         create_group(group)
         normal = rng.normal(size=(4, *shape)).astype(np.float32)
         write_maps(
-            group, bias=500 + normal[0], dark_rate=np.zeros(shape, np.float32),
-            flat=1 + 0.01 * normal[2], read_noise=16 + normal[3], mask=mask & 1,
-        )  # fmt: skip
+            group,
+            bias=500 + normal[0],
+            dark_rate=np.zeros(shape, np.float32),
+            flat=1 + 0.01 * normal[2],
+            read_noise=16 + normal[3],
+            mask=mask & 1,
+        )
 
 
 def set_facts(n: int) -> dict[str, Any]:
     angle = n * np.pi / 2
     return {
-        "model": "paraxial", "frames": 60, "interfringe_px": 9.6,
-        "kx": float(np.cos(angle)) * 0.65, "ky": float(np.sin(angle)) * 0.65,
-        "sigma_median_px": 4e-4, "crb_median_px": 3.9e-4, "chi2_reduced": 1.2,
-        "sigma_scale": 1.0954, "fringe_vector_moves": False, "batch_period_s": 0.14,
-        "batch_note": "", "geometry": {"kx_sigma": 1e-6},
+        "model": "paraxial",
+        "frames": 60,
+        "interfringe_px": 9.6,
+        "kx": float(np.cos(angle)) * 0.65,
+        "ky": float(np.sin(angle)) * 0.65,
+        "sigma_median_px": 4e-4,
+        "crb_median_px": 3.9e-4,
+        "chi2_reduced": 1.2,
+        "sigma_scale": 1.0954,
+        "fringe_vector_moves": False,
+        "batch_period_s": 0.14,
+        "batch_note": "",
+        "geometry": {"kx_sigma": 1e-6},
         "removed_modes": ["1", "x", "y", "cos(2*psi)", "d psi / d baseline_x", "odd one"],
-    }  # fmt: skip
+    }
 
 
 def write_fit(
-    run: Path, shape: tuple[int, int], mask: Any, sets: tuple[str, ...], key: str, moving: bool,
+    run: Path,
+    shape: tuple[int, int],
+    mask: Any,
+    sets: tuple[str, ...],
+    key: str,
+    moving: bool,
     rng: Any,
-) -> None:  # fmt: skip
+) -> None:
     outputs = ["delta_x", "delta_y"] if len(sets) > 1 else ["delta_fringe"]
     facts = {name: set_facts(n) for n, name in enumerate(sets)}
     bad = mask != 0
@@ -163,29 +184,46 @@ def write_fit(
             )
             frames = rng.normal(size=(5, 60))
             columns = {
-                "time": 0.14 * np.arange(60), "B": 1 + 0.02 * frames[0], "A": 1 + 0.01 * frames[1],
-                "phi": rng.uniform(-np.pi, np.pi, 60), "dkx": 1e-6 * frames[2] * moving,
+                "time": 0.14 * np.arange(60),
+                "B": 1 + 0.02 * frames[0],
+                "A": 1 + 0.01 * frames[1],
+                "phi": rng.uniform(-np.pi, np.pi, 60),
+                "dkx": 1e-6 * frames[2] * moving,
                 "dky": 1e-6 * frames[3] * moving,
-            }  # fmt: skip
+            }
             for column, values in columns.items():
                 write_array(group / name / column, values, dims=("time",))
         write_json(
             made.folder / "fit.json",
-            {"schema": "pixcal/fit/1", "sets": facts, "outputs": outputs,
-             "sets_chi2_reduced": 1.0 if len(sets) > 2 else None},
-        )  # fmt: skip
+            {
+                "schema": "pixcal/fit/1",
+                "sets": facts,
+                "outputs": outputs,
+                "sets_chi2_reduced": 1.0 if len(sets) > 2 else None,
+            },
+        )
 
 
 def write_allan(run: Path, sets: tuple[str, ...]) -> None:
     frames = [8, 16, 24, 32, 64]
     law = [1.1e-3 / float(np.sqrt(n)) for n in frames]
     entry = {
-        "frames": frames, "seconds": [0.14 * n for n in frames], "adev_px": law,
-        "adev_err_px": [0.02 * v for v in law], "adev_lo_px": [0.98 * v for v in law],
-        "adev_hi_px": [1.02 * v for v in law], "white_expected_px": law, "slope": -0.5,
-        "slope_err": 0.01, "knee_frames": 40.0, "n_batches": 24, "batch_frames": 8, "gaps": 0,
-        "region": None, "warnings": ["short batches"],
-    }  # fmt: skip
+        "frames": frames,
+        "seconds": [0.14 * n for n in frames],
+        "adev_px": law,
+        "adev_err_px": [0.02 * v for v in law],
+        "adev_lo_px": [0.98 * v for v in law],
+        "adev_hi_px": [1.02 * v for v in law],
+        "white_expected_px": law,
+        "slope": -0.5,
+        "slope_err": 0.01,
+        "knee_frames": 40.0,
+        "n_batches": 24,
+        "batch_frames": 8,
+        "gaps": 0,
+        "region": None,
+        "warnings": ["short batches"],
+    }
     with build(run, "allan", 1, {}, {"fit": read_manifest(run / "fit").key}) as made:
         write_json(
             made.folder / "allan.json",
@@ -197,31 +235,64 @@ def write_diagnose(run: Path, verdict: str = "explained", effects: tuple[str, ..
     """A cause that ``effects`` names, or lag; and the curve that gave it away."""
     band = {"value": [0.0, 1.0], "low": [-0.1, 0.9], "high": [0.1, 1.1]}
     curve = {
-        "statistic": "contrast_by_step", "set": "one", "title": "contrast by step",
-        "kind": "linear", "domain": "time", "quantity": "slope", "unit": "",
-        "x_label": "frames before", "x": [1.0, 2.0],
-        "measured": [2.0, 1.0], "nominal": band, "with_effects": band, "z": [9.0, 0.0],
-        "z_after": [0.5, 0.0], "in_gap": True, "left": 0.0, "weight": 81.0, "size": 9.0,
+        "statistic": "contrast_by_step",
+        "set": "one",
+        "title": "contrast by step",
+        "kind": "linear",
+        "domain": "time",
+        "quantity": "slope",
+        "unit": "",
+        "x_label": "frames before",
+        "x": [1.0, 2.0],
+        "measured": [2.0, 1.0],
+        "nominal": band,
+        "with_effects": band,
+        "z": [9.0, 0.0],
+        "z_after": [0.5, 0.0],
+        "in_gap": True,
+        "left": 0.0,
+        "weight": 81.0,
+        "size": 9.0,
         "significance": 9.0,
         "significance_after": -37.0,
-    }  # fmt: skip
+    }
     cause = {
-        "effect": "lag", "title": "left behind", "parameters": {"share": 0.002},
-        "uncertainty": {"share": 1e-5}, "units": {"share": ""}, "strengths": ["share"],
-        "meanings": {"share": "share of the charge"}, "about": "Charge stays.",
-        "gap_closed": 0.97, "gap_closed_interval": [0.95, 0.98],
-        "gain_over_rest": 0.97, "p_value": 1e-30, "sigmas": 30.0, "why": NASTY,
+        "effect": "lag",
+        "title": "left behind",
+        "parameters": {"share": 0.002},
+        "uncertainty": {"share": 1e-5},
+        "units": {"share": ""},
+        "strengths": ["share"],
+        "meanings": {"share": "share of the charge"},
+        "about": "Charge stays.",
+        "gap_closed": 0.97,
+        "gap_closed_interval": [0.95, 0.98],
+        "gain_over_rest": 0.97,
+        "p_value": 1e-30,
+        "sigmas": 30.0,
+        "why": NASTY,
         "given_away_by": [{"statistic": "contrast_by_step", "set": "one"}],
-        "not_told_apart_from": [], "would_decide": [], "remedy": "flush the sensor",
+        "not_told_apart_from": [],
+        "would_decide": [],
+        "remedy": "flush the sensor",
         "on_map": {"rms_px": 0.0, "max_px": 0.0, "action": "not measured"},
-    }  # fmt: skip
+    }
     facts = {
-        "schema": "pixcal/diagnosis/1", "verdict": verdict, "statistics": 1, "candidates": [],
+        "schema": "pixcal/diagnosis/1",
+        "verdict": verdict,
+        "statistics": 1,
+        "candidates": [],
         "more_would_tell": ["dark frames"],
         "causes": [cause | {"effect": name} for name in effects or ("lag",)],
-        "gap": {"total": 1.0, "after": 0.03, "interval": [0.02, 0.05], "where": [], "absolute": [],
-                "domains": {"time": [1.0, 0.03]}},
-    }  # fmt: skip
+        "gap": {
+            "total": 1.0,
+            "after": 0.03,
+            "interval": [0.02, 0.05],
+            "where": [],
+            "absolute": [],
+            "domains": {"time": [1.0, 0.03]},
+        },
+    }
     inputs = {"reduce": read_manifest(run / "reduce").key}
     with build(
         run,
@@ -464,13 +535,28 @@ def browse(page: Path, folder: Path) -> tuple[Any, list[str]]:
     folder.mkdir()
     shot, log = folder / "page.png", folder / "net.json"
     subprocess.run(
-        ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
-         "--no-first-run", "--disable-background-networking", "--disable-component-update",
-         "--disable-sync", "--hide-scrollbars", "--host-resolver-rules=MAP * ~NOTFOUND",
-         f"--user-data-dir={folder / 'profile'}", f"--screenshot={shot}",
-         f"--log-net-log={log}", "--window-size=1200,3000", page.as_uri()],
-        check=True, capture_output=True, timeout=120,
-    )  # fmt: skip
+        [
+            "chromium",
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-quic",
+            "--no-first-run",
+            "--disable-background-networking",
+            "--disable-component-update",
+            "--disable-sync",
+            "--hide-scrollbars",
+            "--host-resolver-rules=MAP * ~NOTFOUND",
+            f"--user-data-dir={folder / 'profile'}",
+            f"--screenshot={shot}",
+            f"--log-net-log={log}",
+            "--window-size=1200,3000",
+            page.as_uri(),
+        ],
+        check=True,
+        capture_output=True,
+        timeout=120,
+    )
     asked = [event.get("params", {}) for event in json.loads(log.read_text())["events"]]
     # A page from a file has the origin "null"; the browser's own services have none.
     urls = [found["url"] for found in asked if found.get("initiator") == "null"]

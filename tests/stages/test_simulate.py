@@ -338,10 +338,29 @@ def test_the_truth_stays_out_of_the_acquisition(acq: Path) -> None:
     maps = {"delta_x", "delta_y", "response", "bias", "dark_rate", "mask"}
     assert kept == {f"{m}.fits" for m in maps} | {"truth.json", "bench.yaml", "manifest.json"}
     known = {
-        "DATE-OBS", "MJD-OBS", "TIMESYS", "EXPTIME", "CADENCE", "CCD-TEMP", "IMAGETYP", "OBJECT",
-        "INSTRUME", "ORIGIN", "SIMPLE", "BITPIX", "NAXIS", "NAXIS1", "NAXIS2", "NAXIS3", "BSCALE",
-        "BZERO", "XTENSION", "PCOUNT", "GCOUNT", "EXTNAME",
-    }  # fmt: skip
+        "DATE-OBS",
+        "MJD-OBS",
+        "TIMESYS",
+        "EXPTIME",
+        "CADENCE",
+        "CCD-TEMP",
+        "IMAGETYP",
+        "OBJECT",
+        "INSTRUME",
+        "ORIGIN",
+        "SIMPLE",
+        "BITPIX",
+        "NAXIS",
+        "NAXIS1",
+        "NAXIS2",
+        "NAXIS3",
+        "BSCALE",
+        "BZERO",
+        "XTENSION",
+        "PCOUNT",
+        "GCOUNT",
+        "EXTNAME",
+    }
     secrets = [b"918273645", b"564738291", b"391.7", b"7.31", b"4.19", b"rms", b"delta"]
     for name, data in contents(acq).items():
         if ".fits" in name:

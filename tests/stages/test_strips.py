@@ -72,9 +72,7 @@ def test_neither_source_nor_width_matters(
 
 def test_strips_are_neighbours_within_a_row() -> None:
     every = indices(SHAPE)
-    assert strips(every, 2) == [
-        ((0, 0), (0, 1)), ((0, 2),), ((1, 0), (1, 1)), ((1, 2),)
-    ]  # fmt: skip
+    assert strips(every, 2) == [((0, 0), (0, 1)), ((0, 2),), ((1, 0), (1, 1)), ((1, 2),)]
     assert strips([(0, 0), (0, 2), (1, 0)], 9) == [((0, 0),), ((0, 2),), ((1, 0),)]
 
 

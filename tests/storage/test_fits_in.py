@@ -307,9 +307,11 @@ def test_gzip_of_several_members_is_whole(tmp_path: Path) -> None:
 def test_altered_compressed_data_are_refused_when_unpacked(tmp_path: Path) -> None:
     for name, container in (("a.fits.gz", "plain"), ("b.fz", "tiles")):
         path = save(
-            tmp_path / name, samples("uint16", (67, 131)), container,
+            tmp_path / name,
+            samples("uint16", (67, 131)),
+            container,
             **({"compression_type": "GZIP_1"} if container == "tiles" else {}),
-        )  # fmt: skip
+        )
         whole = bytearray(path.read_bytes())
         at = len(whole) // 2
         whole[at : at + 64] = bytes(64)

@@ -11,9 +11,14 @@ _Drawn = dict[str, Any]
 
 
 @law(
-    "charge_transfer", "traps", 150, 5000, "e- that the traps of a column hold",
-    known=False, needs="pyxel",
-)  # fmt: skip
+    "charge_transfer",
+    "traps",
+    150,
+    5000,
+    "e- that the traps of a column hold",
+    known=False,
+    needs="pyxel",
+)
 def charge_transfer(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     """Charge captured by traps during its transfer to the output, and released later.
 
@@ -32,10 +37,17 @@ def charge_transfer(bench: Bench, size: float, rng: np.random.Generator) -> _Dra
     def transfers(e: F64, _: Frame) -> F64:
         return np.asarray(
             run_cdm_parallel(
-                np.ascontiguousarray(e), beta, volume, step, well, 1.2e7, release, density,
+                np.ascontiguousarray(e),
+                beta,
+                volume,
+                step,
+                well,
+                1.2e7,
+                release,
+                density,
                 np.array([1e-10]),
             )
-        )  # fmt: skip
+        )
 
     bench.charge.append(transfers)
     return {"release_rows": float(release[0] / step)}
@@ -84,9 +96,14 @@ def pixel_nonlinearity(bench: Bench, size: float, rng: np.random.Generator) -> _
 
 
 @law(
-    "mirror_crosstalk", "halves", 3e-4, 0.01, "of the mirrored pixel",
-    known=False, decidable=False,
-)  # fmt: skip
+    "mirror_crosstalk",
+    "halves",
+    3e-4,
+    0.01,
+    "of the mirrored pixel",
+    known=False,
+    decidable=False,
+)
 def mirror_crosstalk(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     """Coupling of two outputs that are read simultaneously, from both sides inwards.
 

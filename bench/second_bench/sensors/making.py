@@ -29,16 +29,23 @@ def make(
     sensor.declared_gain /= 2**sensor.shift
     good = ~sensor.defects
     truth = {
-        "kind": name, "seed": seed, "ladder": ladder, "bits": sensor.bits, "drawn": drawn,
+        "kind": name,
+        "seed": seed,
+        "ladder": ladder,
+        "bits": sensor.bits,
+        "drawn": drawn,
         "causes": _causes(own.cause),
-        "gain": sensor.gain / 2**sensor.shift, "declared_gain": sensor.declared_gain,
+        "gain": sensor.gain / 2**sensor.shift,
+        "declared_gain": sensor.declared_gain,
         "read_noise_e": float(
             np.sqrt(np.mean(sensor.read_noise_e[good] ** 2) + sensor.shared_e**2)
         ),
-        "bias_adu": float(np.median(sensor.bias_adu)), "well_e": sensor.well_e,
-        "top_e": sensor.top_e, "defects": np.flatnonzero(sensor.defects).tolist(),
+        "bias_adu": float(np.median(sensor.bias_adu)),
+        "well_e": sensor.well_e,
+        "top_e": sensor.top_e,
+        "defects": np.flatnonzero(sensor.defects).tolist(),
         "unclear": np.flatnonzero(sensor.unclear).tolist(),
-    }  # fmt: skip
+    }
     return sensor, truth
 
 

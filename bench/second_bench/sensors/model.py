@@ -149,10 +149,20 @@ def ordinary(
     offsets = rng.uniform(0, 1.5) * rng.standard_normal(shape)
     pixels = rng.lognormal(0, rng.uniform(0, 0.1), shape)
     sensor = Sensor(
-        rng, gain, gain * float(rng.uniform(0.98, 1.02)), bits, read * pixels,
-        np.maximum(bias + offsets, 8), response, dark, well_e, top_e, 0.001,
-        np.zeros(shape, np.bool_), np.zeros(shape, np.bool_),
-    )  # fmt: skip
+        rng,
+        gain,
+        gain * float(rng.uniform(0.98, 1.02)),
+        bits,
+        read * pixels,
+        np.maximum(bias + offsets, 8),
+        response,
+        dark,
+        well_e,
+        top_e,
+        0.001,
+        np.zeros(shape, np.bool_),
+        np.zeros(shape, np.bool_),
+    )
     sensor.declared_gain = gain
     biases, flats = counts
     sensor.series = [Series("bias", biases or int(rng.choice([20, 40, 100])), 0.0, 0.0)]

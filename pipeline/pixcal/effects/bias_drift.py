@@ -59,8 +59,15 @@ class BiasDrift(Effect):
     acts_at = Stage.READOUT
     order = 3
     domains = ("time", "noise")
-    strengths = ("jitter_rms", "ramp_e_h", "walk_e_h", "settle_e", "run_walk_e_h",
-                 "run_ramp_e_h", "tracks")  # fmt: skip
+    strengths = (
+        "jitter_rms",
+        "ramp_e_h",
+        "walk_e_h",
+        "settle_e",
+        "run_walk_e_h",
+        "run_ramp_e_h",
+        "tracks",
+    )
     absorbed_because = "the free intensity of each frame absorbs a level common to all pixels"
     frames_needed = ("dark",)
     remedy = "subtract the level of each frame, from dark or overscan pixels"
@@ -246,9 +253,13 @@ class BiasDrift(Effect):
             sigmas(log_chance_of_any(changes)),
             "levels of " + ", ".join(dict.fromkeys(s.name for s in every)) + " against time, beyond"
             " the noise of pixels, rows and columns",
-            {"noise_sigmas": sigmas(changes[0]), "settling_sigmas": sigmas(changes[1]),
-             "ramp_sigmas": sigmas(changes[2]), "ramp_over_walk_sigmas": steady},
-        )  # fmt: skip
+            {
+                "noise_sigmas": sigmas(changes[0]),
+                "settling_sigmas": sigmas(changes[1]),
+                "ramp_sigmas": sigmas(changes[2]),
+                "ramp_over_walk_sigmas": steady,
+            },
+        )
 
 
 def _all_series(evidence: Evidence) -> list[OffsetSeries]:

@@ -84,9 +84,12 @@ class CosmicHits(Effect):
         0.03, unit="/(cm² s)", low=0, high=1e7, doc="flux of particles through the detector"
     )
     readout_cm2: float = quantity(
-        0.0, unit="/cm²", low=0, high=1e7, doc="hits in each frame during the readout, in addition "
-        "to those of the exposure"
-    )  # fmt: skip
+        0.0,
+        unit="/cm²",
+        low=0,
+        high=1e7,
+        doc="hits in each frame during the readout, in addition to those of the exposure",
+    )
     electrons_per_um: float = quantity(
         70.0, unit="e-/um", above=0, high=1e4, doc="most probable charge per length of track"
     )
@@ -97,9 +100,12 @@ class CosmicHits(Effect):
         1.5, unit="um", above=0, high=100, doc="rms width of the charge cloud at collection"
     )
     spread: float = quantity(
-        0.0, low=0, high=3, doc="standard deviation of the logarithm of the charge per length, "
-        "from particle to particle"
-    )  # fmt: skip
+        0.0,
+        low=0,
+        high=3,
+        doc="standard deviation of the logarithm of the charge per length, "
+        "from particle to particle",
+    )
 
     def charge(self, charge: F32, shot: Shot) -> F32:
         detector = shot.bench.detector
@@ -120,9 +126,13 @@ class CosmicHits(Effect):
         return np.minimum(found, np.float32(full))
 
     def tracks(
-        self, rng: np.random.Generator, count: int, pitch_um: float, shape: tuple[int, int],
+        self,
+        rng: np.random.Generator,
+        count: int,
+        pitch_um: float,
+        shape: tuple[int, int],
         margin_px: int = MARGIN_PX,
-    ) -> F64:  # fmt: skip
+    ) -> F64:
         """Draw tracks by `pixcal.kernels.tracks.draw_tracks`, for pixels of a given pitch."""
         depth, electrons_per_px = self.thickness_um / pitch_um, self.electrons_per_um * pitch_um
         tracks = draw_tracks(rng, count, shape, margin_px, depth, electrons_per_px, _STRAGGLING)

@@ -46,9 +46,12 @@ class FringeJitter(Effect):
         (0.0, 0.0), unit="rad/px", low=0, high=0.1, doc="amplitude of the vibration along x and y"
     )
     vibration_hz: float = quantity(
-        20.3, unit="Hz", low=0, high=1e4, doc="frequency of the vibration; aliased below half "
-        "the frame rate"
-    )  # fmt: skip
+        20.3,
+        unit="Hz",
+        low=0,
+        high=1e4,
+        doc="frequency of the vibration; aliased below half the frame rate",
+    )
     along_x: tuple[Track, ...] = quantity((), unit="rad/px", doc="measured fast change of kx")
     along_y: tuple[Track, ...] = quantity((), unit="rad/px", doc="measured fast change of ky")
 

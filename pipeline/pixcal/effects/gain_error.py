@@ -63,9 +63,12 @@ class GainError(Effect):
     )
 
     relative: float = quantity(
-        0.03, low=-0.9, high=9.0, doc="true gain over the gain used, minus 1; the variance of "
-        "shot noise in ADU is smaller by as much"
-    )  # fmt: skip
+        0.03,
+        low=-0.9,
+        high=9.0,
+        doc="true gain over the gain used, minus 1; the variance of "
+        "shot noise in ADU is smaller by as much",
+    )
 
     def detector(self, maps: DetectorMaps, bench: Bench, rows: Rows) -> DetectorMaps:
         return replace(maps, dark_rate=maps.dark_rate * np.float32(1 + self.relative))
@@ -170,6 +173,14 @@ def _of_fringes(found: FringeEvidence) -> F64 | None:
     alike = np.cos(STEPS @ np.array([found.k[1], found.k[0]]))
     taken = (1 + (4 if np.any(found.dk) else 2) * alike) / pixels
     return residual_sums(
-        found.residual, found.model, found.shot_factor, found.read_variance,
-        found.good, of_time, of_pixels, taken, STEPS, CLIP,
-    )  # fmt: skip
+        found.residual,
+        found.model,
+        found.shot_factor,
+        found.read_variance,
+        found.good,
+        of_time,
+        of_pixels,
+        taken,
+        STEPS,
+        CLIP,
+    )

@@ -49,9 +49,12 @@ class IntensityNoise(Effect):
     )
     line: float = quantity(0.0, low=0, high=0.5, doc="relative amplitude of a periodic variation")
     line_hz: float = quantity(
-        100.0, unit="Hz", low=0, high=1e4, doc="frequency of the periodic variation, which "
-        "averages out in exposures of whole periods"
-    )  # fmt: skip
+        100.0,
+        unit="Hz",
+        low=0,
+        high=1e4,
+        doc="frequency of the periodic variation, which averages out in exposures of whole periods",
+    )
     ambient: tuple[float, ...] = quantity(
         (), low=0, high=0.9, doc="share of the light of each set that does not follow the laser"
     )

@@ -141,11 +141,14 @@ class Ipc(Effect):
         if kernel.per_ke:
             errors |= {f"couplings[{n}].per_ke": kernel.per_ke_error for n in range(len(sigma))}
         return Estimate(
-            cls(kernel.couplings), errors, kernel.significance, _why(kernel),
+            cls(kernel.couplings),
+            errors,
+            kernel.significance,
+            _why(kernel),
             {"covariance": kernel.covariance.tolist()},
             law=f"a kernel of {len(kernel.couplings)} couplings, all significant",
             in_full=cls(_worth_it(kernel.whole)) if kernel.whole else None,
-        )  # fmt: skip
+        )
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:

@@ -77,28 +77,40 @@ class Lag(Effect):
     )
 
     bands: tuple[float, ...] = quantity(
-        (), low=0, high=100, doc="factors of the share at signals from 0, 1/8, 1/4 and 1/2 of "
-        "level_e on; empty: the same share at all signals"
-    )  # fmt: skip
+        (),
+        low=0,
+        high=100,
+        doc="factors of the share at signals from 0, 1/8, 1/4 and 1/2 of "
+        "level_e on; empty: the same share at all signals",
+    )
     level_e: float = quantity(
         50_000.0, unit="e-", above=0, high=1e7, doc="signal that bands refers to"
     )
     later: tuple[float, ...] = quantity(
-        (), low=0, high=1, doc="parts of the lagging charge that appear 1, 2, ... frames later; "
-        "empty: an exponential decay over decay_frames"
-    )  # fmt: skip
+        (),
+        low=0,
+        high=1,
+        doc="parts of the lagging charge that appear 1, 2, ... frames later; "
+        "empty: an exponential decay over decay_frames",
+    )
     quiet: float = quantity(
         0.0, low=0, high=1, doc="part of the released charge without shot noise of its own"
     )
     capacity_e: float = quantity(
-        0.0, unit="e-", low=0, high=1e7, doc="largest charge that a pixel holds back, released "
-        "over decay_frames; 0: no limit"
-    )  # fmt: skip
+        0.0,
+        unit="e-",
+        low=0,
+        high=1e7,
+        doc="largest charge that a pixel holds back, released over decay_frames; 0: no limit",
+    )
 
     carried: float = quantity(
-        0.0, low=0, high=1, doc="part of the charge left by the last frame before a recording that "
-        "is still there when it begins; 0: the detector is cleared"
-    )  # fmt: skip
+        0.0,
+        low=0,
+        high=1,
+        doc="part of the charge left by the last frame before a recording that "
+        "is still there when it begins; 0: the detector is cleared",
+    )
 
     @property
     def releases(self) -> F64:

@@ -156,9 +156,14 @@ class Nonlinearity(Effect):
             # The last point lies beyond the flats.
             size = _size(bent.charge[-2], bent.change[-2], bent.error[-2])
             return Estimate(
-                cls(0.0, 0.0, found.level_e, tuple(map(Bend, *points))), named, *told, steps,
-                law="response curve of second and third order", by_law=effect, size=size,
-            )  # fmt: skip
+                cls(0.0, 0.0, found.level_e, tuple(map(Bend, *points))),
+                named,
+                *told,
+                steps,
+                law="response curve of second and third order",
+                by_law=effect,
+                size=size,
+            )
         if evidence.fringes and found.significance > SIGNIFICANT:
             part = central_crop(evidence)
             more, agreement = _bends(part, effect.response, found.chi2)
@@ -170,10 +175,14 @@ class Nonlinearity(Effect):
         named |= {f"bends[{n}].change_e": error for n, error in enumerate(more[1])}
         curve = replace(effect, bends=more[0])
         return Estimate(
-            replace(curve, bends=(*more[0], *_straight_on(curve, evidence))), named, *told,
-            law="response curve of second and third order", by_law=effect, refused=refused,
+            replace(curve, bends=(*more[0], *_straight_on(curve, evidence))),
+            named,
+            *told,
+            law="response curve of second and third order",
+            by_law=effect,
+            refused=refused,
             size=found.size,
-        )  # fmt: skip
+        )
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:

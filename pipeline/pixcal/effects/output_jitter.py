@@ -60,9 +60,12 @@ class OutputJitter(Effect):
         2.0, unit="e-", low=0, high=1e5, doc="white noise of an output's level, rms"
     )
     walk_e_h: float = quantity(
-        0.0, unit="e-/h^0.5", low=0, high=1e6, doc="random walk of an output's level, rms after an "
-        "hour"
-    )  # fmt: skip
+        0.0,
+        unit="e-/h^0.5",
+        low=0,
+        high=1e6,
+        doc="random walk of an output's level, rms after an hour",
+    )
     row_edges: tuple[int, ...] = quantity(
         (), unit="px", low=0, doc="first row of each output but the first, on the chip"
     )

@@ -72,9 +72,12 @@ class Quantisation(Effect):
         3.0, unit="ADU", low=0, high=4095, doc="step of the converter minus 1 ADU"
     )
     dnl_rms: float = quantity(
-        0.3, unit="codes", low=0, high=1, doc="scatter of the code widths (differential "
-        "nonlinearity)"
-    )  # fmt: skip
+        0.3,
+        unit="codes",
+        low=0,
+        high=1,
+        doc="scatter of the code widths (differential nonlinearity)",
+    )
     ripple: float = quantity(
         0.1,
         unit="codes",

@@ -66,9 +66,12 @@ class RollingShutter(Effect):
     )
 
     settling: tuple[float, ...] = quantity(
-        (), low=-1, high=1, doc="phase error as a share of the phase step, at equally spaced "
-        "rows from the first to the last of the window (none, or four and more)"
-    )  # fmt: skip
+        (),
+        low=-1,
+        high=1,
+        doc="phase error as a share of the phase step, at equally spaced "
+        "rows from the first to the last of the window (none, or four and more)",
+    )
     of_step: str = quantity(
         "last",
         choices=("last", "next"),
@@ -76,9 +79,12 @@ class RollingShutter(Effect):
         "one (next)",
     )
     origin_rad: float | None = quantity(
-        None, unit="rad", low=-10, high=10, doc="start of the modulator's range of 2 pi; default: "
-        "the phase takes the shorter way"
-    )  # fmt: skip
+        None,
+        unit="rad",
+        low=-10,
+        high=10,
+        doc="start of the modulator's range of 2 pi; default: the phase takes the shorter way",
+    )
 
     def check(self, bench: Bench) -> None:
         if 0 < len(self.settling) < FEWEST:
@@ -137,9 +143,15 @@ class RollingShutter(Effect):
         for of_rows in (lines, later):
             found.append(np.empty_like(light.iota))
             illuminate(
-                light.iota, light.alpha_sin, light.alpha_cos, states.level[shot.frame],
-                states.amplitude[shot.frame], columns, of_rows, found[-1],
-            )  # fmt: skip
+                light.iota,
+                light.alpha_sin,
+                light.alpha_cos,
+                states.level[shot.frame],
+                states.amplitude[shot.frame],
+                columns,
+                of_rows,
+                found[-1],
+            )
         return found[1] - found[0]
 
     def undo(self, maps: FringeMaps) -> FringeMaps | None:

@@ -87,13 +87,19 @@ class TelegraphNoise(Effect):
         0.5, unit="s", low=0, high=1e6, doc="mean time in a level; 0: independent in each frame"
     )
     amplitude_shape: float = quantity(
-        1.0, low=0.01, high=100, doc="shape of the gamma distribution of amplitudes; 1: "
-        "exponential, large: equal amplitudes"
-    )  # fmt: skip
+        1.0,
+        low=0.01,
+        high=100,
+        doc="shape of the gamma distribution of amplitudes; 1: "
+        "exponential, large: equal amplitudes",
+    )
     switching_decades: float = quantity(
-        0.0, low=0, high=6, doc="range of the mean times over pixels, uniform in the logarithm; "
-        "switching_s is the geometric mean"
-    )  # fmt: skip
+        0.0,
+        low=0,
+        high=6,
+        doc="range of the mean times over pixels, uniform in the logarithm; "
+        "switching_s is the geometric mean",
+    )
     upper: float = quantity(0.5, above=0, below=1, doc="share of the time in the upper level")
     measured: tuple[MeasuredPixels, ...] = quantity((), doc="pixels with levels of their own")
 
@@ -265,9 +271,12 @@ def _of_stack(stack: Stack, evidence: Evidence) -> Series | None:
         # The distribution of noise far below a converter step depends on the steps.
         return None
     return Series(
-        rest / spread, stack.frame, np.flatnonzero(pixels), spread,
+        rest / spread,
+        stack.frame,
+        np.flatnonzero(pixels),
+        spread,
         max(_period(stack.time_s), seconds),
-    )  # fmt: skip
+    )
 
 
 def _lit(evidence: Evidence, pixels: Indices) -> list[LitSeries]:

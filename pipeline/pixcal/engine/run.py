@@ -133,9 +133,14 @@ def run_tasks(
             from pixcal.engine.cluster import run_on_cluster
 
             run_on_cluster(
-                runtime.cluster, function, items, ended,
-                label=label, at_once=runtime.workers, quiet=runtime.quiet,
-            )  # fmt: skip
+                runtime.cluster,
+                function,
+                items,
+                ended,
+                label=label,
+                at_once=runtime.workers,
+                quiet=runtime.quiet,
+            )
         elif runtime.cluster == "processes":
             run_in_processes(function, items, runtime.n_workers, ended)
         elif runtime.cluster == "threads" and len(items) > 1:

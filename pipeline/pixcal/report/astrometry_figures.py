@@ -64,9 +64,14 @@ def _table(axes: Axes, view: AstrometryView) -> None:
     axes.set_axis_off()
     header = ["error of a star's centroid", "along", *LABELS.values(), "gain"]
     drawn = axes.table(
-        view.table, colLabels=header, cellLoc="left", colLoc="left", edges="horizontal",
-        colWidths=[0.21, 0.07, 0.3, 0.3, 0.12], bbox=Bbox.from_bounds(0.01, 0, 0.98, 1),
-    )  # fmt: skip
+        view.table,
+        colLabels=header,
+        cellLoc="left",
+        colLoc="left",
+        edges="horizontal",
+        colWidths=[0.21, 0.07, 0.3, 0.3, 0.12],
+        bbox=Bbox.from_bounds(0.01, 0, 0.98, 1),
+    )
     drawn.auto_set_font_size(False)
     drawn.set_fontsize(9)
     for (row, column), cell in drawn.get_celld().items():
@@ -106,9 +111,13 @@ def _against_electrons(axes: Axes, view: AstrometryView) -> None:
         errors = view.first["photons"][grid]
         if errors["px"] is not None:
             axes.errorbar(
-                view.result["stars"]["electrons"], errors["px"], yerr=errors["err_px"], fmt="o",
-                color=COLOURS[grid], ms=5,
-            )  # fmt: skip
+                view.result["stars"]["electrons"],
+                errors["px"],
+                yerr=errors["err_px"],
+                fmt="o",
+                color=COLOURS[grid],
+                ms=5,
+            )
     axes.axhline(view.target_px, color=GREEN, lw=1, label=f"target, {view.target_px:g} px")
     lowest = min([view.target_px, *(f for f in _floors(view).values() if f > 0)])
     axes.set_ylim(0.3 * lowest, 20 * float(photons[0]))
@@ -129,14 +138,23 @@ def _against_positions(axes: Axes, view: AstrometryView) -> None:
         if not known.any():
             continue
         axes.errorbar(
-            positions[known], px[known], yerr=error[known], fmt="o-", color=COLOURS[grid],
-            ms=4, lw=1, label=label,
-        )  # fmt: skip
+            positions[known],
+            px[known],
+            yerr=error[known],
+            fmt="o-",
+            color=COLOURS[grid],
+            ms=4,
+            lw=1,
+            label=label,
+        )
         first = np.flatnonzero(known)[0]
         axes.plot(
-            positions, px[first] * np.sqrt(positions[first] / positions), color=COLOURS[grid],
-            lw=0.8, ls=":",
-        )  # fmt: skip
+            positions,
+            px[first] * np.sqrt(positions[first] / positions),
+            color=COLOURS[grid],
+            lw=0.8,
+            ls=":",
+        )
         values += px[known].tolist()
     axes.axhline(view.target_px, color=GREEN, lw=1)
     axes.set_xscale("log", base=2)

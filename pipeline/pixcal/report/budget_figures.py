@@ -17,9 +17,15 @@ from pixcal.report.text import duration, number
 
 COLOURS = (BLUE, GREEN, *MARKS)
 CLOCK = {
-    10.0: "10 s", 60.0: "1 min", 600.0: "10 min", 3600.0: "1 h", 36000.0: "10 h",
-    8.64e4: "1 d", 8.64e5: "10 d", 8.64e6: "100 d",
-}  # fmt: skip
+    10.0: "10 s",
+    60.0: "1 min",
+    600.0: "10 min",
+    3600.0: "1 h",
+    36000.0: "10 h",
+    8.64e4: "1 d",
+    8.64e5: "10 d",
+    8.64e6: "100 d",
+}
 
 
 @dataclass(frozen=True)
@@ -92,9 +98,13 @@ def _precision(axes: Axes, result: Mapping[str, Any]) -> None:
         axes.plot(line.planned, reached, "o", color=colour, ms=8 + 3 * before)
     for line, colour, style in zip(joined, (INK, GREY), ("-", "--"), strict=False):
         axes.plot(
-            frames, line.median / np.sqrt(frames), color=colour, ls=style, lw=1.4,
+            frames,
+            line.median / np.sqrt(frames),
+            color=colour,
+            ls=style,
+            lw=1.4,
             label=f"{line.label}, frames of all sets",
-        )  # fmt: skip
+        )
     if wanted:
         axes.axhline(wanted, color=RED, lw=1.2)
         text = f"wanted {number(wanted)} px"
@@ -104,9 +114,15 @@ def _precision(axes: Axes, result: Mapping[str, Any]) -> None:
     if given:
         axes.axvline(given, color=RED, lw=1.2)
         note(
-            axes, f"{number(given)} frames of each set", (given, 0.02), (-5, 0), ha="right",
-            xycoords=("data", "axes fraction"), color=RED, fontsize=10,
-        )  # fmt: skip
+            axes,
+            f"{number(given)} frames of each set",
+            (given, 0.02),
+            (-5, 0),
+            ha="right",
+            xycoords=("data", "axes fraction"),
+            color=RED,
+            fontsize=10,
+        )
     axes.set(xscale="log", yscale="log", xlim=(frames[0], frames[-1]))
     plain_ticks(axes.xaxis, *axes.get_xlim(), most=9)
     plain_ticks(axes.yaxis, *axes.get_ylim(), most=9)

@@ -30,9 +30,15 @@ MARKS = ("#ff3d1f", "#ff3dc8", "#00a7e1", "#39c24a")
 
 # one colour for each bit of the flags
 FLAGS = {
-    1: "#d7301f", 2: "#54278f", 4: "#fdae33", 8: "#1f9ed1", 16: "#e377c2", 32: "#111111",
-    64: "#2ca25f", 128: "#8c510a",
-}  # fmt: skip
+    1: "#d7301f",
+    2: "#54278f",
+    4: "#fdae33",
+    8: "#1f9ed1",
+    16: "#e377c2",
+    32: "#111111",
+    64: "#2ca25f",
+    128: "#8c510a",
+}
 
 
 def _sampled(name: str) -> F64:
@@ -56,9 +62,17 @@ def _palette() -> bytes:
     """Every colour that the figures use, edges of lines and letters included, as RGB bytes."""
     solid = [to_rgb(c) for c in (*FLAGS.values(), *MARKS, SEVERAL, UNFLAGGED, MASKED, BAR, BAND)]
     parts = [
-        _DIVERGING, _SEQUENTIAL, _tints("#000000", 18), _tints(INK, 8), _tints(BLUE, 12),
-        _tints(RED, 12), _tints(GREEN, 8), _tints(GREY, 6), solid, [(1, 1, 1)],
-    ]  # fmt: skip
+        _DIVERGING,
+        _SEQUENTIAL,
+        _tints("#000000", 18),
+        _tints(INK, 8),
+        _tints(BLUE, 12),
+        _tints(RED, 12),
+        _tints(GREEN, 8),
+        _tints(GREY, 6),
+        solid,
+        [(1, 1, 1)],
+    ]
     colours = np.rint(255 * np.concatenate([np.asarray(p) for p in parts])).astype(np.uint8)
     assert len(colours) <= 256
     return bytes(colours)

@@ -77,17 +77,24 @@ def _against(axes: Axes, view: ComponentView) -> None:
     end = view.reach * unit.factor
     shown, colours = np.ma.masked_equal(view.picture, 0), SEQUENTIAL.with_extremes(bad="w")
     axes.imshow(
-        shown, origin="lower", extent=(-end, end, -end, end), cmap=colours,
-        norm=LogNorm(1, max(2, int(view.picture.max()))), interpolation="nearest",
-    )  # fmt: skip
+        shown,
+        origin="lower",
+        extent=(-end, end, -end, end),
+        cmap=colours,
+        norm=LogNorm(1, max(2, int(view.picture.max()))),
+        interpolation="nearest",
+    )
     line, slope = np.array([-end, end]), view.facts["slope"]
     axes.plot(line, line, color=GREY, ls="--", lw=1, label="equal")
     if slope is not None:
         axes.plot(line, slope * line, color=RED, lw=1.3, label=f"slope {slope:.3f}")
     axes.set(
-        xlim=(-end, end), ylim=(-end, end), title=f"{symbol}: pixels",
-        xlabel=f"{symbol} in 1 ({unit.label})", ylabel=f"{symbol} in 2 ({unit.label})",
-    )  # fmt: skip
+        xlim=(-end, end),
+        ylim=(-end, end),
+        title=f"{symbol}: pixels",
+        xlabel=f"{symbol} in 1 ({unit.label})",
+        ylabel=f"{symbol} in 2 ({unit.label})",
+    )
     axes.legend(fontsize=8, loc="upper left", framealpha=0.9)
 
 
@@ -120,9 +127,14 @@ def _scales(axes: Axes, view: ComponentView) -> None:
     ):
         if which.any():
             axes.errorbar(
-                at[which], line("px", key)[which], line("error_px", key)[which], fmt=marker,
-                color=colour, ms=6, label=label,
-            )  # fmt: skip
+                at[which],
+                line("px", key)[which],
+                line("error_px", key)[which],
+                fmt=marker,
+                color=colour,
+                ms=6,
+                label=label,
+            )
     axes.set_yscale("log")
     _round_off(axes, np.concatenate([expected, common[seen], difference]))
     names = [str(s["side_px"]) for s in scales]

@@ -149,9 +149,12 @@ def _extract(axes: Axes, view: CrestView, extract: Extract, title: str) -> None:
         on = every % 2 == odd
         axes.plot(x[on], y[on], "o", color=_colour(odd), ms=6, mec="white", mew=0.8, label=label)
     axes.set(
-        xlabel="x (px)", ylabel="y (px)", title=title, xlim=(x0 - 0.5, x0 + nx - 0.5),
+        xlabel="x (px)",
+        ylabel="y (px)",
+        title=title,
+        xlim=(x0 - 0.5, x0 + nx - 0.5),
         ylim=(y0 - 0.5, y0 + ny - 0.5),
-    )  # fmt: skip
+    )
     axes.legend(loc="upper right", fontsize=8, framealpha=0.9)
 
 

@@ -30,9 +30,12 @@ def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
     left.errorbar(level, variance, error, **style, label="pairs of flats")
     at = np.geomspace(level.min(), level.max(), 200)
     left.plot(
-        at, at / curve["gain"] + curve["read_variance"], color=INK, lw=1.2,
+        at,
+        at / curve["gain"] + curve["read_variance"],
+        color=INK,
+        lw=1.2,
         label=f"{curve['gain']:.4g} e⁻/ADU",
-    )  # fmt: skip
+    )
     if curve["read_variance"] > 0:
         left.axhline(curve["read_variance"], color=GREY, ls=":", label="read noise")
     left.set(xscale="log", yscale="log", ylabel="variance (ADU²)")
@@ -61,9 +64,13 @@ def nonuniformity(patterns: Mapping[str, Curves]) -> Figure:
     means.
     """
     figure, grid = axes_grid(
-        (WIDE, 2.6 * len(patterns) + 0.3), len(patterns), 3, right=0.1, beside=0.85,
+        (WIDE, 2.6 * len(patterns) + 0.3),
+        len(patterns),
+        3,
+        right=0.1,
+        beside=0.85,
         width_ratios=[1.3, 1, 1],
-    )  # fmt: skip
+    )
     for (spectrum, *profiles), (name, curves) in zip(grid, patterns.items(), strict=True):
         unit = str(curves["unit"]).replace("e-", "e⁻")
         _spectra(spectrum, curves)
@@ -112,8 +119,11 @@ def linearity(levels: Sequence[Mapping[str, Any]]) -> Figure:
     axes.plot(
         [v["level_e"] / 1e3 for v in used],
         [v["deviation_percent"] for v in used],
-        "o-", color=BLUE, lw=1.2, ms=6,
-    )  # fmt: skip
+        "o-",
+        color=BLUE,
+        lw=1.2,
+        ms=6,
+    )
     for level in left_out:
         axes.axvline(level["level_e"] / 1e3, color=INK, ls=":", lw=1)
     axes.margins(y=0.25)

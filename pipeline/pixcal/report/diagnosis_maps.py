@@ -88,9 +88,16 @@ def where_figure(
     """Maps side by side, in the nominal simulation and, below, with the causes."""
     rows = 1 + with_after
     figure, axes = axes_grid(
-        (WIDE * (1 + len(maps)) / 4, 0.9 + 3.0 * rows), rows, len(maps), left=0.95, top=0.6,
-        beside=0.3, between=0.25, sharex=True, sharey=True,
-    )  # fmt: skip
+        (WIDE * (1 + len(maps)) / 4, 0.9 + 3.0 * rows),
+        rows,
+        len(maps),
+        left=0.95,
+        top=0.6,
+        beside=0.3,
+        between=0.25,
+        sharex=True,
+        sharey=True,
+    )
     largest = min(max(panel.largest for panel in maps), LARGEST)
     scale = Normalize(-largest, largest)
     for row, words in zip(axes, ("nominal simulation", "with the causes"), strict=False):
@@ -118,9 +125,14 @@ def _draw(
         axes.add_patch(Rectangle((left, low), wide, high, fc=colour, ec="white", lw=1))
         dark = abs(scale(sigma) - 0.5) > 0.33
         axes.text(
-            left + wide / 2, low + high / 2, f"{sigma:.1f}".replace("-", "−"), ha="center",
-            va="center", fontsize=9, color="white" if dark else INK,
-        )  # fmt: skip
+            left + wide / 2,
+            low + high / 2,
+            f"{sigma:.1f}".replace("-", "−"),
+            ha="center",
+            va="center",
+            fontsize=9,
+            color="white" if dark else INK,
+        )
     axes.set(xlim=(-0.02 * nx, 1.02 * nx), ylim=(-0.02 * ny, 1.02 * ny), aspect="equal")
 
 

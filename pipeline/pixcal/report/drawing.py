@@ -119,9 +119,13 @@ def axes_grid(
     wide = (width - left - right - (columns - 1) * beside) / columns
     high = (height - bottom - top - (rows - 1) * between) / rows
     figure.subplots_adjust(
-        left / width, bottom / height, 1 - right / width, 1 - top / height,
-        beside / wide, between / high,
-    )  # fmt: skip
+        left / width,
+        bottom / height,
+        1 - right / width,
+        1 - top / height,
+        beside / wide,
+        between / high,
+    )
     return figure, figure.subplots(rows, columns, squeeze=False, **drawing)
 
 
@@ -142,9 +146,14 @@ def draw_map(
     ny, nx = summary.shape
     y0, x0 = start
     drawn = draw_blocks(
-        axes, summary.image * factor, summary.block, start, norm=scale.norm, cmap=scale.colours,
+        axes,
+        summary.image * factor,
+        summary.block,
+        start,
+        norm=scale.norm,
+        cmap=scale.colours,
         aspect="auto",
-    )  # fmt: skip
+    )
     axes.set(xlim=(x0 - 0.5, x0 + nx - 0.5), ylim=(y0 - 0.5, y0 + ny - 0.5))
     axes.locator_params(nbins=5)
     return drawn
@@ -155,9 +164,12 @@ def draw_blocks(
 ) -> ScalarMappable:
     """An image of blocks of pixels at its place, y upwards; the first is at ``start`` (y, x)."""
     return axes.imshow(
-        np.ma.masked_invalid(image), origin="lower", interpolation="nearest",
-        extent=covered(image.shape, side, start), **drawing,
-    )  # fmt: skip
+        np.ma.masked_invalid(image),
+        origin="lower",
+        interpolation="nearest",
+        extent=covered(image.shape, side, start),
+        **drawing,
+    )
 
 
 def note(

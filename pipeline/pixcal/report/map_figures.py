@@ -65,9 +65,15 @@ def offsets(
     beside.tick_params(labelleft=False)
     handles, labels = below.get_legend_handles_labels()
     figure.legend(
-        handles, labels, loc="upper left", frameon=False, fontsize=9.5, title="Means",
-        alignment="left", bbox_to_anchor=((left + width + 0.2) / WIDE, 1.85 / total),
-    )  # fmt: skip
+        handles,
+        labels,
+        loc="upper left",
+        frameon=False,
+        fontsize=9.5,
+        title="Means",
+        alignment="left",
+        bbox_to_anchor=((left + width + 0.2) / WIDE, 1.85 / total),
+    )
     numbers = (
         f"rms {delta.std * unit.factor:.3g}, robust {delta.robust_std * unit.factor:.3g}\n"
         f"median error {sigma.median * unit.factor:.3g}  ({unit.label})"
@@ -150,14 +156,22 @@ def _histogram(axes: Axes, offset: MapContents, unit: Unit, colour: str) -> None
     top = len(values) * (edges[1] - edges[0]) / (np.sqrt(2 * np.pi) * spread)
     normal = top * np.exp(-(((at - middle) / spread) ** 2) / 2)
     axes.plot(
-        at, np.maximum(normal, 0.1), color=colour, lw=1.0,
-        ls="--", label=f"normal, σ = {spread:.3g} (robust)",
-    )  # fmt: skip
+        at,
+        np.maximum(normal, 0.1),
+        color=colour,
+        lw=1.0,
+        ls="--",
+        label=f"normal, σ = {spread:.3g} (robust)",
+    )
     if np.isfinite(noise) and noise > 0:
         axes.axvspan(
-            middle - noise, middle + noise, color=colour, alpha=0.25, lw=0,
+            middle - noise,
+            middle + noise,
+            color=colour,
+            alpha=0.25,
+            lw=0,
             label=f"noise, ±1σ = ±{noise:.3g}",
-        )  # fmt: skip
+        )
 
 
 def power(maps: Sequence[MapContents], vectors: Mapping[str, tuple[float, float]]) -> Figure:

@@ -40,9 +40,12 @@ WITHOUT_FRINGES = ("diagnosis", "detector", "masks", "provenance")
 
 # functions that templates may use for figures, tables and text
 FIGURES = (
-    vars(map_figures) | vars(set_figures) | vars(detector_figures)
-    | vars(diagnosis_figures) | vars(diagnosis_maps)
-)  # fmt: skip
+    vars(map_figures)
+    | vars(set_figures)
+    | vars(detector_figures)
+    | vars(diagnosis_figures)
+    | vars(diagnosis_maps)
+)
 DATA = vars(tables) | vars(diagnosis) | vars(diagnosis_maps)
 
 
@@ -80,9 +83,12 @@ def _fill(template: str, contents: Contents, **values: Any) -> str:
     environment.filters["not_tested"] = text.not_tested
     environment.filters |= vars(verdict) | vars(diagnosis_words) | vars(tables)
     environment.globals |= {
-        "draw": _draw, "figures": FIGURES, "panels": vars(map_panels), "data": DATA,
+        "draw": _draw,
+        "figures": FIGURES,
+        "panels": vars(map_panels),
+        "data": DATA,
         "NAMES": text.NAMES,
-    }  # fmt: skip
+    }
     return environment.get_template(f"{template}.html.j2").render(run=contents, **values)
 
 

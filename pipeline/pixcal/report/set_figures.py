@@ -37,9 +37,14 @@ def temporal(sets: Sequence[SetContents]) -> Figure:
     moving = any(s.series.moving for s in sets)
     rows = 5 if moving else 3
     figure, grid = axes_grid(
-        (WIDE, 1.55 * (rows + 1) + 1.2), rows + 1, len(sets), left=0.95, beside=0.95, top=0.35,
+        (WIDE, 1.55 * (rows + 1) + 1.2),
+        rows + 1,
+        len(sets),
+        left=0.95,
+        beside=0.95,
+        top=0.35,
         between=0.5,
-    )  # fmt: skip
+    )
     for column, fringes in zip(grid.T, sets, strict=True):
         step = -(-len(fringes.series.time) // 6000)  # every n-th frame of longer runs
         time, clock = _clock(fringes.series.time[::step])
@@ -166,9 +171,17 @@ def allan_figure(sets: Mapping[str, tuple[Facts, Facts]]) -> Figure:
 
 
 def _allan_lines(
-    axes: Axes, below: Axes, name: str, measured: Facts, facts: Facts, curve: Mapping[str, F64],
-    unit: Unit, *, color: str, aside: float,
-) -> None:  # fmt: skip
+    axes: Axes,
+    below: Axes,
+    name: str,
+    measured: Facts,
+    facts: Facts,
+    curve: Mapping[str, F64],
+    unit: Unit,
+    *,
+    color: str,
+    aside: float,
+) -> None:
     """One set: points, square-root law, bound, knee; ``aside`` shifts its points."""
     frames, adev, white = curve["frames"], curve["adev_px"], curve["white_expected_px"]
     low, high = curve["adev_lo_px"], curve["adev_hi_px"]
@@ -192,9 +205,12 @@ def _allan_lines(
         for each in (axes, below):
             each.axvline(knee, color=color, ls=":", lw=1.4)
         axes.annotate(
-            f" knee: {knee:.0f} frames", (knee, 0.04), xycoords=("data", "axes fraction"),
-            fontsize=10, color=color,
-        )  # fmt: skip
+            f" knee: {knee:.0f} frames",
+            (knee, 0.04),
+            xycoords=("data", "axes fraction"),
+            fontsize=10,
+            color=color,
+        )
 
 
 def _add_clock(axes: Axes, frames: F64, seconds: F64) -> None:

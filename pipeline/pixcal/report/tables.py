@@ -33,9 +33,16 @@ _LADDER = {
     "deviation_percent": ("deviation (%)", 2),
 }
 _REDUCTION_SHOWN = (
-    "schema", "warnings", "flags", "figures_of_merit", "gain_e_per_adu", "read_noise_e",
-    "linearity", "sets", "quantisation",
-)  # fmt: skip
+    "schema",
+    "warnings",
+    "flags",
+    "figures_of_merit",
+    "gain_e_per_adu",
+    "read_noise_e",
+    "linearity",
+    "sets",
+    "quantisation",
+)
 
 
 @dataclass(frozen=True)
@@ -251,9 +258,16 @@ def _frames(arrays: Mapping[str, Mapping[str, Any]]) -> Table:
             ]
         )
     header = [
-        "array", "files", "frames", "x × y", "first frame (UTC)", "duration", "exposures (s)", "°C",
+        "array",
+        "files",
+        "frames",
+        "x × y",
+        "first frame (UTC)",
+        "duration",
+        "exposures (s)",
+        "°C",
         "times from",
-    ]  # fmt: skip
+    ]
     return Table("Frames", header, rows)
 
 

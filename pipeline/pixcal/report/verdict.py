@@ -99,8 +99,15 @@ def cards(contents: Contents) -> Iterator[Card]:
 def _detector_cards(facts: dict[str, Any]) -> Iterator[Card]:
     """Key numbers of a data sheet."""
     figures = facts.get("figures_of_merit") or {}
-    for key in ("conversion_gain", "read_noise", "full_well", "dynamic_range", "dsnu", "prnu",
-                "dark_current"):  # fmt: skip
+    for key in (
+        "conversion_gain",
+        "read_noise",
+        "full_well",
+        "dynamic_range",
+        "dsnu",
+        "prnu",
+        "dark_current",
+    ):
         if key in figures:
             f = figures[key]
             value = f"{with_error(f['value'], f['error'])} {unit(f['unit'])}"

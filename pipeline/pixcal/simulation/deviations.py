@@ -249,9 +249,15 @@ class SetDeviations(_Deviations):
             beside = found.model.copy()
             beside[:, good] += changed - found.g.astype(np.float32) @ share
             (free, _), *_ = free_frames(
-                beside, Coding(1.0, 0.0, NO_SAMPLE), found.g, found.dk, found.theta,
-                found.read_variance, found.shot_factor, good,
-            )  # fmt: skip
+                beside,
+                Coding(1.0, 0.0, NO_SAMPLE),
+                found.g,
+                found.dk,
+                found.theta,
+                found.read_variance,
+                found.shot_factor,
+                good,
+            )
             own = np.hstack([found.g, found.dk])
             change["frames"] = self._series(free) - self._series(own)
         if "maps" in names:

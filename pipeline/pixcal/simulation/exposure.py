@@ -154,9 +154,15 @@ class _Chain:
         states, shape = self.states, self.camera.bench.detector.shape
         columns, lines = states.turns(frame, shape, self.camera.rows, reach)
         synthesis.illuminate(
-            light.iota, light.alpha_sin, light.alpha_cos,
-            states.level[frame], states.amplitude[frame], columns, lines, out,
-        )  # fmt: skip
+            light.iota,
+            light.alpha_sin,
+            light.alpha_cos,
+            states.level[frame],
+            states.amplitude[frame],
+            columns,
+            lines,
+            out,
+        )
         return out
 
     def beyond(self, frame: int, reach: int) -> F32:

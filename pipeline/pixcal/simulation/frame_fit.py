@@ -149,10 +149,13 @@ class FrameBasis:
             [w.series for w in self.every],
             lambda s: np.stack([part[self._number[id(s)]] for part in parts]),
             lambda s: np.concatenate(
-                [*(v[self._number[id(s)]][..., None] for v in known),
-                 self._shapes[self._number[id(s)]]], axis=2,
+                [
+                    *(v[self._number[id(s)]][..., None] for v in known),
+                    self._shapes[self._number[id(s)]],
+                ],
+                axis=2,
             ),
-        )  # fmt: skip
+        )
         if start is not None and len(start.size) != len(modes.start):
             start = None
         return estimate_components(modes, (), start, steps)

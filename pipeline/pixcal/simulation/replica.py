@@ -128,11 +128,15 @@ def _fitted(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Fitted:
     each = (*delta, response, np.nan_to_num(evidence.bias), np.maximum(rate, 0))
     dx, dy, relative, bias, dark = (values.astype(np.float32) for values in each)
     maps = DetectorMaps(
-        dx, dy, relative, bias, dark,
+        dx,
+        dy,
+        relative,
+        bias,
+        dark,
         np.full(shape, evidence.amplifier_noise, np.float32),
         np.full(shape, 1 / evidence.gain, np.float32),
         np.where(evidence.good, 0, 1).astype(np.uint8),
-    )  # fmt: skip
+    )
     theta = tuple(filled(np.where(s.good, s.theta, np.nan), s.k) for s in sets)
     return Fitted(maps, theta, tuple(s.k for s in sets), tuple(_states(s) for s in sets))
 
@@ -177,9 +181,17 @@ def _starts(evidence: Evidence, sets: Sequence[FringeEvidence]) -> dict[str | in
 def _of_set(bench: Bench, number: int, found: FringeEvidence, start_s: float) -> Recording:
     exposure = found.exptime_s if np.isfinite(found.exptime_s) else 0.0
     return Recording(
-        bench, "fringes", number, found.name, found.name, int(found.frame[-1]) + 1, exposure,
-        start_s, _period(found.time_s), 1.0,
-    )  # fmt: skip
+        bench,
+        "fringes",
+        number,
+        found.name,
+        found.name,
+        int(found.frame[-1]) + 1,
+        exposure,
+        start_s,
+        _period(found.time_s),
+        1.0,
+    )
 
 
 def _of_stack(
@@ -194,9 +206,17 @@ def _of_stack(
         electrons = float(np.median(light)) if light.size else 0.0
     count = int(np.ptp(stack.frame)) + 1
     return Recording(
-        bench, stack.kind, number, stack.kind, stack.kind, count, exposure, start_s,
-        _period(stack.time_s), electrons,
-    )  # fmt: skip
+        bench,
+        stack.kind,
+        number,
+        stack.kind,
+        stack.kind,
+        count,
+        exposure,
+        start_s,
+        _period(stack.time_s),
+        electrons,
+    )
 
 
 def _bench(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Bench:

@@ -82,9 +82,14 @@ def create_map(
     many = (number,) * (number > 0)
     dims = ("batch", "y", "x")[-2 - len(many) :]
     return create_array(
-        path, (*many, *shape), "<f4", dims=dims, chunks=(*many, *chunks), fill_value=np.nan,
+        path,
+        (*many, *shape),
+        "<f4",
+        dims=dims,
+        chunks=(*many, *chunks),
+        fill_value=np.nan,
         attrs={"units": units} if units else None,
-    )  # fmt: skip
+    )
 
 
 # Cached: many arrays are alike, and zarr-python takes a millisecond for each.

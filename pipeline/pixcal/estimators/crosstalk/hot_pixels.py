@@ -160,8 +160,11 @@ def hot_pixels(
     rest = rest - got
     charge = rest[y, x]
     step = np.array(links)
-    at = (slice(None), REACH + np.stack([step[:, 0], -step[:, 0]], 1),
-          REACH + np.stack([step[:, 1], -step[:, 1]], 1))  # fmt: skip
+    at = (
+        slice(None),
+        REACH + np.stack([step[:, 0], -step[:, 0]], 1),
+        REACH + np.stack([step[:, 1], -step[:, 1]], 1),
+    )
     around, clean = _patches(rest, warm, y, x, OVERLAP_KNOWN if known else OVERLAP)
     others = _surroundings(got, y, x, REACH)[at] / charge[:, None, None] - shares
     value = around[at] / charge[:, None, None] + shares

@@ -100,6 +100,10 @@ def sums_of(values: F32 | F64, classes: PixelClasses) -> F64:
     """Sums (..., class) of maps (..., y, x) over the pixels of each class."""
     (n, m), (y, x) = (classes.rows, classes.columns), classes.first
     return np.stack(
-        [values[..., (a - y) % n :: n, (b - x) % m :: m].sum((-2, -1), dtype=float)
-         for a in range(n) for b in range(m)], -1
-    )  # fmt: skip
+        [
+            values[..., (a - y) % n :: n, (b - x) % m :: m].sum((-2, -1), dtype=float)
+            for a in range(n)
+            for b in range(m)
+        ],
+        -1,
+    )

@@ -114,9 +114,15 @@ def _of_set(
     visibility, spread = _clipped(log_visibility(theta, good), smooth)
     noise = float(np.median(found.sigma[good])) / k
     return _Pattern(
-        np.array(found.k) / k, members @ delta, members @ visibility, noise, scatter, spread,
-        response_slopes(found.k, couplings, classes), k,
-    )  # fmt: skip
+        np.array(found.k) / k,
+        members @ delta,
+        members @ visibility,
+        noise,
+        scatter,
+        spread,
+        response_slopes(found.k, couplings, classes),
+        k,
+    )
 
 
 def _clipped(values: F64, modes: F64) -> tuple[F64, float]:

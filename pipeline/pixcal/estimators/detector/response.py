@@ -53,9 +53,12 @@ def fit_response(
         value[-1], information[-1] = known_shift[0] / UNIT, UNIT**2 / known_shift[1]
         prior = value, information
     sizes, covariance, _ = fit_distortions(
-        tuple(evidence.fringes.values()), _signal_of(evidence, level_e, [UNIT * shifts]),
-        powers + 1, margin=REACH, prior=prior,
-    )  # fmt: skip
+        tuple(evidence.fringes.values()),
+        _signal_of(evidence, level_e, [UNIT * shifts]),
+        powers + 1,
+        margin=REACH,
+        prior=prior,
+    )
     scale = np.ones(powers + 1)
     scale[-1] = UNIT
     return sizes * scale, covariance * np.outer(scale, scale)

@@ -157,10 +157,17 @@ def _products_of(stack: Stack, evidence: Evidence) -> F64 | None:
     # Noise that every second row shares does not average out over few frames.
     residual = without_line_means(frames - brighter, good)
     return residual_sums(
-        residual, usual + brighter, ones, evidence.read_noise**2 * ones, good,
-        np.ones((len(frames), 1)), (noise / len(frames))[None], np.full(len(STEPS), 1 / pixels),
-        STEPS, CLIP,
-    )  # fmt: skip
+        residual,
+        usual + brighter,
+        ones,
+        evidence.read_noise**2 * ones,
+        good,
+        np.ones((len(frames), 1)),
+        (noise / len(frames))[None],
+        np.full(len(STEPS), 1 / pixels),
+        STEPS,
+        CLIP,
+    )
 
 
 def _shared_steps(evidence: Evidence) -> Mask:

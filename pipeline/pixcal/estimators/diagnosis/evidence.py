@@ -99,9 +99,15 @@ class FringeEvidence:
         """
         codes = np.where(np.isnan(self.electrons), np.float32(NO_SAMPLE), self.electrons)
         _, *halves = free_frames(
-            codes, Coding(1.0, 0.0, NO_SAMPLE), self.g, self.dk, self.theta, self.read_variance,
-            self.shot_factor, self.good,
-        )  # fmt: skip
+            codes,
+            Coding(1.0, 0.0, NO_SAMPLE),
+            self.g,
+            self.dk,
+            self.theta,
+            self.read_variance,
+            self.shot_factor,
+            self.good,
+        )
         return halves[0], halves[1]
 
 
@@ -262,12 +268,20 @@ def free_frames(
         packed, right = np.zeros((n, 15)), np.zeros((n, 5))
         samples = np.take(codes.reshape(n, -1), used, axis=1).astype(np.float32, copy=False)
         frame_sums(
-            samples, coding.scale, coding.offset, coding.fill,
-            start, turned, y[good].astype(np.float32), x[good].astype(np.float32),
+            samples,
+            coding.scale,
+            coding.offset,
+            coding.fill,
+            start,
+            turned,
+            y[good].astype(np.float32),
+            x[good].astype(np.float32),
             np.ascontiguousarray(theta[:, good], np.float32),
-            read_variance[good].astype(np.float32), shot_factor[good].astype(np.float32),
-            packed, right,
-        )  # fmt: skip
+            read_variance[good].astype(np.float32),
+            shot_factor[good].astype(np.float32),
+            packed,
+            right,
+        )
         return packed, right
 
     def solved(packed: F64, right: F64) -> FreeFrames:

@@ -105,9 +105,14 @@ def find_hopping(
     ramps, errors = np.array([s.ramp(size) for s in every]).T
     weight = errors**-2
     return Hopping(
-        size, abs(size) * _error(of_size, step), rate, rate_error,
-        tuple(s.noise for s in every), float(ramps @ weight / weight.sum()), weight.sum() ** -0.5,
-    )  # fmt: skip
+        size,
+        abs(size) * _error(of_size, step),
+        rate,
+        rate_error,
+        tuple(s.noise for s in every),
+        float(ramps @ weight / weight.sum()),
+        weight.sum() ** -0.5,
+    )
 
 
 def _error(likelihood: Callable[[float], float], step: float) -> float:

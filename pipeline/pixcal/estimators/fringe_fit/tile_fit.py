@@ -92,9 +92,18 @@ class PixelSums:
         stops = sorted(inside | {*range(MOST_FRAMES, len(codes), MOST_FRAMES), len(codes)})
         closes = [self._cuts.get(first + stop, GOES_ON) for stop in stops]
         sweep_batches(
-            codes, *self._coding, self._g[first:last], self._dk[first:last], *self._fixed,
-            np.array(stops), np.array(closes), self._part, self._total, self.turn, self.sigma,
-        )  # fmt: skip
+            codes,
+            *self._coding,
+            self._g[first:last],
+            self._dk[first:last],
+            *self._fixed,
+            np.array(stops),
+            np.array(closes),
+            self._part,
+            self._total,
+            self.turn,
+            self.sigma,
+        )
         self.position = last
 
     @property

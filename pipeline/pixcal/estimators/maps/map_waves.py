@@ -177,9 +177,12 @@ def _strongest(maps: Maps, allowed: Mapping[str, Mask], in_flats: bool) -> Waves
         # Equal ghosts of both fibres change neither visibility nor phase.
         significance = float(first)
     return Waves(
-        tuple(waves), in_flats, significance,
-        tuple(kind for kind in order if by_map[kind] > SIGNIFICANT) or tuple(order[:2]), by_map,
-    )  # fmt: skip
+        tuple(waves),
+        in_flats,
+        significance,
+        tuple(kind for kind in order if by_map[kind] > SIGNIFICANT) or tuple(order[:2]),
+        by_map,
+    )
 
 
 def _less(maps: Maps, waves: Sequence[WaveFit]) -> Maps:
@@ -274,10 +277,16 @@ def _fitted(
         s, f, b = (complex(*six[6 * n : 6 * n + 6][part]) for part in (STATIC, FORWARD, BACKWARD))
         own_errors = errors[6 * n : 6 * n + 6]
         spread = [float(own_errors[part].max()) for part in (STATIC, FORWARD, BACKWARD)]
-        waves.append(WaveFit(
-            name, (float(q[0]), float(q[1])), s, f, b,
-            (spread[0], spread[1], spread[2], float(errors[size]), float(errors[size + 1])),
-        ))  # fmt: skip
+        waves.append(
+            WaveFit(
+                name,
+                (float(q[0]), float(q[1])),
+                s,
+                f,
+                b,
+                (spread[0], spread[1], spread[2], float(errors[size]), float(errors[size + 1])),
+            )
+        )
     return waves, q
 
 

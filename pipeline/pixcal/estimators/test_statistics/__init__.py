@@ -77,9 +77,18 @@ def statistic(
         of_set = sets and not together
         name = getattr(measure, "__name__", "")
         return Statistic(
-            name, title, domain, quantity, unit, x, kind, of_set, together, floor,
+            name,
+            title,
+            domain,
+            quantity,
+            unit,
+            x,
+            kind,
+            of_set,
+            together,
+            floor,
             measure,
-        )  # fmt: skip
+        )
 
     return mark
 

@@ -116,10 +116,13 @@ def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
 
 
 @statistic(
-    "time", "change of the bias: spatial spectrum", "noise / expected noise",
+    "time",
+    "change of the bias: spatial spectrum",
+    "noise / expected noise",
     x="band, then two rows, two columns",
-    power=True, sets=False,
-)  # fmt: skip
+    power=True,
+    sets=False,
+)
 def bias_change(evidence: Evidence) -> Curve | None:
     """Power of the change from the first half of the frames to the second, over that of noise."""
     stacks = [s for s in repeated(evidence, "bias") if len(s.adu) >= 4]
@@ -153,27 +156,42 @@ def _neighbours(evidence: Evidence, kind: str, steps: slice) -> Curve | None:
 
 
 @family(
-    "{0}_neighbours", KINDS, "noise", "correlation of adjacent pixels in {0} frames",
-    "correlation", x="neighbour", sets=False,
-)  # fmt: skip
+    "{0}_neighbours",
+    KINDS,
+    "noise",
+    "correlation of adjacent pixels in {0} frames",
+    "correlation",
+    x="neighbour",
+    sets=False,
+)
 def neighbours(kind: str, evidence: Evidence) -> Curve | None:
     """Correlation of pixels that touch, where most crosstalk is."""
     return _neighbours(evidence, kind, slice(ADJACENT))
 
 
 @family(
-    "{0}_far_neighbours", KINDS, "noise", "correlation of pixels further apart in {0} frames",
-    "correlation", x="far neighbour", sets=False,
-)  # fmt: skip
+    "{0}_far_neighbours",
+    KINDS,
+    "noise",
+    "correlation of pixels further apart in {0} frames",
+    "correlation",
+    x="far neighbour",
+    sets=False,
+)
 def far_neighbours(kind: str, evidence: Evidence) -> Curve | None:
     """Correlation of pixels two to four rows or columns apart."""
     return _neighbours(evidence, kind, slice(ADJACENT, None))
 
 
 @family(
-    "{0}_line_repeats", KINDS, "noise", "correlated row and column noise in {0} frames",
-    "correlation", x="distance: rows, then columns", sets=False,
-)  # fmt: skip
+    "{0}_line_repeats",
+    KINDS,
+    "noise",
+    "correlated row and column noise in {0} frames",
+    "correlation",
+    x="distance: rows, then columns",
+    sets=False,
+)
 def line_repeats(kind: str, evidence: Evidence) -> Curve | None:
     """Correlation of the means of lines some lines apart."""
     stacks = repeated(evidence, kind)

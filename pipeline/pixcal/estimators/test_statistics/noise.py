@@ -246,9 +246,15 @@ def hot_neighbours(evidence: Evidence) -> Curve | None:
 
 
 @family(
-    "lines_of_{0}", (("bias",), ("dark",)), "noise", "row and column noise in {0} frames",
-    "noise / white noise", x="rows, columns", power=True, sets=False,
-)  # fmt: skip
+    "lines_of_{0}",
+    (("bias",), ("dark",)),
+    "noise",
+    "row and column noise in {0} frames",
+    "noise / white noise",
+    x="rows, columns",
+    power=True,
+    sets=False,
+)
 def lines_of_stacks(kind: str, evidence: Evidence) -> Curve | None:
     """Of frames without light."""
     stacks = [s for s in evidence.of_kind(kind) if len(s.adu) >= 3]

@@ -57,18 +57,29 @@ def strongest(sizes: F64) -> float:
 
 
 @statistic(
-    "noise", "strongest tone in fringe frames", "significance", unit="σ", x="cycles a pixel",
+    "noise",
+    "strongest tone in fringe frames",
+    "significance",
+    unit="σ",
+    x="cycles a pixel",
     floor=FLOOR,
-)  # fmt: skip
+)
 def tone(look: Look) -> Curve:
     """Of the residuals."""
     return tone_sigmas(look.residual[:: look.thinned], look.good)
 
 
 @family(
-    "{0}_tone", KINDS, "noise", "strongest tone in {0} frames", "significance", unit="σ",
-    x="cycles a pixel", floor=FLOOR, sets=False,
-)  # fmt: skip
+    "{0}_tone",
+    KINDS,
+    "noise",
+    "strongest tone in {0} frames",
+    "significance",
+    unit="σ",
+    x="cycles a pixel",
+    floor=FLOOR,
+    sets=False,
+)
 def tones(kind: str, evidence: Evidence) -> Curve | None:
     """Of the differences of two frames."""
     noise = _all_differences(kind, evidence)
@@ -83,9 +94,13 @@ def smooth_patterns(look: Look) -> Curve:
 
 
 @family(
-    "{0}_smooth_patterns", KINDS, "time", "smooth patterns that vary over {0} frames",
-    "strongest / noise of one frame", sets=False,
-)  # fmt: skip
+    "{0}_smooth_patterns",
+    KINDS,
+    "time",
+    "smooth patterns that vary over {0} frames",
+    "strongest / noise of one frame",
+    sets=False,
+)
 def smooth_patterns_of(kind: str, evidence: Evidence) -> Curve | None:
     """The same of the differences of two frames."""
     noise = _all_differences(kind, evidence)

@@ -144,18 +144,31 @@ def first_flats(evidence: Evidence) -> Curve | None:
 
 
 @family(
-    "{0}_of_frames", SERIES, "time", "{1}: spectrum over the frames", "{2}", unit="{3}",
-    x="cycles a frame", power=True,
-)  # fmt: skip
+    "{0}_of_frames",
+    SERIES,
+    "time",
+    "{1}: spectrum over the frames",
+    "{2}",
+    unit="{3}",
+    x="cycles a frame",
+    power=True,
+)
 def series_of_frames(name: str, look: Look) -> Curve:
     """Mean squares of a parameter of the frames."""
     return power_of(look.frames[name])
 
 
 @family(
-    "{0}_of_frames", STACKS, "time", "mean of {0} frames: spectrum", "{1}", unit="{2}",
-    x="bin of frequency", power=True, sets=False,
-)  # fmt: skip
+    "{0}_of_frames",
+    STACKS,
+    "time",
+    "mean of {0} frames: spectrum",
+    "{1}",
+    unit="{2}",
+    x="bin of frequency",
+    power=True,
+    sets=False,
+)
 def means_of_frames(kind: str, evidence: Evidence) -> Curve | None:
     """Mean squares of the means of calibration frames; of flats, over their light."""
     every = evidence.ladder if kind == "flat" else evidence.of_kind(kind)

@@ -166,9 +166,14 @@ def _write_maps(
     (cy, cx), shape = batches.chunks, batches.window
     chunks = (TILES_HIGH * cy, cx)
     adev = create_array(
-        folder / "adev", (len(lengths), *shape), "<f4", dims=("length", "y", "x"),
-        chunks=(1, *chunks), fill_value=np.nan, attrs={"units": "pixel"},
-    )  # fmt: skip
+        folder / "adev",
+        (len(lengths), *shape),
+        "<f4",
+        dims=("length", "y", "x"),
+        chunks=(1, *chunks),
+        fill_value=np.nan,
+        attrs={"units": "pixel"},
+    )
     expected = create_map(folder / "expected", shape, chunks, units="pixel")
     squares = batches.tiles((0, shape[0], 0, shape[1]), TILES_HIGH)
     steps = {f"{name}:{y[0]},{x[0]}": (y, x) for y, x in squares}

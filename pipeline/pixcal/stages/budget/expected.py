@@ -149,9 +149,17 @@ def frame_rms(bench: Bench, number: int) -> tuple[float, float]:
     scan, f = replace(bench.frames.fringes[number], count=FRAMES_DRAWN), bench.frames
     sets = (*f.fringes[:number], scan, *f.fringes[number + 1 :])
     drawn = Recording(
-        replace(bench, frames=replace(f, fringes=sets)), "fringes", number, scan.name, scan.name,
-        scan.count, f.exptime_s, 0.0, f.period_s, 1.0,
-    )  # fmt: skip
+        replace(bench, frames=replace(f, fringes=sets)),
+        "fringes",
+        number,
+        scan.name,
+        scan.name,
+        scan.count,
+        f.exptime_s,
+        0.0,
+        f.period_s,
+        1.0,
+    )
     states = states_of(drawn, own_effects(bench, "bench"))
     contrast = states.amplitude / np.maximum(states.level, DARKNESS)
     return float(states.level.std()), float(contrast.std() / contrast.mean())

@@ -83,9 +83,13 @@ def correct_sweep(swept: Swept, target: Path, runtime: Runtime, name: str) -> No
     writers |= _create(target, swept, ("batch_phase", "batch_sigma"), len(variants))
     width = TileSums.width(len(variants))
     writers["sums"] = create_array(
-        target / "sums", (*swept.source.grid, width), "<f8", dims=("row", "column", "fact"),
-        chunks=(1, 1, width), fill_value=np.nan,
-    )  # fmt: skip
+        target / "sums",
+        (*swept.source.grid, width),
+        "<f8",
+        dims=("row", "column", "fact"),
+        chunks=(1, 1, width),
+        fill_value=np.nan,
+    )
     fitting = within_memory(f"correction of {name}", task_bytes(swept), 0, runtime)
     task = partial(_correct_tile, swept, target, writers)
     run_tasks(task, tiles, fitting, label=f"correct {name}")

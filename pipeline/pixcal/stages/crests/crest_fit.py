@@ -125,9 +125,17 @@ def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior | None = None) -
             break
     root = chain @ np.linalg.pinv(solved.jac, rcond=1e-13)[1:]
     return CrestFit(
-        geometry, float(solved.x[0]), root @ root.T, used, residual,
-        float((residual[used] ** 2).sum()), chi2, spread, int(solved.nfev), prior,
-    )  # fmt: skip
+        geometry,
+        float(solved.x[0]),
+        root @ root.T,
+        used,
+        residual,
+        float((residual[used] ** 2).sum()),
+        chi2,
+        spread,
+        int(solved.nfev),
+        prior,
+    )
 
 
 DISTANCE, LENGTH, ANGLE = 2, 3, 4

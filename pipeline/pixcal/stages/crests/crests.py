@@ -157,9 +157,16 @@ def find_crests(
         step = (number * np.pi - carrier.at(y, x) - rest) / (gx**2 + gy**2)
         y, x = y + step * gy, x + step * gx
     return CrestPaths(
-        x, y, number.astype(np.int64), weight[use] ** -0.5, np.hypot(*carrier.vector(y, x)),
-        phi - start, (kx, ky), frame, windows.size[1],
-    )  # fmt: skip
+        x,
+        y,
+        number.astype(np.int64),
+        weight[use] ** -0.5,
+        np.hypot(*carrier.vector(y, x)),
+        phi - start,
+        (kx, ky),
+        frame,
+        windows.size[1],
+    )
 
 
 def _check(use: Mask) -> None:

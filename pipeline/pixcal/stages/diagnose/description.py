@@ -113,11 +113,19 @@ def recordings_of(
             late = known and not np.allclose(after, even, rtol=0, atol=_LATE * period)
             recordings.append(
                 Recording(
-                    bench, kind, listed.get(name, n), name, name, len(numbers), exposure,
-                    start[name] + float(times[numbers[0]]), period, electrons,
+                    bench,
+                    kind,
+                    listed.get(name, n),
+                    name,
+                    name,
+                    len(numbers),
+                    exposure,
+                    start[name] + float(times[numbers[0]]),
+                    period,
+                    electrons,
                     stamps_s=tuple(after.tolist()) if late else (),
                 )
-            )  # fmt: skip
+            )
             places.append((name, numbers))
     return _in_sequence(recordings, places, tables), places, light
 

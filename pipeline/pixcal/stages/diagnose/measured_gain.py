@@ -118,8 +118,10 @@ def _pairs(
         level = float(levels.mean()) - offset
         blocks = pair_statistics(
             *(pair - levels + np.float32(level)),
-            gain=gain, read_noise=detector.read_noise_e / gain, quantum=1.0,
-        )  # fmt: skip
+            gain=gain,
+            read_noise=detector.read_noise_e / gain,
+            quantum=1.0,
+        )
         dof, noise = blocks[:, 0], blocks[:, 2] + 2 * blocks[:, shared].sum(axis=1)
         found.append((level, dof @ noise / max(dof.sum(), 1.0)))
     return np.array(found).T

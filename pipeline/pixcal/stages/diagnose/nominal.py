@@ -158,11 +158,14 @@ class NominalBench:
         levels = measured.lamp.levels(self.recordings, undone)
         taken = {
             r.key: replace(
-                r, bench=bench, window=window, before=None,
+                r,
+                bench=bench,
+                window=window,
+                before=None,
                 electrons=levels.get(r.number, r.electrons) if r.kind == "flat" else r.electrons,
             )
             for r in self.recordings
-        }  # fmt: skip
+        }
         for recording, (name, numbers) in zip(self.recordings, self.places, strict=True):
             wanted = np.flatnonzero(np.isin(numbers, half[name]))
             before = None if recording.before is None else taken[recording.before.key]

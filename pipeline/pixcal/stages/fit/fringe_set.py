@@ -88,11 +88,15 @@ def fit_sets(
     """Fit the shape of the fringes of every set, see `fit_set`."""
     return [
         fit_set(
-            sweep / "sweep.zarr" / name, ReducedSet(reduced / name), facts[name], acquisition,
-            name, model,
+            sweep / "sweep.zarr" / name,
+            ReducedSet(reduced / name),
+            facts[name],
+            acquisition,
+            name,
+            model,
         )
         for name in (listed.name for listed in acquisition.frames.fringes)
-    ]  # fmt: skip
+    ]
 
 
 def fit_set(
@@ -117,9 +121,17 @@ def fit_set(
     shape = fitted.basis.shape.moved(fitted.coefficients[: len(fitted.basis.shape.names), 0])
     chosen = next(n for n, cls in fringe_models().items() if isinstance(shape, cls))
     return FittedSet(
-        name, source, swept, facts, tiles.planes, fitted, shape, chosen, evidence,
+        name,
+        source,
+        swept,
+        facts,
+        tiles.planes,
+        fitted,
+        shape,
+        chosen,
+        evidence,
         float(facts["chi2_reduced"]),
-    )  # fmt: skip
+    )
 
 
 def _start(

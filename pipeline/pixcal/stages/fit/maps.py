@@ -280,9 +280,13 @@ def _write_frames(folder: Path, maps: Local) -> None:
     """Write the parameters of every frame and the times of the batches, for users of the fit."""
     frames = read_frames(maps)
     for array, data in (
-        ("B", frames.B), ("A", frames.A), ("phi", frames.phi), ("dkx", frames.dk[:, 0]),
-        ("dky", frames.dk[:, 1]), ("time", ArrayReader(maps / "time").read()),
-    ):  # fmt: skip
+        ("B", frames.B),
+        ("A", frames.A),
+        ("phi", frames.phi),
+        ("dkx", frames.dk[:, 0]),
+        ("dky", frames.dk[:, 1]),
+        ("time", ArrayReader(maps / "time").read()),
+    ):
         write_array(folder / array, data, dims=("time",))
     for array in ("batch_time", "batch_count"):
         write_array(folder / array, ArrayReader(maps / array).read(), dims=("batch",))

@@ -195,9 +195,13 @@ def _create_maps(folder: Local, source: ReducedSet, n_batches: int) -> dict[str,
     width = 1 + _bound_pixels(source) + _chi2_pixels(source)
     for name, numbers in zip(TABLES, (width, TileSums.width(n_batches)), strict=True):
         writers[name] = create_array(
-            folder / name, (*source.grid, numbers), "<f8", dims=("row", "column", "fact"),
-            chunks=(1, min(STRIP, source.grid[1]), numbers), fill_value=np.nan,
-        )  # fmt: skip
+            folder / name,
+            (*source.grid, numbers),
+            "<f8",
+            dims=("row", "column", "fact"),
+            chunks=(1, min(STRIP, source.grid[1]), numbers),
+            fill_value=np.nan,
+        )
     return writers
 
 
@@ -227,13 +231,26 @@ def _sweep_tile(job: _Job, at: tuple[int, int]) -> dict[str, NDArray[Any]]:
     fresh = sum(not source.signal.holds((n, *at)) for n in range(source.n_blocks))
     number = _bound_pixels(source)
     maps = sweep_tile(
-        tile, source.blocks(at), source.coding, job.frames, job.carrier.k, job.batches, job.prime,
+        tile,
+        source.blocks(at),
+        source.coding,
+        job.frames,
+        job.carrier.k,
+        job.batches,
+        job.prime,
         number,
-    )  # fmt: skip
+    )
     flags = fit_flags(
-        mask, maps.iota, maps.alpha, maps.sigma, maps.chi2, maps.count, job.noise,
-        job.excess_scatter, job.chi2_limit,
-    )  # fmt: skip
+        mask,
+        maps.iota,
+        maps.alpha,
+        maps.sigma,
+        maps.chi2,
+        maps.count,
+        job.noise,
+        job.excess_scatter,
+        job.chi2_limit,
+    )
     usable = (mask == 0) & np.isfinite(maps.chi2)
     chi2 = maps.chi2[usable]
     chi2 = chi2[:: -(-len(chi2) // _chi2_pixels(source)) or 1]

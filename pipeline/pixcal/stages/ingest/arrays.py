@@ -62,10 +62,13 @@ class Writers:
         _create_groups(store, array)
         facts = (-(-shape[1] // BAND), len(FACTS))
         catalogue = create_array(
-            store / array, (shape[0], *facts), "f8",
-            dims=("time", "band", "fact"), chunks=(FRAMES_A_PIECE, *facts),
+            store / array,
+            (shape[0], *facts),
+            "f8",
+            dims=("time", "band", "fact"),
+            chunks=(FRAMES_A_PIECE, *facts),
             attrs={"fact": list(FACTS.values())},
-        )  # fmt: skip
+        )
         samples = None
         if copied:
             cubes = made.cubes / "raw.zarr"

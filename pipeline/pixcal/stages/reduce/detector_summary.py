@@ -141,9 +141,20 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     if gain is not None and (is_cut_off(job) or _tells_noise(gain)):
         noise, own = of_variance(gain.read_variance, job.quantum)
     return Summary(
-        declared, job.quantum or 1.0, medians, light, noise, own, gain, levels, usable, full,
-        points, well, straight,
-    )  # fmt: skip
+        declared,
+        job.quantum or 1.0,
+        medians,
+        light,
+        noise,
+        own,
+        gain,
+        levels,
+        usable,
+        full,
+        points,
+        well,
+        straight,
+    )
 
 
 def _tells_noise(gain: GainFit) -> bool:

@@ -131,9 +131,12 @@ def set_writers(
             folder / name, shape, dtype, dims=("y", "x"), chunks=map_chunk(shape), attrs=attrs
         )
     made["counts"] = create_array(
-        scratch, (*grid(shape), 5), np.int64, dims=("i", "j", "count"),
+        scratch,
+        (*grid(shape), 5),
+        np.int64,
+        dims=("i", "j", "count"),
         chunks=(1, min(STRIP, grid(shape)[1]), 5),
-    )  # fmt: skip
+    )
     return made
 
 
@@ -175,9 +178,15 @@ class _Column:
         at = first % CHUNK[0]
         held = at + len(samples)
         self.total += encode(
-            samples, *self.coefficients, fringes.exptime[first:last],
-            np.float32(fringes.saturation), self.codes[at:held], self.saturated, self.lost, begin,
-        )  # fmt: skip
+            samples,
+            *self.coefficients,
+            fringes.exptime[first:last],
+            np.float32(fringes.saturation),
+            self.codes[at:held],
+            self.saturated,
+            self.lost,
+            begin,
+        )
         if held == CHUNK[0] or last == fringes.frames:
             (y0, _), (x0, _) = extent(fringes.raw.shape[1:], self.index)
             self.job.writers["signal"].write((last - held, y0, x0), self.codes[:held])

@@ -145,9 +145,14 @@ def reduce_frames(made: Workspace, source: Ingested, config: Config, runtime: Ru
     sets = {}
     for name in exposures.fringes:
         sets[name.partition("/")[2]] = write_set(
-            made, source, name,
-            gain=gain, bounds=bounds, share=config.rounding_share, runtime=runtime,
-        )  # fmt: skip
+            made,
+            source,
+            name,
+            gain=gain,
+            bounds=bounds,
+            share=config.rounding_share,
+            runtime=runtime,
+        )
     return Reduction(job, summary, gain, bounds, sets)
 
 

@@ -151,9 +151,13 @@ def _fitting(
 
 
 def _write_frames(
-    bench: Bench, effects: Effects, recorded: list[Recording], folder: Path, runtime: Runtime,
+    bench: Bench,
+    effects: Effects,
+    recorded: list[Recording],
+    folder: Path,
+    runtime: Runtime,
     camera: Cameras,
-) -> None:  # fmt: skip
+) -> None:
     batches: list[list[Span]] = [[]]
     ready: list[Callable[[], Path]] = []
     for recording in recorded:

@@ -106,9 +106,15 @@ def find_telegraph(
         found = _likeliest(parts, upper)
     stays = found.stays
     return Telegraph(
-        **vars(found.population), switching_s=stays.mean_s, switching_decades=stays.decades,
-        upper=stays.upper, switching_error=found.error, signs=told, own=single, faintest=faintest,
-    )  # fmt: skip
+        **vars(found.population),
+        switching_s=stays.mean_s,
+        switching_decades=stays.decades,
+        upper=stays.upper,
+        switching_error=found.error,
+        signs=told,
+        own=single,
+        faintest=faintest,
+    )
 
 
 def significance(series: Sequence[Series]) -> float | None:
