@@ -10,6 +10,7 @@ from pixcal.estimators.detector.transfer_curve import (
     MIN_PIXELS,
     STEPS,
     TransferCurve,
+    read_known,
     shot_share,
     sums_of_stacks,
     transfer_curve,
@@ -120,7 +121,7 @@ def shot_share_of_flats(evidence: Evidence) -> tuple[float, float] | None:
     The nonlinearity is corrected by the levels or, if the lamp was changed between them, by
     extrapolation of the noise to level zero.
     """
-    pooled = shot_share(sums_of_stacks(evidence))
+    pooled = shot_share(sums_of_stacks(evidence), known=read_known(evidence))
     curve = transfer_curve(evidence, whole=True)
     if pooled is None or curve is None:
         return pooled

@@ -71,6 +71,7 @@ def fit_gain(
     uneven: float = 0.0,
     common: float = 0.0,
     straight: bool = False,
+    without_dark: bool | None = None,
 ) -> GainFit | None:
     """Fit the curve through the points of variance against level, from the read noise on.
 
@@ -89,13 +90,22 @@ def fit_gain(
     common : relative error of the noise at all levels alike
     straight : fit a line only: within few flats the level changes from place to place, as the
         amplifiers do
+    without_dark : leave out the noise without light; by default where it is not on the curve
     """
 
     def fit(highest: float, known: tuple[float, float] = read_variance) -> GainFit | None:
         found = _fit_range(sums, known, highest, level_error, uneven, straight)
         return found and replace(found, error=math.hypot(found.error, common * found.gain))
 
-    whole = fit(highest)
+    def of_flats() -> GainFit | None:
+        lit = sums[(sums[:, 0] > 0) & (sums[:, 1] > 0)]
+        if not len(lit):
+            return None
+        # Nothing is known of it but that noise grows with light.
+        found = fit(highest, (read_variance[0], float((lit[:, 2] / lit[:, 0]).max())))
+        return found and replace(found, without_dark=True)
+
+    whole = of_flats() if without_dark else fit(highest)
     if whole is None or straight or whole.chance > _OFF_CURVE:
         return whole
 
@@ -103,12 +113,10 @@ def fit_gain(
         return int(np.count_nonzero((sums[:, 1] > 0) & (sums[:, 1] <= top * sums[:, 0])))
 
     best, top = whole, whole.levels[1] / _SHORTER
-    if points(1.001 * whole.levels[1]) >= 2 * _SPARE:
-        # Nothing is known of it but that noise grows with light.
-        lit = sums[(sums[:, 0] > 0) & (sums[:, 1] > 0)]
-        found = fit(highest, (read_variance[0], float((lit[:, 2] / lit[:, 0]).max())))
+    if without_dark is None and points(1.001 * whole.levels[1]) >= 2 * _SPARE:
+        found = of_flats()
         if found is not None and found.chance > _OFF_CURVE and found.error < best.error:
-            best = replace(found, without_dark=True)
+            best = found
     while points(top) >= _SPARE:
         found = fit(top)
         if found is not None and found.chance > _OFF_CURVE and found.error < best.error:

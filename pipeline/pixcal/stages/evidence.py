@@ -11,6 +11,7 @@ from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.model.arrays import F64, Indices
 from pixcal.model.errors import InputError
 from pixcal.stages.fit.sweep import read_frames
+from pixcal.stages.reduce.black_cut_off import Black
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.cube import ArrayReader
@@ -38,11 +39,16 @@ def evidence_of(
     part: Part | None = None,
     frames: slice = slice(None),
     *,
+    black: Black | None = None,
     within: tuple[tuple[int, int], tuple[int, int]] | None = None,
 ) -> Evidence:
-    """The same of a whole run; ``within``: first row and column in, and shape of, a window."""
+    """The same of a whole run.
+
+    ``black``: known of the camera from more frames. ``within``: first row and column in, and shape
+    of, a window.
+    """
     acquisition = read_acquisition(run_dir)
-    ingested = Ingested(run_dir / "ingest")
+    ingested = Ingested(run_dir / "ingest", black)
     ny, nx = ingested.shape
     y, x = part or ((0, ny), (0, nx))
     (y0, x0), window = within or ((0, 0), (ny, nx))
@@ -63,6 +69,7 @@ def evidence_of(
         gain=float(used["gain_e_per_adu"]["used"]),
         read_noise=float(used["read_noise_e"]["used"]),
         amplifier_noise=float(used["read_noise_e"]["before_rounding"]),
+        read_noise_error=float(used["read_noise_e"]["error"] or np.nan),
         bias=maps["bias"].astype(float),
         dark_rate=maps["dark_rate"].astype(float),
         flat=maps["flat"].astype(float),
@@ -76,6 +83,7 @@ def evidence_of(
         photon_transfer=_photon_transfer(used["gain_e_per_adu"]),
         step_adu=max(int(ingested.quantum), 1),
         neighbours=tuple((y, x) for y, x in used["gain_e_per_adu"]["neighbours"]),
+        without_dark=bool(used["gain_e_per_adu"].get("without_dark")),
     )
 
 

@@ -25,6 +25,7 @@ CLIP = 6.0  # standard deviations beyond which a residual does not count
 _MIN_LEVELS = 3
 _ALIKE = 1e4
 _READ_KNOWN = 0.3  # assumed relative error of the variance of the read noise
+_EXACT = 1e-3  # the same within a level, where its error is counted for all levels together
 
 
 @dataclass(frozen=True)
@@ -57,12 +58,13 @@ def _transfer_curve(evidence: Evidence, whole: bool) -> TransferCurve | None:
     if not evidence.has_level:
         return None
     counted = None if whole else _shared_steps(evidence)
-    without = (s for s in evidence.stacks if s.kind != "flat" and _is_enough(s))
-    darks = [_read_alone(sums) for s in without if (sums := _of_stack(s, evidence)) is not None]
+    darks = [_read_alone(s) for s in _without_light(evidence)]
+    known = read_known(evidence)
+    common = 0.0 if known is None else known * evidence.read_noise**2
     points = []
     for stack in filter(_is_enough, evidence.ladder):
         sums = _of_stack(stack, evidence)
-        share = None if sums is None else shot_share([sums, *darks], counted)
+        share = None if sums is None else shot_share([sums, *darks], counted, common and _EXACT)
         level = float((stack.adu.mean(axis=0) - evidence.bias)[evidence.good].mean())
         if share is not None and level > 0:
             points.append((level * evidence.gain, *share))
@@ -70,12 +72,13 @@ def _transfer_curve(evidence: Evidence, whole: bool) -> TransferCurve | None:
         return None
     level, share, error = np.array(points).T
     top = float(level.max())
-    design = np.stack([np.ones_like(level), level / top]) / error
-    normal = design @ design.T
+    design = np.stack([np.ones_like(level), level / top])
+    weights = np.linalg.inv(np.diag(error**2) + np.outer(common / level, common / level))
+    normal = design @ weights @ design.T
     if np.linalg.cond(normal) > _ALIKE:
         return None
     covariance = np.linalg.inv(normal)
-    found = covariance @ (design @ (share / error))
+    found = covariance @ (design @ weights @ share)
     errors = np.sqrt(np.diag(covariance))
     at_zero, rise = zip(found.tolist(), errors.tolist(), strict=True)
     return TransferCurve(*at_zero, *rise, top, level, share, error)
@@ -92,10 +95,13 @@ def _read_alone(sums: F64) -> F64:
     return np.stack([n, none, none, s22, none, p2 - s12 * own, square], axis=1)
 
 
-def shot_share(sums: Iterable[F64], counted: Mask | None = None) -> tuple[float, float] | None:
+def shot_share(
+    sums: Iterable[F64], counted: Mask | None = None, known: float | None = None
+) -> tuple[float, float] | None:
     """Level-dependent noise over that expected, with its error; None without samples.
 
-    ``counted``: which of `STEPS` to add to the first, all by default.
+    ``counted``: which of `STEPS` to add to the first, all by default. ``known``: relative error of
+    the variance of the read noise, where frames without light do not tell it.
     """
     total = sum(sums, np.zeros((len(STEPS), 7)))
     if not total[0, 0]:
@@ -107,9 +113,9 @@ def shot_share(sums: Iterable[F64], counted: Mask | None = None) -> tuple[float,
             continue
         normal, right = np.array([[s11, s12], [s12, s22]]), np.array([p1, p2])
         scatter = square / n - own
-        known = scatter / _READ_KNOWN**2
-        normal[1, 1] += known
-        right[1] += known * own
+        prior = scatter / ((own and known) or _READ_KNOWN) ** 2
+        normal[1, 1] += prior
+        right[1] += prior * own
         inverse = np.linalg.inv(normal)
         times = 1 if own else 2
         share += times * (inverse @ right)[0]
@@ -119,13 +125,32 @@ def shot_share(sums: Iterable[F64], counted: Mask | None = None) -> tuple[float,
     return float(share), float(np.sqrt(variance + FLOOR**2))
 
 
-def sums_of_stacks(evidence: Evidence) -> Iterable[F64]:
+def sums_of_stacks(evidence: Evidence) -> list[F64]:
     """Sums of flats, and of frames without light, which give the noise at zero level."""
-    if any(s.kind == "flat" and _is_enough(s) for s in evidence.stacks):
-        for stack in filter(_is_enough, evidence.stacks):
-            sums = _of_stack(stack, evidence)
-            if sums is not None:
-                yield sums
+    flats = [s for s in evidence.stacks if s.kind == "flat" and _is_enough(s)]
+    return [*_of_stacks(flats, evidence), *_without_light(evidence)] if flats else []
+
+
+def read_known(evidence: Evidence) -> float | None:
+    """Relative error of the variance of the read noise; None if frames without light tell it."""
+    if not evidence.without_dark and evidence.lowest_adu is None:
+        return None
+    error = 2 * evidence.read_noise_error / evidence.read_noise
+    return min(error, _READ_KNOWN) if error > 0 else _READ_KNOWN
+
+
+def _without_light(evidence: Evidence) -> list[F64]:
+    """Sums of bias and dark frames; their variance is left out if it is not that of flats."""
+    found = _of_stacks((s for s in evidence.stacks if s.kind != "flat"), evidence)
+    if read_known(evidence) is None:
+        return found
+    other = np.arange(len(STEPS))[:, None] > 0
+    return [sums * other for sums in found]
+
+
+def _of_stacks(stacks: Iterable[Stack], evidence: Evidence) -> list[F64]:
+    every = (_of_stack(stack, evidence) for stack in filter(_is_enough, stacks))
+    return [sums for sums in every if sums is not None]
 
 
 def _is_enough(stack: Stack) -> bool:

@@ -24,6 +24,7 @@ from pixcal.stages.diagnose.parts import Half, Raw, evidence_of, take
 from pixcal.stages.diagnose.trial import Curves, Signature, Window, averaged, measured_curves
 from pixcal.stages.diagnose.windows import chosen_windows, frames_of_half, split
 from pixcal.stages.evidence import Part
+from pixcal.stages.reduce.black_cut_off import Black
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.manifest import read_json
 from pixcal.storage.stage import read_acquisition, require
@@ -70,6 +71,8 @@ def look_at(
     first, parts = chosen_windows(shape, 0 if fringes else frames_of_half(ingested.tables))
     pixels = (first[0][1] - first[0][0]) * (first[1][1] - first[1][0])
     saturated = read_json(run_dir / "reduce" / "reduce.json")["saturation_adu"]
+    of_gain = read_json(run_dir / "reduce" / "reduce.json")["gain_e_per_adu"]
+    black = Black(ingested.cut_off, of_gain.get("without_dark"))
     own = split(ingested.tables, pixels, saturated.get("full_frames", ()))
     _enough(own.test)
     runtime, few, room = _memory(own.test, pixels, runtime)
@@ -80,7 +83,10 @@ def look_at(
     signatures: tuple[Signature, ...] = ()
     seed: int | None = None
     for part in dict.fromkeys((first, *parts)):
-        raws = [take(ingested, acquisition, h, part, reduction) for h in (own.learn, own.test)]
+        raws = [
+            take(ingested, acquisition, half, part, reduction, black)
+            for half in (own.learn, own.test)
+        ]
         seed = raws[0].checksum if seed is None else seed
         try:
             number = len(windows) + len(left_out) + 1
@@ -99,7 +105,14 @@ def look_at(
         if not windows:
             signatures = tuple(learnt(halves[0], halves[1], few))
         bench = nominal_bench(
-            acquisition, ingested.tables, halves, (own.learn, own.test), shape, reduction, dtypes
+            acquisition,
+            ingested.tables,
+            halves,
+            (own.learn, own.test),
+            shape,
+            reduction,
+            dtypes,
+            black,
         )
         assert seed is not None
         windows.append(Window(part, bench, own.learn, own.test, shape, seed, full))

@@ -26,6 +26,7 @@ from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain
 from pixcal.stages.diagnose.nominal import Measured, NominalBench, SetTruth, uncoupled
 from pixcal.stages.diagnose.parts import Half, Table
+from pixcal.stages.reduce.black_cut_off import Black
 from pixcal.stages.reduce.calibration import FLAT_FLOOR
 
 NO_TEST = 10.0  # reduced chi-square of the photon transfer above which its gain is not used
@@ -41,6 +42,7 @@ def nominal_bench(
     whole: tuple[int, int],
     reduction: reduce.Config,
     dtypes: Mapping[str, np.dtype[Any]],
+    black: Black | None = None,
 ) -> NominalBench:
     """The nominal bench measured from one or more parts of an acquisition.
 
@@ -87,6 +89,7 @@ def nominal_bench(
         pedestal_of(evidence, dtypes, bench.detector.step_adu),
         tuple(recordings),
         tuple(places),
+        black,
     )
 
 

@@ -24,6 +24,7 @@ from pixcal.stages.evidence import Part
 from pixcal.stages.fit.fringe_set import fit_sets
 from pixcal.stages.fit.maps import write_offsets
 from pixcal.stages.fit.sweep import sweep_sets
+from pixcal.stages.reduce.black_cut_off import Black
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduce.stage import reduce_frames
 from pixcal.storage.cube import CHUNK
@@ -47,6 +48,7 @@ class Raw:
     arrays: Mapping[str, Frames]  # (t, y, x) by name of the array
     tables: Mapping[str, Table]  # properties of each frame, in columns, as in ``frames.json``
     reduction: reduce.Config  # how to reduce them
+    black: Black | None = None  # known of the camera from the whole run
 
     @property
     def checksum(self) -> int:
@@ -66,14 +68,19 @@ def groups(table: Table) -> list[Indices]:
 
 
 def take(
-    ingested: Ingested, acquisition: Acquisition, half: Half, part: Part, reduction: reduce.Config
+    ingested: Ingested,
+    acquisition: Acquisition,
+    half: Half,
+    part: Part,
+    reduction: reduce.Config,
+    black: Black | None = None,
 ) -> Raw:
     """Read a part of a run's frames."""
     arrays = {}
     for name, frames in half.items():
         array = ingested.arrays[name]
         arrays[name] = np.concatenate([array.read(run, *part) for run in runs(frames)])
-    return Raw(acquisition, arrays, select(ingested.tables, half), reduction)
+    return Raw(acquisition, arrays, select(ingested.tables, half), reduction, black)
 
 
 def select(tables: Mapping[str, Table], half: Half) -> dict[str, Table]:
@@ -87,8 +94,8 @@ def select(tables: Mapping[str, Table], half: Half) -> dict[str, Table]:
 
 def evidence_of(raw: Raw, part: Part, window: tuple[int, int]) -> Evidence:
     """Reduce and fit a part of a window, with straight fringes."""
-    run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction)
-    return evidence.evidence_of(run, within=((part[0][0], part[1][0]), window))
+    run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction, black=raw.black)
+    return evidence.evidence_of(run, black=raw.black, within=((part[0][0], part[1][0]), window))
 
 
 def run_in_memory(
@@ -97,6 +104,7 @@ def run_in_memory(
     tables: Mapping[str, Mapping[str, list[Any]]],
     reduction: reduce.Config,
     sweep: Sweep = NO_BATCHES,
+    black: Black | None = None,
 ) -> MemoryPath:
     """A run of frames (t, y, x), ADU, by name of the array, as a run directory; straight fringes.
 
@@ -108,7 +116,7 @@ def run_in_memory(
     write_json(run / "ingest" / "acquisition.json", to_plain(acquisition))
     write_json(run / "ingest" / "frames.json", tables)
     reduced = MemoryBuild(run / "reduce")
-    found = reduce_frames(reduced, Ingested(run / "ingest"), reduction, HERE)
+    found = reduce_frames(reduced, Ingested(run / "ingest", black), reduction, HERE)
     write_json(run / "reduce" / "reduce.json", found.noise(reduction))
     if acquisition.frames.fringes:
         cubes = run / "reduce" / "reduced.zarr"

@@ -55,6 +55,17 @@ class CutOff:
         return cls(float(code), share, noise) if _changing(samples, code) > _SHARE else None
 
 
+class Black(NamedTuple):
+    """What a camera does to frames without light, as found on whole frames.
+
+    Parts of the frames, and simulations of them, are reduced like the whole.
+    """
+
+    cut_off: Mapping[str, CutOff]  # arrays whose noise is cut off at their lowest code
+    # whether their noise is not that of flats at level zero; None: found anew in each part
+    differs: bool | None = None
+
+
 class _Counts(NamedTuple):
     """Samples of some frames (t, y, x) by code."""
 

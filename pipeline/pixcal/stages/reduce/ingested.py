@@ -11,7 +11,7 @@ import numpy as np
 
 from pixcal.model.acquisition import Detector
 from pixcal.model.errors import InputError
-from pixcal.stages.reduce.black_cut_off import CutOff, cut_offs
+from pixcal.stages.reduce.black_cut_off import Black, CutOff, cut_offs
 from pixcal.stages.reduce.exposures import Exposures, group_exposures
 from pixcal.stages.reduce.flat_survey import (
     FlatSurvey,
@@ -34,6 +34,7 @@ class Ingested:
     """Frames and their tables."""
 
     folder: Local  # ``RUN/ingest``
+    black: Black | None = None  # known of the camera from more than these frames
 
     @cached_property
     def raw(self) -> Place:
@@ -189,6 +190,8 @@ class Ingested:
     @cached_property
     def cut_off(self) -> dict[str, CutOff]:
         """Arrays of frames without light whose noise is cut off at their lowest code."""
+        if self.black is not None:
+            return dict(self.black.cut_off)
         return cut_offs(self.arrays, self.quantum or 1.0)
 
     @property
