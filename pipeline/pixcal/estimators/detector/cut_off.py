@@ -60,9 +60,16 @@ def without_cut_off(
     if not 0 < float(mean.mean()) < _CUT * sample:
         return found, 1.0
 
+    # Means of few frames scatter more than the levels: shrunk so that their scatter is that of the
+    # levels, and further, towards the mean of all, for each pixel's likely level.
+    true = max(1 - sample**2 / frames / float(mean.var()), 0.0) if mean.var() > 0 else 0.0
+    centre = float(mean.mean())
+    alike = np.where(usual, centre + math.sqrt(true) * (found.mean - centre), found.mean)
+    likely = np.where(usual, centre + true * (found.mean - centre), found.mean)
+
     def excess(noise: float) -> float:
         table = _of_cut_off(_LEVELS * noise, noise, step)
-        return float(np.mean(variance_at(mean, variance / frames, *table)) - sample**2)
+        return float(np.interp(alike[usual], *table).mean() - sample**2)
 
     low, high = (end * sample for end in _RANGE)
     if not excess(low) < 0 < excess(high):
@@ -71,25 +78,14 @@ def without_cut_off(
     means, variances = _of_cut_off(_LEVELS * noise, noise, step)
     above = found.mean > means[-1]
     whole = noise**2 + SHEPPARD * step**2
-    # Means of usual pixels in few frames are shrunk towards that of all: a pixel that is always
-    # zero has no other information.
-    true = max(1 - sample**2 / frames / float(mean.var()), 0.0) if mean.var() > 0 else 0.0
-    likely = np.where(usual, mean.mean() + true * (found.mean - mean.mean()), found.mean)
     seen = np.interp(likely, means, variances)
     corrected = replace(
         found,
         mean=np.where(above, found.mean, np.interp(likely, means, _LEVELS * noise)),
         variance=np.where(above, 1.0, whole / seen) * found.variance,
     )
-    expected = variance_at(found.mean, found.variance / frames, means, variances)
+    expected = np.interp(alike, means, variances)
     return corrected, whole / float(np.nanmean(np.where(above, whole, expected)))
-
-
-def variance_at(mean: F64, error: F64, means: F64, variances: F64) -> F64:
-    """Variances of samples at means with errors (variances), corrected for bias by these."""
-    bend = np.gradient(np.gradient(variances, means), means)
-    at = np.interp(mean, means, variances)
-    return np.asarray(at - np.interp(mean, means, bend) * error / 2)
 
 
 def _of_cut_off(levels: F64, noise: float, step: float) -> tuple[F64, F64]:

@@ -11,7 +11,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
-from pixcal.estimators.detector.cut_off import variance_at
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.arrays import F64, I64
 
@@ -107,7 +106,7 @@ def noise_before_missing_codes(
 
         def excess(sigma: float) -> float:
             table = moments(sigma)
-            seen = variance_at(means, np.interp(means, *table) / frames, *table)
+            seen = _variance_at(means, np.interp(means, *table) / frames, *table)
             return float(seen.mean()) - variance
 
         least, most = _LEAST, float(np.sqrt(variance)) + 1
@@ -123,3 +122,10 @@ def noise_before_missing_codes(
         if slope > 0 and (best is None or misfit < best[0]):
             best = misfit, sigma, error / slope
     return best and best[1:]
+
+
+def _variance_at(mean: F64, error: F64, means: F64, variances: F64) -> F64:
+    """Variances of samples at means with errors (variances), corrected for bias by these."""
+    bend = np.gradient(np.gradient(variances, means), means)
+    at = np.interp(mean, means, variances)
+    return np.asarray(at - np.interp(mean, means, bend) * error / 2)

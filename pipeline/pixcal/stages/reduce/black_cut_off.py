@@ -25,6 +25,9 @@ _BELOW, _NOISE = 0.01, 1.5
 # An edge: least samples lacking at the code below it, over all; least samples at it over the
 # expected ones.
 _LACKING, _EDGE = 5e-3, 1.05
+# A pile spread over two codes: least share of samples at the second, higher, code that noise alone
+# does not explain, and in standard errors.
+_SPREAD, _SURE = 0.2, 5.0
 _SECOND = 0.4  # least share of a pile at a second code over that at the first
 _LEAVE = 0.1  # least share of the samples at the lowest code that are above it in the next frame
 
@@ -90,15 +93,29 @@ class _Counts(NamedTuple):
 
 def _pile(found: _Counts, most: float) -> int:
     """Code up to ``most`` at which samples pile up, with hardly any below; 0 if there is none."""
-    piled = found.many() & (found.below < _BELOW * found.number) & (found.code < most)
+    low = found.many() & (found.code < most)
+    piled = low & (found.below < _BELOW * found.number)
     if not piled.any():
-        return 0
+        return _spread_pile(found, low)
     at = int(np.flatnonzero(piled)[-1])
     # Rounding after the cut may spread the pile over two codes. Noise alone is log-concave.
     after = found.number[at + 1 : at + 4].astype(float)
     if len(after) == 3 and after[0] - after[1] ** 2 / after[2] > _SECOND * found.number[at]:
         at += 1
     return int(found.code[at])
+
+
+def _spread_pile(found: _Counts, low: Mask) -> int:
+    """Code of a pile of which fewer samples lie at the code below; 0 if there is none."""
+    at = int(np.argmax(low))
+    near = found.number[at : at + 3].astype(float)
+    if at == 0 or len(near) < 3 or found.below[at - 1] > _BELOW * near[0]:
+        return 0
+    # Noise alone is log-concave.
+    most = near[1] ** 2 / near[2]
+    error = math.sqrt(near[0] + most**2 * (4 / near[1] + 1 / near[2]))
+    beyond = near[0] - most > max(_SPREAD * near[0], _SURE * error)
+    return int(found.code[at]) if beyond else 0
 
 
 def _edge(found: _Counts, step: float) -> int:
@@ -108,14 +125,17 @@ def _edge(found: _Counts, step: float) -> int:
     """
     code, number, total = found.code, found.number, found.number.sum()
     first = int(np.argmax(found.many() & (found.below < _SHARE * total)))
-    # Rounding after the cut may spread the pile over two codes.
-    for at, below in ((first, (6, -8, 3)), (first + 1, (10, -15, 6))):
+    # Rounding, or dark signal added, after the cut may spread the pile over two codes.
+    for at in (first, first + 1):
         near = number[at : at + 4].astype(float)
         even = len(near) == 4 and code[at + 3] - code[first] == (at + 3 - first) * step
         if not even or near.min() < max(_SHARE * total, _COUNT):
             return 0
         above = np.log(near[1:])
-        lacking = math.exp(above @ below)  # expected at the code below the first
+        # Those expected at the code below the first; at the first too, where the pile is spread.
+        lacking = math.exp(above @ ((6, -8, 3) if at == first else (10, -15, 6)))
+        if at > first:
+            lacking += math.exp(above @ (6, -8, 3)) - float(number[first])
         lost = lacking > max(_LACKING * total, found.below[first] / _BELOW)
         if lost and near[0] > _EDGE * math.exp(above @ (3, -3, 1)):
             return int(code[at])
