@@ -15,8 +15,10 @@ from pixcal.model.config import to_plain
 from pixcal.model.options import Sweep
 from pixcal.stages import ingest, reduce, simulate
 from pixcal.stages.diagnose.parts import NO_BATCHES, Raw, run_in_memory, take
+from pixcal.stages.diagnose.parts import evidence_of as evidence_of_part
 from pixcal.stages.diagnose.windows import whole_of
 from pixcal.stages.evidence import evidence_of
+from pixcal.stages.reduce.black_cut_off import Black, CutOff
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.stage import read_acquisition
 
@@ -89,3 +91,14 @@ def test_nothing_is_written(raw: Raw, tmp_path: Path, monkeypatch: pytest.Monkey
     run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction)
     assert list(tmp_path.iterdir()) == []
     assert (run / "ingest" / "raw.zarr" / "bias").array.values is raw.arrays["bias"]
+
+
+def test_a_part_is_reduced_with_the_black_of_the_whole_run(raw: Raw) -> None:
+    """Few frames tell a cut-off, or noise of darks that is off the curve, less surely."""
+    whole = Black({"bias": CutOff(3.0, 0.01, 2.0)}, differs=True)
+    _, ny, nx = raw.arrays["bias"].shape
+    part = (0, ny), (0, nx)
+    found = evidence_of_part(replace(raw, black=whole), part, (ny, nx))
+    assert (found.lowest_adu, found.without_dark) == (3.0, True)
+    own = evidence_of_part(raw, part, (ny, nx))
+    assert (own.lowest_adu, own.without_dark) == (None, False)

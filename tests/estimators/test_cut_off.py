@@ -43,6 +43,21 @@ def test_level_and_noise_are_those_before(level: float, noise: float, frames: in
     assert float(np.mean(mended.variance)) == pytest.approx(whole, rel=0.1)
 
 
+@pytest.mark.parametrize("spread", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("level", [0.5, 1.5])
+@pytest.mark.parametrize("frames", [2, 3, 12])
+def test_few_frames_tell_the_noise_too(frames: int, level: float, spread: float) -> None:
+    """Means of two frames scatter by more than the levels."""
+    rng = np.random.default_rng(7)
+    levels = 1.1 * (level + spread * rng.standard_normal((128, 128)))
+    found = combined(samples_of(rng, levels, 1.1, 1, frames), 1.1)
+    mended, factor = without_cut_off(found, frames, 1.0)
+    assert float(np.mean(found.variance)) * factor == pytest.approx(1.1**2 + 1 / 12, rel=0.06)
+    # Each level is drawn to the mean of all, where those of few frames say little.
+    near = 0.06 if spread < 1 else 0.2
+    assert np.mean(mended.mean) == pytest.approx(levels.mean(), abs=near)
+
+
 @pytest.mark.parametrize("level", [-5.0, 0.0, 20.0])
 def test_likelihood_of_scipy_gives_the_same_noise(level: float) -> None:
     """Where all pixels have the same level, the censored likelihood has no nuisance."""

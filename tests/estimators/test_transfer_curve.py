@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from pixcal.effects.gain_error import shot_share_of_flats
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.effects.quantisation import Quantisation
 from pixcal.estimators.detector.ladder_curve import ladder_curve
@@ -37,6 +38,7 @@ def evidence(
     lamp: float | None = None,
     count: int = 8,
     rows: float = 0.0,
+    lights: tuple[float, float] = (1500, 18000),
 ) -> Evidence:
     """Flats in pairs, and bias and dark frames whose signal is about the read noise."""
     rng = np.random.default_rng(seed)
@@ -53,15 +55,15 @@ def evidence(
             kind, seconds, np.arange(frames), np.arange(float(frames)), adu, step=int(light)
         )
 
-    levels = np.linspace(1500, 18000, count)
+    levels = np.linspace(*lights, count)
     times = np.zeros(count) if lamp is None else levels / 1e5
-    lights = levels * (1 + (lamp or 0.0) * rng.standard_normal(count))
+    every = levels * (1 + (lamp or 0.0) * rng.standard_normal(count))
     return Evidence(
         fringes={},
         stacks=(
             stack("bias", 40, 0.0, 0),
             stack("dark", 10, 1.0, 0),
-            *(stack("flat", 2, *one) for one in zip(times, lights, strict=True)),
+            *(stack("flat", 2, *one) for one in zip(times, every, strict=True)),
         ),
         gain=GAIN,
         read_noise=float(np.hypot(read, GAIN / np.sqrt(12))),
@@ -83,6 +85,34 @@ def test_dark_signal_of_the_order_of_the_read_noise_leaves_the_photon_transfer_r
     assert curve is not None
     assert abs(curve.share - 1) < 4 * curve.error < 0.04
     assert abs(curve.slope) < 4 * curve.slope_error
+
+
+@pytest.mark.parametrize("dark", [0.8, 1.3])
+def test_noise_of_dark_frames_that_is_not_that_of_flats_does_not_bend_the_curve(
+    dark: float,
+) -> None:
+    """As of a camera that clips black; `reduce` finds that the darks are not on the curve."""
+    read = 20.0
+    true = float(np.hypot(read, GAIN / np.sqrt(12)))
+    frames = evidence(3, read=read, count=16, lights=(100, 4000))
+    frames = replace(
+        frames,
+        stacks=tuple(
+            s if s.kind == "flat" else replace(s, adu=BIAS + dark * (s.adu - BIAS))
+            for s in frames.stacks
+        ),
+    )
+    biased = transfer_curve(frames)
+    assert biased is not None
+    assert abs(biased.slope) > 4 * biased.slope_error
+    known = replace(frames, without_dark=True, read_noise_error=0.01 * true)
+    curve = transfer_curve(known)
+    assert curve is not None
+    assert abs(curve.share - 1) < 4 * curve.error < 0.2
+    assert abs(curve.slope) < 4 * curve.slope_error < 0.2
+    share = shot_share_of_flats(known)
+    assert share is not None
+    assert abs(share[0] - 1) < 4 * share[1] < 0.1
 
 
 @pytest.mark.parametrize("seed", range(6, 9))

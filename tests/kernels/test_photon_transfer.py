@@ -258,6 +258,12 @@ def test_dark_frames_of_another_noise_do_not_bias_the_gain(dark: float) -> None:
     assert fitted.error < 0.01 * GAIN
     value, error = fitted.read_variance
     assert value == pytest.approx(zero, abs=4 * error)
+    # Where more frames told it, it is not asked again.
+    for known in (False, True):
+        again = fit_gain(np.asarray(sums), (dark * zero, 0.03), np.inf, without_dark=known)
+        assert again is not None
+        assert again.without_dark == known
+        assert not known or again.gain == pytest.approx(GAIN, abs=3 * again.error)
 
 
 def test_points_off_the_line_widen_the_error() -> None:

@@ -75,6 +75,24 @@ def test_a_pile_may_lie_on_two_codes(lowest: float, above: float, noise: float) 
     assert abs(found.code - lowest) <= 0.6
 
 
+@pytest.mark.parametrize("lowest", [11.81, 31.75, 63.85])
+@pytest.mark.parametrize(
+    ("noise", "pattern", "above"),
+    [(0.51, 0.69, 1.6), (0.66, 0.15, 1.5), (1.1, 0.12, 1.5), (3.0, 5.8, 4.5), (3.6, 5.2, 4.5)],
+)
+def test_a_pile_of_few_samples_may_lie_on_two_codes(
+    noise: float, pattern: float, above: float, lowest: float
+) -> None:
+    """The lower code holds a tenth of the pile, so that codes below the pile are not empty."""
+    rng = np.random.default_rng(3)
+    levels = lowest + above * noise + pattern * rng.standard_normal(SHAPE[1:])
+    cut = np.maximum(rng.normal(levels, noise, SHAPE), lowest)
+    samples = np.rint(cut + rng.uniform(-0.5, 0.5, SHAPE)).astype(np.uint16)
+    found = CutOff.of(Frames(samples), 1.0)
+    assert found is not None
+    assert found.code in (np.floor(lowest), np.ceil(lowest))
+
+
 def test_broken_columns_are_no_lowest_code() -> None:
     samples = frames(3.0, 100.0, 0)
     samples[:, :, 17] = 80
