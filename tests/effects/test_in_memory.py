@@ -95,7 +95,7 @@ def test_nothing_is_written(raw: Raw, tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_a_part_is_reduced_with_the_black_of_the_whole_run(raw: Raw) -> None:
     """Few frames tell a cut-off, or noise of darks that is off the curve, less surely."""
-    whole = Black({"bias": CutOff(3.0, 0.01, 2.0)}, differs=True)
+    whole = Black({"bias": CutOff(3.0, 0.01, 2.0)}, without_dark=True)
     _, ny, nx = raw.arrays["bias"].shape
     part = (0, ny), (0, nx)
     found = evidence_of_part(replace(raw, black=whole), part, (ny, nx))

@@ -65,8 +65,8 @@ class Black(NamedTuple):
     """
 
     cut_off: Mapping[str, CutOff]  # arrays whose noise is cut off at their lowest code
-    # whether their noise is not that of flats at level zero; None: found anew in each part
-    differs: bool | None = None
+    # `GainFit.without_dark`; None: found anew in each part
+    without_dark: bool | None = None
 
 
 class _Counts(NamedTuple):

@@ -207,7 +207,7 @@ def _gain(
         uneven=uneven,
         common=shared.error,
         straight=len(job.flat) < LADDER,
-        without_dark=job.dark_differs,
+        without_dark=job.without_dark,
     )
     if fitted is None or not fitted.error < _GAIN_ERROR * fitted.gain:
         return None

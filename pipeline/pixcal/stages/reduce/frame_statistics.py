@@ -84,8 +84,8 @@ class Measuring:
     full: float
     quantum: float  # step of the samples (ADU), 0 for real numbers
     cut_off: Mapping[str, CutOff]  # arrays whose noise is cut off at their lowest code
-    # whether frames without light do not have the noise of flats at level zero; None: to be found
-    dark_differs: bool | None
+    # whether the gain leaves out their noise, which is not that of flats; None: to be found
+    without_dark: bool | None
     gain: float  # gain, read_noise: rough values (e-/ADU, ADU)
     read_noise: float
     options: Reduce  # limits of outliers and flags

@@ -176,7 +176,7 @@ def _measuring(source: Ingested, config: Config, folder: Place) -> Measuring:
         full=min(map(source.saturation, source.tables)),
         quantum=source.quantum,
         cut_off=source.cut_off,
-        dark_differs=None if source.black is None else source.black.differs,
+        without_dark=None if source.black is None else source.black.without_dark,
         gain=gain,
         read_noise=max(detector.read_noise_e / gain, ROUNDING_ADU),
         options=config,
