@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -15,6 +15,10 @@ import yaml
 from astropy.io import fits
 from hypothesis import settings
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from pixcal.engine.run import Runtime
+
 
 # Before Dask is imported, here and in workers that tests start: with Python 3.11 its profiler can
 # stop a process for good (https://github.com/python/cpython/issues/106883).
@@ -203,6 +207,24 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             cases[test] += 1
             if cases[test] > quick.args[0]:
                 item.add_marker(pytest.mark.long)
+
+
+@pytest.fixture(scope="module")
+def dask_cluster() -> Iterator["Runtime"]:
+    """A Dask cluster of two workers, reached by its address."""
+    from distributed import LocalCluster
+
+    from pixcal.engine.run import Runtime
+
+    with LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=False,
+        host="127.0.0.1",
+        protocol="tcp://",
+        dashboard_address=None,
+    ) as local:
+        yield Runtime(local.scheduler_address)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -8,7 +8,6 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from typing import Any
 import cloudpickle
 import psutil
 import pytest
-from distributed import LocalCluster
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.errors import InputError
@@ -31,24 +29,10 @@ LOCAL = [
 ]
 
 
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[Runtime]:
-    """A Dask cluster of two workers, reached by its address."""
-    with LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        processes=False,
-        host="127.0.0.1",
-        protocol="tcp://",
-        dashboard_address=None,
-    ) as local:
-        yield Runtime(local.scheduler_address)
-
-
 @pytest.fixture(params=[*LOCAL, "cluster"], ids=str)
 def runtime(request: pytest.FixtureRequest) -> Runtime:
     if request.param == "cluster":
-        found: Runtime = request.getfixturevalue("cluster")
+        found: Runtime = request.getfixturevalue("dask_cluster")
         return found
     local: Runtime = request.param
     return local

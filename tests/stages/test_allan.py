@@ -1,7 +1,7 @@
 """The stage ``allan`` on batch maps written here, of known noise."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,6 @@ import allantools
 import numpy as np
 import pytest
 import xarray
-from distributed import LocalCluster
 from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime
@@ -82,14 +81,6 @@ def measured(run: Path, config: Config = DEFAULT, runtime: Runtime = SYNC) -> di
     sets = read_json(run / "allan" / "allan.json")["sets"]
     first: dict[str, Any] = next(iter(sets.values()))
     return first
-
-
-@pytest.fixture
-def cluster() -> Iterator[Runtime]:
-    """A Dask cluster, reached by its address."""
-    options: dict[str, Any] = {"processes": False, "dashboard_address": None}
-    with LocalCluster(n_workers=2, host="127.0.0.1", protocol="tcp://", **options) as local:
-        yield Runtime(local.scheduler_address)
 
 
 def test_white_noise(tmp_path: Path) -> None:
@@ -192,11 +183,11 @@ def test_results_do_not_depend_on_the_tiling(tmp_path: Path, chunks: tuple[int, 
 
 
 @pytest.mark.long
-def test_results_do_not_depend_on_the_runtime(tmp_path: Path, cluster: Runtime) -> None:
+def test_results_do_not_depend_on_the_runtime(tmp_path: Path, dask_cluster: Runtime) -> None:
     maps = noise(25)
     texts = set()
     for number, runtime in enumerate(
-        (SYNC, Runtime("threads", 3), Runtime("processes", 2), cluster)
+        (SYNC, Runtime("threads", 3), Runtime("processes", 2), dask_cluster)
     ):
         run = write_fit(tmp_path / str(number), {"vertical": maps}, (3, 5))
         measured(run, Config(region=(0, 20, 1, 31)), runtime)

@@ -5,7 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ import xarray
 import yaml
 import zarr
 from astropy.io import fits
-from distributed import LocalCluster
 
 from pixcal.engine import run as local_engine
 from pixcal.engine.run import Runtime
@@ -74,25 +73,12 @@ def same_but_for_the_cubes(bucket: Any, run: Path, local: Path, stage: str) -> N
     assert any("/c/" in name for name in there)
 
 
-@pytest.fixture
-def cluster() -> Iterator[Runtime]:
-    with LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        processes=False,
-        host="127.0.0.1",
-        protocol="tcp://",
-        dashboard_address=None,
-    ) as made:
-        yield Runtime(made.scheduler_address)
-
-
 @pytest.fixture(
     params=["threads", *(pytest.param(p, marks=pytest.mark.long) for p in ("processes", "cluster"))]
 )
 def runtime(request: pytest.FixtureRequest) -> Runtime:
     if request.param == "cluster":
-        found: Runtime = request.getfixturevalue("cluster")
+        found: Runtime = request.getfixturevalue("dask_cluster")
         return found
     # Those kept from earlier tests began without the credentials of the bucket.
     local_engine._process_pool.cache_clear()
