@@ -36,6 +36,9 @@ from pixcal.storage.manifest import write_json
 Json = dict[str, Any]
 
 _NO_ERROR = 1e-9  # ADU/s: below it all samples have one code
+# relative error of the change of dark current by correcting noise that is cut off: it is not known
+# which distribution the noise had
+_CUT_OFF = 0.5
 _WELL = 0.97  # share of the converter's range below which saturation is due to full wells
 
 
@@ -243,14 +246,16 @@ def _dark_current(found: Json, made: Build, source: Ingested, scale: float, midd
     good = ArrayReader(folder / "mask").read(*middle) == 0
     if not good.any():
         return
-    rate = ArrayReader(folder / "dark_rate").read(*middle)[good].mean(dtype=float)
+    rate = scale * float(ArrayReader(folder / "dark_rate").read(*middle)[good].mean(dtype=float))
     gain = found["conversion_gain"]["value"]
     slope = dark_slope(*_dark_means(source, middle, good))
     error = gain * slope[1] if slope is not None and slope[1] > _NO_ERROR else None
+    if error is not None and slope is not None and source.cut_off:
+        error = math.hypot(error, _CUT_OFF * (rate - gain * slope[0]))
     note = _temperature(source.tables)
     timed = any(source.tables["dark"]["exptime_s"])
     unit = "e-/s" if timed else "e-/exposure"
-    found["dark_current"] = _figure("dark current", unit, (scale * float(rate), error), note)
+    found["dark_current"] = _figure("dark current", unit, (rate, error), note)
 
 
 def _dark_means(source: Ingested, middle: Window, good: Mask) -> tuple[F64, F64]:
