@@ -270,3 +270,37 @@ def test_a_gain_that_nothing_tells_is_asked_for(
         pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run"))
     assert why in str(raised.value)
     assert "give it in e-/ADU" in str(raised.value)
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_camera_that_clips_black_before_it_adds_an_offset(seed: int, tmp_path: Path) -> None:
+    """Darks in pairs, of a signal that grows; the noise of rounding spreads the clipped samples."""
+    rng, gain, read, dark = np.random.default_rng(seed), 6.0, 6.6, 10.0
+    pattern = 0.7 * rng.standard_normal(SHAPE)
+    response = 1 + PRNU / 100 * rng.standard_normal(SHAPE)
+    acquisition = tmp_path / "acq"
+    acquisition.mkdir()
+    for kind, light in (("dark", 0.0), ("flat", 900.0)):
+        for n, seconds in enumerate(np.linspace(0.1, 0.8, 9)):
+            count = 12 if n == 5 else 2
+            charge = rng.poisson((light * response + dark) * seconds, (count, *SHAPE))
+            analogue = charge + pattern + rng.normal(1.6 * read, read, charge.shape)
+            spread = rng.uniform(-0.5, 0.5, charge.shape)
+            samples = np.rint(np.maximum(analogue, 0) / gain + 11.81 + spread).astype(np.uint16)
+            header = fits.Header({"EXPTIME": float(seconds)})
+            fits.writeto(acquisition / f"{kind}{n}.fits", samples, header)
+    listed = {
+        "schema": "pixcal/acquisition/1",
+        "detector": {"name": "CAM", "pitch_um": 5.5, "read_noise_e": read},
+        "frames": {kind: [f"{kind}*.fits"] for kind in ("dark", "flat")},
+    }
+    (acquisition / "acquisition.yaml").write_text(yaml.safe_dump(listed))
+    reduction = pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run")).reduction
+    assert any("cut off at code 12" in warning for warning in reduction["warnings"])
+    found = reduction["figures_of_merit"]
+    noise = np.hypot(read, gain / np.sqrt(12))
+    true = {"conversion_gain": gain, "read_noise": noise, "dark_current": dark}
+    for name, value in true.items():
+        assert abs(found[name]["value"] - value) < 3 * found[name]["error"], name
+    assert found["conversion_gain"]["error"] < 0.03 * gain
+    assert found["dark_current"]["error"] < 0.3 * dark
