@@ -304,3 +304,27 @@ def test_a_camera_that_clips_black_before_it_adds_an_offset(seed: int, tmp_path:
         assert abs(found[name]["value"] - value) < 3 * found[name]["error"], name
     assert found["conversion_gain"]["error"] < 0.03 * gain
     assert found["dark_current"]["error"] < 0.3 * dark
+
+
+def test_shot_noise_of_the_dark_signal_is_not_taken_for_that_of_light(tmp_path: Path) -> None:
+    """Flats whose dark signal is a tenth of their light: it adds to noise and level alike."""
+    rng, read, dark, light = np.random.default_rng(5), 3.0, 100.0, 1000.0
+    acquisition = tmp_path / "acq"
+    acquisition.mkdir()
+    for kind, electrons in (("dark", 0.0), ("flat", light)):
+        for n, seconds in enumerate(np.linspace(0.4, 4.0, 9)):
+            charge = rng.poisson((electrons + dark) * seconds, (4, *SHAPE))
+            samples = np.rint(200 + (charge + rng.normal(0, read, charge.shape)) / GAIN)
+            header = fits.Header({"EXPTIME": float(seconds)})
+            fits.writeto(acquisition / f"{kind}{n}.fits", samples.astype(np.uint16), header)
+    listed = {
+        "schema": "pixcal/acquisition/1",
+        "detector": {"name": "CAM", "pitch_um": 5.5, "read_noise_e": read},
+        "frames": {kind: [f"{kind}*.fits"] for kind in ("dark", "flat")},
+    }
+    (acquisition / "acquisition.yaml").write_text(yaml.safe_dump(listed))
+    reduction = pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run")).reduction
+    gain = reduction["figures_of_merit"]["conversion_gain"]
+    assert abs(gain["value"] - GAIN) < 3 * gain["error"] < 0.06 * GAIN
+    noise = reduction["figures_of_merit"]["read_noise"]
+    assert abs(noise["value"] - read) < 3 * noise["error"]

@@ -38,6 +38,11 @@ class DarkLine:
         """Signal without light (ADU) after an exposure time (s)."""
         return self.bias + self.rate * exptime
 
+    def usual_charge(self, exptime: float) -> float:
+        """Dark signal (ADU) of the median pixel after an exposure time (s)."""
+        rate = finite_median(self.rate)
+        return rate * exptime if rate > 0 else 0.0
+
     def variance(self, exptime: float) -> F64:
         """Variance of `signal`, for frames of unit variance."""
         return self.per_mean + self.per_rate * (exptime - self.mean_time) ** 2

@@ -94,6 +94,7 @@ def flat_pair_sums(
     quantum: float,
     line_noise: "LineNoise",
     full: F32 | float = np.inf,
+    dark: float = 0.0,
 ) -> F64:
     """The same for flats, with the two frames of a pair scaled to equal level.
 
@@ -102,6 +103,7 @@ def flat_pair_sums(
     gain, read_noise, quantum : as in `pair_statistics`
     line_noise : of these pixels
     full : (y, x) or scalar, where samples saturate, ADU above bias and dark
+    dark : dark signal, ADU: it has shot noise too, and belongs to the level
     """
     blocks = [_NO_BLOCKS]
     for n in range(0, len(frames) - 1, 2):
@@ -115,7 +117,9 @@ def flat_pair_sums(
         # Full pixels beside those of an overscan would pass for half-full ones without noise.
         first[~lit(level) | (level + _NEARLY * noise > full)] = np.nan
         blocks.append(_blocks(first, second, gain, read_noise, quantum, line_noise.lines or ()))
-    return line_noise.put_back(bin_pairs(np.concatenate(blocks)))
+    every = np.concatenate(blocks)
+    every[:, 1] += dark * (every[:, 0] > 0)
+    return line_noise.put_back(bin_pairs(every))
 
 
 def _blocks(

@@ -36,7 +36,7 @@ _LINEAR_SHARE = 0.7
 _SATURATED_RUNG = 1e-2
 _KNOWN = 0.2  # largest relative error of a variance that replaces that of frames without light
 _GAIN_ERROR = 0.2
-_GUESS_ERROR = 0.1
+_GUESS_ERROR = 0.1  # relative error of gain and read noise in `Measuring`
 # variance of a sample, in square codes, above which rounding adds the same at every level
 _SMOOTH = 0.25 + SHEPPARD
 _LAMP = 0.3  # relative change of light per second that shows that flats are not of one lamp
@@ -136,7 +136,8 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     # Shot noise of the dark signal is not read noise; its size depends on the gain.
     for _ in range(2 if charge else 1):
         shot = charge / (job.gain if gain is None else gain.gain)
-        noise, own = read_noise(sums[0], lost, shot, folder, job)
+        error = _GUESS_ERROR if gain is None else gain.error / gain.gain
+        noise, own = read_noise(sums[0], lost, (shot, error * shot), folder, job)
         gain = _gain(sums, own, lost[0], wander, top, job)
     if gain is not None and (is_cut_off(job) or _tells_noise(gain)):
         noise, own = of_variance(gain.read_variance, job.quantum)

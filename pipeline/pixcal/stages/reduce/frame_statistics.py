@@ -261,8 +261,8 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
     step = max(job.quantum, cut.noise if cut else 0.0)
     every = [Combination(clip=job.options.clip_sigma, lamp=lamp, quantum=step) for _ in columns]
     pedestals: list[F32 | None] = [None] * len(columns)
+    exptime = group.exptime if job.flats_timed else 0.0
     if lamp:
-        exptime = group.exptime if job.flats_timed else 0.0
         lines = [column.line for column in columns]
         pedestals = [None if x is None else x.signal(exptime).astype(np.float32) for x in lines]
     for number, batch in enumerate(_batches(job, group, tuple(c.index for c in columns))):
@@ -277,21 +277,26 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
                 column.loud |= _loud(job, frames - levels[:, None, None])
             if lamp or group == job.read_series:
                 frames[:, column.loud] = np.nan
-                full = job.saturation - (0.0 if pedestal is None else pedestal)
-                _add_pairs(
-                    job, column, frames, levels, np.asarray(full, np.float32) if lamp else None
-                )
+                if lamp:
+                    full = job.saturation - (0.0 if pedestal is None else pedestal)
+                    dark = 0.0 if column.line is None else column.line.usual_charge(exptime)
+                    _add_flat_pairs(job, column, frames, levels, full, dark)
+                else:
+                    _add_dark_pairs(job, column, frames, levels)
     return [combination.result() for combination in every]
 
 
-def _add_pairs(job: Measuring, column: _Column, frames: F32, levels: F32, full: F32 | None) -> None:
-    """Add photon transfer of frames 0 and 1, 2 and 3, and so on; ``full`` (ADU) for flats."""
+def _add_flat_pairs(
+    job: Measuring, column: _Column, frames: F32, levels: F32, full: F32 | float, dark: float
+) -> None:
+    """Add photon transfer of frames 0 and 1, 2 and 3, and so on; ``full`` and ``dark`` in ADU."""
+    of_samples = job.gain, job.read_noise, job.quantum
+    column.pairs[1] += flat_pair_sums(frames, levels, *of_samples, column.line_noise, full, dark)
+
+
+def _add_dark_pairs(job: Measuring, column: _Column, frames: F32, levels: F32) -> None:
+    """The same of frames without light."""
     of_samples = job.read_noise, job.quantum
-    if full is not None:
-        column.pairs[1] += flat_pair_sums(
-            frames, levels, job.gain, *of_samples, column.line_noise, full
-        )
-        return
     frames -= levels[:, None, None]
     sums = dark_pair_sums(frames, *of_samples)
     column.line_noise.add(frames, sums, *of_samples)

@@ -68,16 +68,16 @@ def dark_charge(folder: Place, job: Measuring) -> float:
 
 
 def read_noise(
-    dark: F64, lost: Measure, shot: float, folder: Place, job: Measuring
+    dark: F64, lost: Measure, shot: Measure, folder: Place, job: Measuring
 ) -> tuple[Measure | None, Measure | None]:
-    """Noise without light (ADU), less a shot variance (ADU²), with and without rounding.
+    """Noise without light (ADU), less the variance of the dark signal, with and without rounding.
 
-    ``lost``: see `lost_in_blocks`.
+    ``lost``: see `lost_in_blocks`. ``shot``: the shot variance of the dark signal (ADU²).
     """
     whole = _read_variance(dark, lost)
     if whole is None:
         return None, None
-    variance = max(whole[0] - shot, SHEPPARD * job.quantum**2), whole[1]
+    variance = max(whole[0] - shot[0], SHEPPARD * job.quantum**2), math.hypot(whole[1], shot[1])
     if is_cut_off(job):
         own = max(variance[0] - SHEPPARD * job.quantum**2, (_LEAST * job.quantum) ** 2)
         off = _CUT_OFF + _COARSE_CUT_OFF * (job.quantum / math.sqrt(own)) ** 3
