@@ -410,3 +410,18 @@ def test_amplifiers_of_different_gain_are_in_the_error_of_the_gain(seed: int) ->
     assert fitted.chi2_reduced > 10
     assert fitted.gain == pytest.approx(GAIN, abs=3 * fitted.error)
     assert fitted.error < 0.02 * GAIN
+
+
+def test_flats_alone_tell_the_gain_below_a_step() -> None:
+    """Where the darks are known to be off the curve, they are so for every range of levels."""
+    rng = np.random.default_rng(6)
+    low = sum(bin_pairs(pair(rng, np.full((320, 320), n))) for n in np.linspace(100, 6e3, 9))
+    high = sum(bin_pairs(pair(rng, np.full((320, 320), n))) for n in np.linspace(7e3, 2e4, 9))
+    sums = np.asarray(low + high * np.array([1.0, 1.0, 1.4] + [1.0] * (high.shape[1] - 3)))
+    dark = 1.3 * (READ_ADU**2 + 1 / 12), 0.01
+    fitted = fit_gain(sums, dark, np.inf, without_dark=True)
+    assert fitted is not None
+    assert fitted.step
+    assert fitted.without_dark
+    assert fitted.gain == pytest.approx(GAIN, abs=3 * fitted.error)
+    assert fitted.error < 0.03 * GAIN

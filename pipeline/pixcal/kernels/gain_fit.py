@@ -97,7 +97,7 @@ def fit_gain(
         found = _fit_range(sums, known, highest, level_error, uneven, straight)
         return found and replace(found, error=math.hypot(found.error, common * found.gain))
 
-    def of_flats() -> GainFit | None:
+    def of_flats(highest: float) -> GainFit | None:
         lit = sums[(sums[:, 0] > 0) & (sums[:, 1] > 0)]
         if not len(lit):
             return None
@@ -105,7 +105,8 @@ def fit_gain(
         found = fit(highest, (read_variance[0], float((lit[:, 2] / lit[:, 0]).max())))
         return found and replace(found, without_dark=True)
 
-    whole = of_flats() if without_dark else fit(highest)
+    up_to = of_flats if without_dark else fit
+    whole = up_to(highest)
     if whole is None or straight or whole.chance > _OFF_CURVE:
         return whole
 
@@ -114,11 +115,11 @@ def fit_gain(
 
     best, top = whole, whole.levels[1] / _SHORTER
     if without_dark is None and points(1.001 * whole.levels[1]) >= 2 * _SPARE:
-        found = of_flats()
+        found = of_flats(highest)
         if found is not None and found.chance > _OFF_CURVE and found.error < best.error:
             best = found
     while points(top) >= _SPARE:
-        found = fit(top)
+        found = up_to(top)
         if found is not None and found.chance > _OFF_CURVE and found.error < best.error:
             best = replace(found, step=True)
         top /= _SHORTER

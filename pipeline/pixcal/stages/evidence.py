@@ -63,13 +63,16 @@ def evidence_of(
             run_dir, ingested, listed.name, listed.baseline_mm, (y, x), frames, origin, window
         )
     used = read_json(run_dir / "reduce" / "reduce.json")
+    without_dark = None if black is None else black.without_dark
+    if without_dark is None:
+        without_dark = bool(used["gain_e_per_adu"].get("without_dark"))
     return Evidence(
         fringes=fringes,
         stacks=_stacks(ingested, (y, x)),
         gain=float(used["gain_e_per_adu"]["used"]),
         read_noise=float(used["read_noise_e"]["used"]),
         amplifier_noise=float(used["read_noise_e"]["before_rounding"]),
-        read_noise_error=float(used["read_noise_e"]["error"] or np.nan),
+        read_noise_error=float(used["read_noise_e"].get("used_error") or np.nan),
         bias=maps["bias"].astype(float),
         dark_rate=maps["dark_rate"].astype(float),
         flat=maps["flat"].astype(float),
@@ -83,7 +86,7 @@ def evidence_of(
         photon_transfer=_photon_transfer(used["gain_e_per_adu"]),
         step_adu=max(int(ingested.quantum), 1),
         neighbours=tuple((y, x) for y, x in used["gain_e_per_adu"]["neighbours"]),
-        without_dark=bool(used["gain_e_per_adu"].get("without_dark")),
+        without_dark=without_dark,
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtr, chdtri
 
-from pixcal.kernels.robust import finite_median, lit, median
+from pixcal.kernels.robust import finite_median, lit, median, median_and_sigma
 from pixcal.model.arrays import F64, Mask
 
 MIN_RUNGS = 3  # fewest exposure times that separate a line from a curve
@@ -38,11 +38,6 @@ class DarkLine:
         """Signal without light (ADU) after an exposure time (s)."""
         return self.bias + self.rate * exptime
 
-    def usual_charge(self, exptime: float) -> float:
-        """Dark signal (ADU) of the median pixel after an exposure time (s)."""
-        rate = finite_median(self.rate)
-        return rate * exptime if rate > 0 else 0.0
-
     def variance(self, exptime: float) -> F64:
         """Variance of `signal`, for frames of unit variance."""
         return self.per_mean + self.per_rate * (exptime - self.mean_time) ** 2
@@ -71,6 +66,16 @@ def dark_line(means: Sequence[F64], counts: Sequence[F64], exptimes: Sequence[fl
             rate = per_rate = np.zeros_like(mean)
             mean_time = np.zeros_like(mean)
         return DarkLine(mean - rate * mean_time, rate, mean_time, 1 / total, per_rate)
+
+
+def usual_rate(rate: NDArray[Any], hot_sigma: float) -> float:
+    """Mean dark signal of pixels (any shape) that are not hot; zero if negative or unknown."""
+    known = rate[np.isfinite(rate)]
+    if not known.size:
+        return 0.0
+    centre, sigma = median_and_sigma(known)
+    usual = np.abs(known - centre) <= hot_sigma * sigma
+    return max(float(known[usual].mean()), 0.0) if usual.any() else 0.0
 
 
 @dataclass(frozen=True)

@@ -62,10 +62,11 @@ def without_cut_off(
 
     # Means of few frames scatter more than the levels: shrunk so that their scatter is that of the
     # levels, and further, towards the mean of all, for each pixel's likely level.
-    true = max(1 - sample**2 / frames / float(mean.var()), 0.0) if mean.var() > 0 else 0.0
-    centre = float(mean.mean())
-    alike = np.where(usual, centre + math.sqrt(true) * (found.mean - centre), found.mean)
-    likely = np.where(usual, centre + true * (found.mean - centre), found.mean)
+    common, true = float(mean.mean()), 0.0
+    if mean.var() > 0:
+        true = max(1 - sample**2 / frames / float(mean.var()), 0.0)
+    alike = np.where(usual, common + math.sqrt(true) * (found.mean - common), found.mean)
+    likely = np.where(usual, common + true * (found.mean - common), found.mean)
 
     def excess(noise: float) -> float:
         table = _of_cut_off(_LEVELS * noise, noise, step)

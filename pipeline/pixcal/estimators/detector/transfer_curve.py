@@ -25,7 +25,7 @@ CLIP = 6.0  # standard deviations beyond which a residual does not count
 _MIN_LEVELS = 3
 _ALIKE = 1e4
 _READ_KNOWN = 0.3  # assumed relative error of the variance of the read noise
-_EXACT = 1e-3  # the same within a level, where its error is counted for all levels together
+_EXACT = 1e-3  # the same where the error, common to all levels, is added afterwards
 
 
 @dataclass(frozen=True)
@@ -61,10 +61,11 @@ def _transfer_curve(evidence: Evidence, whole: bool) -> TransferCurve | None:
     darks = [_read_alone(s) for s in _without_light(evidence)]
     known = read_known(evidence)
     common = 0.0 if known is None else known * evidence.read_noise**2
+    exact = None if known is None else _EXACT
     points = []
     for stack in filter(_is_enough, evidence.ladder):
         sums = _of_stack(stack, evidence)
-        share = None if sums is None else shot_share([sums, *darks], counted, common and _EXACT)
+        share = None if sums is None else shot_share([sums, *darks], counted, exact)
         level = float((stack.adu.mean(axis=0) - evidence.bias)[evidence.good].mean())
         if share is not None and level > 0:
             points.append((level * evidence.gain, *share))
@@ -81,7 +82,7 @@ def _transfer_curve(evidence: Evidence, whole: bool) -> TransferCurve | None:
     found = covariance @ (design @ weights @ share)
     errors = np.sqrt(np.diag(covariance))
     at_zero, rise = zip(found.tolist(), errors.tolist(), strict=True)
-    return TransferCurve(*at_zero, *rise, top, level, share, error)
+    return TransferCurve(*at_zero, *rise, top, level, share, np.hypot(error, common / level))
 
 
 def _read_alone(sums: F64) -> F64:
@@ -113,7 +114,7 @@ def shot_share(
             continue
         normal, right = np.array([[s11, s12], [s12, s22]]), np.array([p1, p2])
         scatter = square / n - own
-        prior = scatter / ((own and known) or _READ_KNOWN) ** 2
+        prior = scatter / (known if own and known is not None else _READ_KNOWN) ** 2
         normal[1, 1] += prior
         right[1] += prior * own
         inverse = np.linalg.inv(normal)

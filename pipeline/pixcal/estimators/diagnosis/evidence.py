@@ -162,7 +162,8 @@ class Evidence:
     # lags (rows, columns) whose covariance that gain includes
     neighbours: tuple[tuple[int, int], ...] = ()
     lowest_adu: float | None = None  # code at which noise is cut off; None: it is not
-    # whether that gain leaves out the noise without light, as it differs from that of flats
+    # whether the gain of `photon_transfer` leaves out noise without light, which is not that of
+    # flats
     without_dark: bool = False
     read_noise_error: float = np.nan  # of ``read_noise``, e- rms; nan when unknown
     step_adu: int = 1  # all calibration samples are multiples of it

@@ -70,10 +70,9 @@ def look_at(
     fringes = acquisition.frames.fringes
     first, parts = chosen_windows(shape, 0 if fringes else frames_of_half(ingested.tables))
     pixels = (first[0][1] - first[0][0]) * (first[1][1] - first[1][0])
-    saturated = read_json(run_dir / "reduce" / "reduce.json")["saturation_adu"]
-    of_gain = read_json(run_dir / "reduce" / "reduce.json")["gain_e_per_adu"]
-    black = Black(ingested.cut_off, of_gain.get("without_dark"))
-    own = split(ingested.tables, pixels, saturated.get("full_frames", ()))
+    reduced = read_json(run_dir / "reduce" / "reduce.json")
+    black = Black(ingested.cut_off, reduced["gain_e_per_adu"].get("without_dark"))
+    own = split(ingested.tables, pixels, reduced["saturation_adu"].get("full_frames", ()))
     _enough(own.test)
     runtime, few, room = _memory(own.test, pixels, runtime)
     dtypes = {name: array.dtype for name, array in ingested.arrays.items()}

@@ -48,7 +48,7 @@ class CutOff:
         noise, code = float(upper - lower), 0
         if len(samples) > 1 and of_whole_numbers(frames):
             counts = _Counts.of(samples)
-            code = _pile(counts, lower) if noise > _NOISE * step else _edge(counts, step)
+            code = _pile(counts, lower, step) if noise > _NOISE * step else _edge(counts, step)
             # Else a quiet camera: all usual pixels are at this code, and a few warm ones above.
             leaving = samples[1:][samples[:-1] == code] > code
             code = code if code > 0 and leaving.mean() > _LEAVE else 0
@@ -91,12 +91,12 @@ class _Counts(NamedTuple):
         return np.asarray(self.number > max(_SHARE * self.number.sum(), _COUNT))
 
 
-def _pile(found: _Counts, most: float) -> int:
+def _pile(found: _Counts, most: float, step: float) -> int:
     """Code up to ``most`` at which samples pile up, with hardly any below; 0 if there is none."""
     low = found.many() & (found.code < most)
     piled = low & (found.below < _BELOW * found.number)
     if not piled.any():
-        return _spread_pile(found, low)
+        return _spread_pile(found, low, step)
     at = int(np.flatnonzero(piled)[-1])
     # Rounding after the cut may spread the pile over two codes. Noise alone is log-concave.
     after = found.number[at + 1 : at + 4].astype(float)
@@ -105,11 +105,13 @@ def _pile(found: _Counts, most: float) -> int:
     return int(found.code[at])
 
 
-def _spread_pile(found: _Counts, low: Mask) -> int:
-    """Code of a pile of which fewer samples lie at the code below; 0 if there is none."""
+def _spread_pile(found: _Counts, low: Mask, step: float) -> int:
+    """Second code of a pile whose first code has few of its samples; 0 if there is none."""
     at = int(np.argmax(low))
     near = found.number[at : at + 3].astype(float)
     if at == 0 or len(near) < 3 or found.below[at - 1] > _BELOW * near[0]:
+        return 0
+    if found.code[at + 2] - found.code[at] != 2 * step:
         return 0
     # Noise alone is log-concave.
     most = near[1] ** 2 / near[2]

@@ -20,7 +20,7 @@ from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.read_noise import (
     bias_wander,
     code_counts,
-    dark_charge,
+    dark_rate,
     is_cut_off,
     lost_in_blocks,
     of_variance,
@@ -35,6 +35,9 @@ ROUNDING_ADU = math.sqrt(SHEPPARD)  # noise of a converter that rounds to whole 
 _LINEAR_SHARE = 0.7
 _SATURATED_RUNG = 1e-2
 _KNOWN = 0.2  # largest relative error of a variance that replaces that of frames without light
+# least relative error of the noise of frames without light that is not on the curve of the flats,
+# if these do not tell it
+_OFF_CURVE = 0.15
 _GAIN_ERROR = 0.2
 _GUESS_ERROR = 0.1  # relative error of gain and read noise in `Measuring`
 # variance of a sample, in square codes, above which rounding adds the same at every level
@@ -111,7 +114,10 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     # Full pixels saturate the flats even if the converter does not saturate.
     points = transfer_points(add_neighbours(sums[1], sums[0]).sums)
     well = saturation(points)
-    full = usable & (nearly | (levels > sum(well))) if well else np.zeros_like(usable)
+    rate = dark_rate(folder, job)
+    times = np.array([group.exptime for group in job.flat])
+    charged = levels + rate * times if job.flats_timed and job.flat else levels
+    full = usable & (nearly | (charged > sum(well))) if well else np.zeros_like(usable)
     usable &= ~full
     light = _light(tables, levels, usable, job)
     medians = usual(job, folder, light)
@@ -128,10 +134,9 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     ends = full_level(points), math.inf if well is None else well[0]
     top = float(np.fmin(job.saturation - medians.bias, ends[0] if ends[0] < math.inf else ends[1]))
     straight = None
-    times = np.array([group.exptime for group in job.flat])
     if job.flats_timed and job.flat and _one_lamp(times[usable], levels[usable]):
         straight = linearity(times, levels, usable)
-    charge = dark_charge(folder, job)
+    charge = 0.0 if job.read_series is None else rate * job.read_series.exptime
     gain, wander, lost = None, bias_wander(job), lost_in_blocks(job)
     # Shot noise of the dark signal is not read noise; its size depends on the gain.
     for _ in range(2 if charge else 1):
@@ -141,6 +146,8 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
         gain = _gain(sums, own, lost[0], wander, top, job)
     if gain is not None and (is_cut_off(job) or _tells_noise(gain)):
         noise, own = of_variance(gain.read_variance, job.quantum)
+    elif gain is not None and gain.without_dark:
+        noise, own = (n and (n[0], max(n[1], _OFF_CURVE * n[0])) for n in (noise, own))
     return Summary(
         declared,
         job.quantum or 1.0,

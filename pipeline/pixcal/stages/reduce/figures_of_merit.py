@@ -38,7 +38,7 @@ Json = dict[str, Any]
 _NO_ERROR = 1e-9  # ADU/s: below it all samples have one code
 # relative error of the change of dark current by correcting noise that is cut off: it is not known
 # which distribution the noise had
-_CUT_OFF = 0.5
+_OF_CORRECTION = 0.5
 _WELL = 0.97  # share of the converter's range below which saturation is due to full wells
 
 
@@ -246,30 +246,41 @@ def _dark_current(found: Json, made: Build, source: Ingested, scale: float, midd
     good = ArrayReader(folder / "mask").read(*middle) == 0
     if not good.any():
         return
-    rate = scale * float(ArrayReader(folder / "dark_rate").read(*middle)[good].mean(dtype=float))
+    rates = scale * ArrayReader(folder / "dark_rate").read(*middle)
     gain = found["conversion_gain"]["value"]
+    rows = _middle_rows(middle)
     slope = dark_slope(*_dark_means(source, middle, good))
     error = gain * slope[1] if slope is not None and slope[1] > _NO_ERROR else None
     if error is not None and slope is not None and source.cut_off:
-        error = math.hypot(error, _CUT_OFF * (rate - gain * slope[0]))
+        corrected = rates[rows][good[rows]].mean(dtype=float)
+        error = math.hypot(error, _OF_CORRECTION * (corrected - gain * slope[0]))
     note = _temperature(source.tables)
     timed = any(source.tables["dark"]["exptime_s"])
     unit = "e-/s" if timed else "e-/exposure"
-    found["dark_current"] = _figure("dark current", unit, (rate, error), note)
+    found["dark_current"] = _figure(
+        "dark current", unit, (float(rates[good].mean(dtype=float)), error), note
+    )
 
 
 def _dark_means(source: Ingested, middle: Window, good: Mask) -> tuple[F64, F64]:
-    """Exposure time (s) and mean (ADU) of each frame without light, over a window."""
-    (y0, y1), columns = middle
-    rows = y0 + (y1 - y0) // CHUNK[1] // 2 * CHUNK[1]
-    window = (rows, min(rows + CHUNK[1], y1)), columns
-    pixels = good[window[0][0] - y0 : window[0][1] - y0]
+    """Exposure time (s) and mean (ADU) of each frame without light, in the window's middle rows."""
+    (y0, _), columns = middle
+    rows = _middle_rows(middle)
+    window = (y0 + rows.start, y0 + rows.stop), columns
+    pixels = good[rows]
     times, means = [], []
     for group in source.exposures.dark if pixels.any() else ():
         for samples in frames_of(source, group.array, group.frames, window):
             times.append(group.exptime)
             means.append(float(samples[pixels].mean(dtype=float)))
     return np.array(times), np.array(means)
+
+
+def _middle_rows(middle: Window) -> slice:
+    """Rows of a chunk in the middle of a window, from its first row on."""
+    height = middle[0][1] - middle[0][0]
+    first = height // CHUNK[1] // 2 * CHUNK[1]
+    return slice(first, min(first + CHUNK[1], height))
 
 
 def _temperature(tables: Mapping[str, Mapping[str, Any]]) -> str:

@@ -22,6 +22,7 @@ from pixcal.estimators.detector.calibration import (
     relative_response,
     step_levels,
     unsaturated,
+    usual_rate,
     usual_variance,
 )
 from pixcal.estimators.detector.cut_off import without_cut_off
@@ -84,7 +85,7 @@ class Measuring:
     full: float
     quantum: float  # step of the samples (ADU), 0 for real numbers
     cut_off: Mapping[str, CutOff]  # arrays whose noise is cut off at their lowest code
-    # whether the gain leaves out their noise, which is not that of flats; None: to be found
+    # whether the gain leaves out the noise of frames without light; None: to be found
     without_dark: bool | None
     gain: float  # gain, read_noise: rough values (e-/ADU, ADU)
     read_noise: float
@@ -261,13 +262,17 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
     step = max(job.quantum, cut.noise if cut else 0.0)
     every = [Combination(clip=job.options.clip_sigma, lamp=lamp, quantum=step) for _ in columns]
     pedestals: list[F32 | None] = [None] * len(columns)
-    exptime = group.exptime if job.flats_timed else 0.0
+    charges = [0.0] * len(columns)
     if lamp:
-        lines = [column.line for column in columns]
-        pedestals = [None if x is None else x.signal(exptime).astype(np.float32) for x in lines]
+        exptime = group.exptime if job.flats_timed else 0.0
+        hot = job.options.hot_sigma
+        for n, line in enumerate(column.line for column in columns):
+            if line is not None:
+                pedestals[n] = line.signal(exptime).astype(np.float32)
+                charges[n] = exptime * usual_rate(line.rate, hot) if exptime else 0.0
     for number, batch in enumerate(_batches(job, group, tuple(c.index for c in columns))):
-        for column, combination, pedestal, samples in zip(
-            columns, every, pedestals, batch, strict=True
+        for column, combination, pedestal, charge, samples in zip(
+            columns, every, pedestals, charges, batch, strict=True
         ):
             frames = _usable(job, samples, lamp)
             if pedestal is not None:
@@ -279,8 +284,7 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
                 frames[:, column.loud] = np.nan
                 if lamp:
                     full = job.saturation - (0.0 if pedestal is None else pedestal)
-                    dark = 0.0 if column.line is None else column.line.usual_charge(exptime)
-                    _add_flat_pairs(job, column, frames, levels, full, dark)
+                    _add_flat_pairs(job, column, frames, levels, full, charge)
                 else:
                     _add_dark_pairs(job, column, frames, levels)
     return [combination.result() for combination in every]
@@ -295,7 +299,7 @@ def _add_flat_pairs(
 
 
 def _add_dark_pairs(job: Measuring, column: _Column, frames: F32, levels: F32) -> None:
-    """The same of frames without light."""
+    """Add the noise of frames without light, 0 and 1, 2 and 3, and so on."""
     of_samples = job.read_noise, job.quantum
     frames -= levels[:, None, None]
     sums = dark_pair_sums(frames, *of_samples)

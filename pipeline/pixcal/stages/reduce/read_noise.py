@@ -5,12 +5,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pixcal.estimators.detector.calibration import usual_rate
 from pixcal.estimators.detector.code_density import step_of
 from pixcal.estimators.detector.emva import Measure
 from pixcal.estimators.detector.missing_codes import missing_codes, noise_before_missing_codes
 from pixcal.estimators.detector.pair_noise import shared_by_blocks
 from pixcal.kernels.photon_transfer import BLOCK
-from pixcal.kernels.robust import median_and_sigma
 from pixcal.kernels.rounding import SHEPPARD, noise_before_rounding
 from pixcal.model.arrays import F32, F64
 from pixcal.stages.reduce.calibration import on_grid
@@ -56,15 +56,11 @@ def lost_in_blocks(job: Measuring) -> Measure:
     return mean, float(np.std(found, ddof=1)) / math.sqrt(len(found)) if len(found) > 1 else mean
 
 
-def dark_charge(folder: Place, job: Measuring) -> float:
-    """Mean dark signal (ADU) of pixels that are not hot, in the read-noise series."""
-    series = job.read_series
-    if series is None or not series.exptime > 0:
+def dark_rate(folder: Place, job: Measuring) -> float:
+    """Mean dark signal (ADU/s) of pixels that are not hot; zero if it was not measured."""
+    if not job.dark:
         return 0.0
-    rate = on_grid(folder, job.shape, ("dark_rate",))[0]
-    median, sigma = median_and_sigma(rate)
-    usual = np.abs(rate - median) <= job.options.hot_sigma * sigma
-    return max(float(rate[usual].mean()), 0.0) * series.exptime if usual.any() else 0.0
+    return usual_rate(on_grid(folder, job.shape, ("dark_rate",))[0], job.options.hot_sigma)
 
 
 def read_noise(

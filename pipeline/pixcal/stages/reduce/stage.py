@@ -110,6 +110,7 @@ class Reduction:
                 "with_rounding": total[0] if total else None,
                 "before_rounding": summary.noise_before_rounding_e(gain),
                 "used": self.bounds.read_noise,
+                "used_error": gain * summary.read_noise[1] if summary.read_noise else None,
             },
         }
 
