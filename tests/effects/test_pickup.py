@@ -56,7 +56,8 @@ def test_tones_are_found(
     rows: tuple[float, ...],
 ) -> None:
     effect = Pickup(rms, columns, rows)
-    found = Pickup.estimate(in_the_dark(acquired(), make_effect_bench(), effect))
+    bench = make_effect_bench()
+    found = Pickup.estimate(in_the_dark(acquired(), bench, effect))
     assert found is not None
     assert isinstance(found.effect, Pickup)
     assert found.significance > 5
@@ -67,7 +68,9 @@ def test_tones_are_found(
         n = int(near.argmin())
         assert near[n] < 2e-3, at
         assert found.effect.rms[n] == pytest.approx(size, abs=4 * found.errors[f"rms[{n}]"])
-    assert found.size["value"] == pytest.approx(effect.read_variance**0.5, rel=0.4)
+    assert found.size["value"] == pytest.approx(
+        effect.read_variance(bench.detector) ** 0.5, rel=0.4
+    )
 
 
 def test_sizes_are_within_their_errors() -> None:

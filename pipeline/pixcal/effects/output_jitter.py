@@ -14,9 +14,11 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.variance_components import walk_modes
 from pixcal.kernels.processes import brownian
 from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.scene import Rows
 from pixcal.kernels.significance import SIGNIFICANT, root_with_error, sigmas_of_best, sigmas_of_chi2
 from pixcal.kernels.synthesis import walk_normals
 from pixcal.model.arrays import F32, F64, Indices, Mask
+from pixcal.model.bench import SimulatedDetector
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
@@ -73,12 +75,21 @@ class OutputJitter(Effect):
         (32,), unit="px", low=0, doc="first column of each output but the first, on the chip"
     )
 
+    def read_variance(self, detector: SimulatedDetector) -> float:
+        numbers = self._numbers(detector, (0, detector.shape[0]))
+        shares = np.bincount(numbers.ravel()) / numbers.size
+        return float(self.output_rms**2 * (1 - np.square(shares).sum()))
+
     def readout(self, adu: F32, shot: Shot) -> F32:
         detector = shot.bench.detector
-        rows = np.arange(*shot.rows) + detector.origin[0]
+        levels = (self._levels(shot) / detector.gain_e_per_adu).astype(np.float32)
+        return adu + levels[self._numbers(detector, shot.rows)]
+
+    def _numbers(self, detector: SimulatedDetector, of: Rows) -> Indices:
+        """Number (y, x) of the output that reads each pixel of some rows."""
+        rows = np.arange(*of) + detector.origin[0]
         columns = np.arange(detector.shape[1]) + detector.origin[1]
-        numbers = output_numbers(self.row_edges, self.column_edges, rows, columns)
-        return adu + (self._levels(shot) / detector.gain_e_per_adu).astype(np.float32)[numbers]
+        return output_numbers(self.row_edges, self.column_edges, rows, columns)
 
     def _levels(self, shot: Shot) -> F64:
         """Levels (n,) of the outputs in a frame, e-."""

@@ -16,6 +16,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_largest
 from pixcal.kernels.synthesis import add_waves, turns
 from pixcal.model.arrays import C128, F32, F64, I64, Mask
+from pixcal.model.bench import SimulatedDetector
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate, Stage
@@ -73,8 +74,7 @@ class Pickup(Effect):
         if not len(self.rms) == len(self.columns) == len(self.rows):
             raise InputError("rms, columns and rows: give as many numbers of each, one for a tone")
 
-    @property
-    def read_variance(self) -> float:
+    def read_variance(self, detector: SimulatedDetector) -> float:
         return float(np.square(self.rms).sum())
 
     def readout(self, adu: F32, shot: Shot) -> F32:

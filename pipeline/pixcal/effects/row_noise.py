@@ -15,6 +15,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.processes import flicker, flicker_power
 from pixcal.kernels.significance import root_with_error, sigmas_of_best
 from pixcal.model.arrays import F32, F64, I64, Mask
+from pixcal.model.bench import SimulatedDetector
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
@@ -70,6 +71,14 @@ class RowNoise(Effect):
         0.0,
         doc="noise from row to row, rms; half of its variance is shared with the row after next",
     )
+
+    def read_variance(self, detector: SimulatedDetector) -> float:
+        white = self.row_rms, self.interlace_rms, self.column_rms, self.alternate_rms
+        rows = detector.shape[0]
+        power = flicker_power(rows)
+        # All modes but the first and, of an even number, the last stand for two.
+        of_flicker = (2 * power.sum() - (0 if rows % 2 else power[-1])) / rows
+        return float(np.square(white).sum() + of_flicker * self.flicker_rms**2)
 
     def readout(self, adu: F32, shot: Shot) -> F32:
         rng = shot.recording.pixel_rng(self.name, shot.frame)

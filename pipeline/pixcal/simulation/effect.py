@@ -16,6 +16,7 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.arrays import F32, F64
+from pixcal.model.bench import SimulatedDetector
 from pixcal.model.errors import InputError
 from pixcal.simulation.forward import DOMAINS, ForwardModel, Stage, numbers, with_numbers
 from pixcal.simulation.frame_changes import acts_on_frames_alone
@@ -224,9 +225,8 @@ class Effect(ForwardModel):
         found = cls.estimate(evidence)
         return None if found is None else found.significance
 
-    @property
-    def read_variance(self) -> float:
-        """Variance (e-²) that it adds to every sample, where this is part of the read noise."""
+    def read_variance(self, detector: SimulatedDetector) -> float:
+        """Variance (e-²) of samples about the frame's mean that it adds to the read noise."""
         return 0.0
 
     @classmethod

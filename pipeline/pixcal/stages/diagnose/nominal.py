@@ -150,7 +150,7 @@ class NominalBench:
         change = photon_transfer_change(
             bench, measured, effects, self.recordings, self.gain.neighbours, measured.maps
         )
-        added = sum(effect.read_variance for effect in effects)
+        added = sum(effect.read_variance(self.bench.detector) for effect in effects)
         measured = self._electronics(measured, (seed, own_seed), change, added)
         camera = Camera(bench, rows, [measured, *effects], maps=measured.maps)
         arrays = {
