@@ -272,6 +272,19 @@ def test_a_gain_that_nothing_tells_is_asked_for(
     assert "give it in e-/ADU" in str(raised.value)
 
 
+def reduced_ladders(acquisition: Path, read: float) -> dict[str, Any]:
+    """Contents of ``reduce.json`` of darks and flats without a declared gain."""
+    listed = {
+        "schema": "pixcal/acquisition/1",
+        "detector": {"name": "CAM", "pitch_um": 5.5, "read_noise_e": read},
+        "frames": {kind: [f"{kind}*.fits"] for kind in ("dark", "flat")},
+    }
+    (acquisition / "acquisition.yaml").write_text(yaml.safe_dump(listed))
+    run = pixcal.ingest(acquisition, acquisition.with_name("run"))
+    found: dict[str, Any] = pixcal.reduce(run).reduction
+    return found
+
+
 @pytest.mark.parametrize("seed", [3, 4])
 def test_a_camera_that_clips_black_before_it_adds_an_offset(seed: int, tmp_path: Path) -> None:
     """Darks in pairs, of a signal that grows; the noise of rounding spreads the clipped samples."""
@@ -289,13 +302,7 @@ def test_a_camera_that_clips_black_before_it_adds_an_offset(seed: int, tmp_path:
             samples = np.rint(np.maximum(analogue, 0) / gain + 11.81 + spread).astype(np.uint16)
             header = fits.Header({"EXPTIME": float(seconds)})
             fits.writeto(acquisition / f"{kind}{n}.fits", samples, header)
-    listed = {
-        "schema": "pixcal/acquisition/1",
-        "detector": {"name": "CAM", "pitch_um": 5.5, "read_noise_e": read},
-        "frames": {kind: [f"{kind}*.fits"] for kind in ("dark", "flat")},
-    }
-    (acquisition / "acquisition.yaml").write_text(yaml.safe_dump(listed))
-    reduction = pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run")).reduction
+    reduction = reduced_ladders(acquisition, read)
     assert any("cut off at code 12" in warning for warning in reduction["warnings"])
     found = reduction["figures_of_merit"]
     noise = np.hypot(read, gain / np.sqrt(12))
@@ -317,13 +324,7 @@ def test_shot_noise_of_the_dark_signal_is_not_taken_for_that_of_light(tmp_path: 
             samples = np.rint(200 + (charge + rng.normal(0, read, charge.shape)) / GAIN)
             header = fits.Header({"EXPTIME": float(seconds)})
             fits.writeto(acquisition / f"{kind}{n}.fits", samples.astype(np.uint16), header)
-    listed = {
-        "schema": "pixcal/acquisition/1",
-        "detector": {"name": "CAM", "pitch_um": 5.5, "read_noise_e": read},
-        "frames": {kind: [f"{kind}*.fits"] for kind in ("dark", "flat")},
-    }
-    (acquisition / "acquisition.yaml").write_text(yaml.safe_dump(listed))
-    reduction = pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run")).reduction
+    reduction = reduced_ladders(acquisition, read)
     gain = reduction["figures_of_merit"]["conversion_gain"]
     assert abs(gain["value"] - GAIN) < 3 * gain["error"] < 0.06 * GAIN
     noise = reduction["figures_of_merit"]["read_noise"]
