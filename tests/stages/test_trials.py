@@ -1,6 +1,7 @@
 """Simulations of a bench: none is made twice, and parameters are moved by their errors."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from pixcal.engine.run import Runtime
 from pixcal.estimators.test_statistics import Curve
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose import trial
-from pixcal.stages.diagnose.search import LEAST_SIMULATIONS, SEARCH_S, SIMULATIONS, affordable
+from pixcal.stages.diagnose.search import LEAST_SIMULATIONS, SEARCH_SAMPLES, SIMULATIONS, affordable
 from pixcal.stages.diagnose.trial import Trials
 
 LAG, ROWS = Lag(share=0.002), RowNoise()
@@ -28,9 +29,9 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[tuple[Effect, ...], int,
         items.append(item)
         effects, seed, window = item
         if any(isinstance(e, Lag) and e.share > 0.0021 for e in effects):
-            return "too much lag", 2.0
+            return "too much lag"
         value = np.array([float(seed + 10 * window)])
-        return {("lines", "detector"): Curve(np.zeros(1), value)}, 2.0 + seed % 3
+        return {("lines", "detector"): Curve(np.zeros(1), value)}
 
     monkeypatch.setattr(trial, "_kept_or_made", simulated)
     return items
@@ -55,13 +56,16 @@ def test_the_first_are_exact_and_the_others_moved(tmp_path: Path, made: list[Any
     assert all(ROWS in effects for effects, *_ in made)
 
 
-def test_time_is_that_of_all_windows_of_a_simulation(tmp_path: Path, made: list[Any]) -> None:
-    some = trials(tmp_path, windows=3)
-    assert affordable(some.seconds) == SIMULATIONS  # None is made yet.
-    some.curves([(ROWS,)], 6, "test")
-    assert some.seconds == pytest.approx(9.0)
-    assert affordable(some.seconds) == LEAST_SIMULATIONS
-    assert affordable(2.0) == SEARCH_S / 2
+def test_samples_of_all_windows_limit_a_search(tmp_path: Path) -> None:
+    held_out = {"bias": np.arange(7), "fringes/vertical": np.arange(29)}
+    windows: Any = tuple(
+        SimpleNamespace(part=((5, 5 + rows), (3, 14)), test=held_out) for rows in (13, 17)
+    )
+    some = Trials(windows, tmp_path, Runtime(cluster="sync", quiet=True))
+    assert some.samples == (13 + 17) * 11 * (7 + 29)
+    assert affordable(some.samples) == affordable(0) == SIMULATIONS
+    assert affordable(SEARCH_SAMPLES // 200) == 200
+    assert affordable(SEARCH_SAMPLES) == LEAST_SIMULATIONS
 
 
 def test_what_is_refused_as_moved_is_taken_as_it_was(tmp_path: Path, made: list[Any]) -> None:

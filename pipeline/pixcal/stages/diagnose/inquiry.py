@@ -93,7 +93,7 @@ def inquire(
         reference, data = _nominal(trials, look, base, run_dir)
 
     asking = _Asking(look, base, kinds, candidates, trials)
-    most = affordable(trials.seconds)
+    most = affordable(trials.samples)
     search = Search(reference, data, asking.simulate, asking.again, most)
     return Inquiry(base, look, trials, reference, data, search, search.run(candidates))
 

@@ -48,15 +48,15 @@ PROMISING = 0.25  # share of the best gain above which a candidate is simulated 
 KNOWN_TO = 3.0  # largest significance credited after one simulation: its scatter is unknown
 MAX_CAUSES = 5  # most causes that are accepted
 AS_GOOD = 0.1  # relative difference from the best gain within which candidates are equal
-# most simulations of a search (two causes take about 80); processor time (s) that limits them if
-# they are slow; least number even then
-SIMULATIONS, SEARCH_S, LEAST_SIMULATIONS = 300, 400.0, 100
+# most simulations of a search (two causes take about 80); number of samples that limits them if
+# each has many; least number even then. Never the time: results must not depend on the machine.
+SIMULATIONS, SEARCH_SAMPLES, LEAST_SIMULATIONS = 300, 3_000_000_000, 100
 SIMILAR = 0.7  # largest fraction of a candidate's significance that other effects may produce
 
 
-def affordable(seconds: float) -> int:
-    """Number of simulations that a search may use; each takes ``seconds`` of processor time."""
-    return int(np.clip(SEARCH_S / max(seconds, 1e-3), LEAST_SIMULATIONS, SIMULATIONS))
+def affordable(samples: int) -> int:
+    """Number of simulations that a search may use; each has a number of ``samples``."""
+    return int(np.clip(SEARCH_SAMPLES // max(samples, 1), LEAST_SIMULATIONS, SIMULATIONS))
 
 
 Simulate = Callable[[Sequence[Effects], int, str, Sequence[str]], Sequence[list[Curves] | str]]

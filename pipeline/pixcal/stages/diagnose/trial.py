@@ -1,7 +1,7 @@
 """Simulations of the analysed windows, processed by the same stages as the data."""
 
+import math
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -71,13 +71,15 @@ class Trials:
     estimates: Mapping[str, Estimate] = field(default_factory=dict)
     exact: int = 0
     _made: dict[tuple[frozenset[Effect], int], list[Curves] | str] = field(default_factory=dict)
-    _seconds: list[float] = field(default_factory=list)
 
     @property
-    def seconds(self) -> float:
-        """Median processor time (s) of a simulation, all windows together."""
-        # Median, because the first simulations compile kernels.
-        return float(np.median(self._seconds or [0.0])) * len(self.windows)
+    def samples(self) -> int:
+        """Number of samples of a simulation, all windows together."""
+        return sum(
+            math.prod(last - first for first, last in window.part)
+            * sum(len(frames) for frames in window.test.values())
+            for window in self.windows
+        )
 
     def curves(
         self,
@@ -126,14 +128,13 @@ class Trials:
         again = [
             n
             for n, (one, other) in enumerate(zip(moved, items, strict=True))
-            if isinstance(results[n][0], str) and one != other
+            if isinstance(results[n], str) and one != other
         ]
         if again:
             exact = run_tasks(work, [items[n] for n in again], self.runtime, label=label)
             for n, result in zip(again, exact, strict=True):
                 results[n] = result
-        self._seconds.extend(seconds for _, seconds in results)
-        return [result for result, _ in results]
+        return results
 
     def _moved(self, effects: Effects, seed: int) -> Effects:
         known = self.estimates if seed >= self.exact else {}
@@ -154,8 +155,8 @@ def _kept_or_made(
     scratch: Path,
     signatures: tuple[Signature, ...],
     item: tuple[Effects, int, int],
-) -> tuple[Curves | str, float]:
-    """A simulation from an interrupted run, or a new one; and its processor time, s."""
+) -> Curves | str:
+    """A simulation from an interrupted run, or a new one."""
     effects, seed, number = item
     on = sorted((e.name, to_plain(e)) for e in effects)
     name = digest(on, seed, number, windows[number].part, sorted(k.name for k in signatures))
@@ -163,21 +164,18 @@ def _kept_or_made(
     plain = _kept(file)
     if plain is not None:
         if "curves" not in plain:
-            return str(plain["refused"]), plain["seconds"]
+            return str(plain["refused"])
         return {
             (key, of): Curve(np.array(x, float), np.array(value, float))
             for key, of, x, value in plain["curves"]
-        }, plain["seconds"]
-    begun = time.thread_time()
+        }
     made = _made(windows, signatures, item)
-    seconds = time.thread_time() - begun
     if isinstance(made, str):
         plain = {"refused": made}
     else:
         plain = {"curves": [[*key, c.x.tolist(), c.value.tolist()] for key, c in made.items()]}
-    plain["seconds"] = seconds
     write_json(file, plain | {"seal": digest(plain)})
-    return made, seconds
+    return made
 
 
 def _kept(file: Path) -> dict[str, Any] | None:
