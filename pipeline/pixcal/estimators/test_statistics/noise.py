@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
+from scipy.integrate import quad
 from scipy.ndimage import maximum_filter
+from scipy.special import chdtr
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics import Curve, family, statistic
@@ -138,7 +140,7 @@ def outliers(look: Look) -> Curve:
 
 
 @of_noise(
-    "outliers in dark frames",
+    "outliers in bias and dark frames",
     "outliers",
     x="sigma, low then high",
     unit="2 √number",
@@ -146,9 +148,10 @@ def outliers(look: Look) -> Curve:
     floor=1.0,
 )
 def dark_outliers(evidence: Evidence) -> Curve | None:
-    """The same for darks, which have longer exposures and less noise."""
+    """The same without light, where noise is low and darks have long exposures."""
     limits, counts = np.array(OUTLIERS), np.zeros((2, len(OUTLIERS)))
-    stacks = [s for s in evidence.of_kind("dark") if len(s.adu) >= MIN_DARKS]
+    every = (*evidence.of_kind("bias"), *evidence.of_kind("dark"))
+    stacks = [stack for stack in every if len(stack.adu) >= MIN_DARKS]
     for stack in stacks:
         rest, sigma = evidence.dark_noise(stack)
         # The read noise is that of most pixels.
@@ -179,7 +182,11 @@ def pixel_peakedness(look: Look) -> Curve:
     sets=False,
 )
 def read_noise(evidence: Evidence) -> Curve | None:
-    """Quantiles over the pixels, masked ones if they jump, of variance over the read noise's."""
+    """Quantiles over the pixels of variance over that of the read noise.
+
+    Masked pixels count if they jump, the sample of a pixel that is furthest off does not: a
+    particle hits it in one frame.
+    """
     stacks = [s for s in evidence.of_kind("bias") if len(s.adu) >= 8]
     if not stacks or not evidence.dithered:
         return None
@@ -192,9 +199,19 @@ def read_noise(evidence: Evidence) -> Curve | None:
     # A median of integers jumps by a code.
     level = frame_means(stacks[0].adu, evidence.good).astype(np.float32)
     frames = stacks[0].adu - level[:, None, None]
-    variance = np.var(frames, axis=0, ddof=1) * (evidence.gain / evidence.read_noise) ** 2
+    variance = calm_variance(frames) * (evidence.gain / evidence.read_noise) ** 2
     counted = evidence.good | jumping(frames)
     return Curve(np.array(QUANTILES), ranges_about(variance[counted], QUANTILES))
+
+
+def calm_variance(frames: F32) -> F64:
+    """Variance (y, x) of normal frames (t, y, x), without each pixel's furthest sample."""
+    count, rest = len(frames), frames - frames.mean(axis=0)
+    rest *= rest
+    total = rest.sum(axis=0, dtype=float) - rest.max(axis=0) * count / (count - 1)
+    # The largest of the squares of so many normal numbers.
+    largest, _ = quad(lambda x: 1 - chdtr(1, x) ** count, 0, np.inf)
+    return np.asarray(total / (count - 1 - largest))
 
 
 def jumping(frames: F32) -> Mask:
