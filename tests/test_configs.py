@@ -19,7 +19,7 @@ FILES = sorted(CONFIGS.glob("*.yaml"))
 
 def frames_of(bench: Bench) -> int:
     f = bench.frames
-    ladders = [rung.count for rung in (*f.darks, *f.flats)]
+    ladders = [step.count for step in (*f.darks, *f.flats)]
     return f.bias + sum(ladders) + sum(s.count for s in f.fringes)
 
 

@@ -87,7 +87,7 @@ def test_which_of_one_stage_acts_first_is_said_and_not_left_to_names() -> None:
     assert len({(cls.acts_at, cls.order) for cls in ordered}) == len(ordered)
     # Those without an order come last of their stage.
     own = effect_of_file(GLOW)()
-    assert own.turn > max(cls().turn for cls in ordered if cls.acts_at == own.acts_at)
+    assert own.sort_key > max(cls().sort_key for cls in ordered if cls.acts_at == own.acts_at)
 
 
 def test_what_was_measured_of_a_bench_is_set_before_any_effect_acts() -> None:
@@ -258,7 +258,7 @@ def test_a_file_in_the_folder_is_all_that_a_new_effect_needs(
     effects.cache_clear()
     try:
         assert set(effects()) == before | {"amplifier_light"}
-        assert parse_effects({"amplifier_light": {"rate": 1.0}}, "file")[0].turn
+        assert parse_effects({"amplifier_light": {"rate": 1.0}}, "file")[0].sort_key
         assert effect_table() == table
         assert draw_examination(len(before), 17, "small", "own").truths
     finally:

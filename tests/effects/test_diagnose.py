@@ -228,9 +228,9 @@ def test_a_bent_ladder_of_flats_is_a_gap_and_its_response_closes_it(
 @pytest.mark.long
 def test_a_saturated_rung_of_the_ladder_is_left_out(reduced: Callable[..., Path]) -> None:
     """Whether or not its level is declared; the rest is looked at as before."""
-    rungs = [{"exptime_s": t, "count": 20} for t in (0.01, 0.02, 0.03, 0.08)]
+    steps = [{"exptime_s": t, "count": 20} for t in (0.01, 0.02, 0.03, 0.08)]
     short = {"frames.fringes.0.count": 60, "frames.fringes.1.count": 60}
-    look = look_at(reduced(None, short | {"frames.flats": rungs}), SYNC)
+    look = look_at(reduced(None, short | {"frames.flats": steps}), SYNC)
     again = measure(look.first.evidence(look.first.test, (), 3))
     for found in (look.measured, again):
         for name in ("flat_ladder", "photon_transfer"):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pixcal.effects.hyperbolic_fringes import HyperbolicFringes, bending
+from pixcal.effects.hyperbolic_fringes import HyperbolicFringes, curvature_phase
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels import optics
 from pixcal.kernels.optics import Geometry
@@ -49,8 +49,8 @@ def test_the_bending_has_its_leading_order_and_in_pixels_no_baseline() -> None:
     for baseline in (6.0, 3.0):
         where = replace(PAPER, baseline_x=baseline)
         k = optics.paraxial_vector(where)[0] / 4.4e-3
-        found = bending(x, y, where)
-        # The baseline's own term is a plane, which is no bending to a fit.
+        found = curvature_phase(x, y, where)
+        # The baseline's own term is a plane, which a fit absorbs.
         plane = -k * qx * baseline**2 / (8 * 400.0**2)
         leading = -k * qx * (qx**2 + qy**2) / (2 * 400.0**2)
         np.testing.assert_allclose(found, leading + plane, rtol=5e-3)

@@ -9,7 +9,7 @@ import galsim
 import numpy as np
 import pytest
 
-from pixcal.effects.nonlinearity import Bend, Nonlinearity, _straight_on
+from pixcal.effects.nonlinearity import CurvePoint, Nonlinearity, _straight_on
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
@@ -68,7 +68,11 @@ def test_the_response_is_the_published_polynomial() -> None:
         Nonlinearity(-0.1, 0.05),
         Nonlinearity(0.2, 0.1),
         Nonlinearity(0.0, -0.3),
-        Nonlinearity(0.01, 0.0, bends=(Bend(0.0, 0.0), Bend(900.0, 40.0), Bend(50_000.0, -30.0))),
+        Nonlinearity(
+            0.01,
+            0.0,
+            bends=(CurvePoint(0.0, 0.0), CurvePoint(900.0, 40.0), CurvePoint(50_000.0, -30.0)),
+        ),
     ],
 )
 def test_the_inverse_gives_the_charge_back(effect: Nonlinearity) -> None:
@@ -184,7 +188,7 @@ def test_a_knee_is_measured_to_a_hundredth_of_its_size(acquired: Callable[..., E
     assert isinstance(found.effect, Nonlinearity)
     # Charge that gives the same signal: but for an offset and a factor, that of the truth.
     lit = np.linspace(2_500, 42_000, 200, dtype=np.float32)
-    truth = Nonlinearity(0.0, 0.0, bends=tuple(Bend(**point) for point in points))
+    truth = Nonlinearity(0.0, 0.0, bends=tuple(CurvePoint(**point) for point in points))
     charge = found.effect.linearised(truth.response(lit)).astype(float)
     rest = charge - np.polyval(np.polyfit(lit, charge, 1), lit)
     assert rest.std() < 12.0
@@ -258,7 +262,12 @@ def test_moving_boundaries_are_not_taken_for_it(acquired: Callable[..., Evidence
 
 def test_beyond_the_brightest_fringe_a_measured_response_goes_straight_on() -> None:
     """Where its polynomial, which darker samples gave, would be 3 % lower."""
-    points = Bend(0.0, 0.0), Bend(500.0, 28.0), Bend(9000.0, -9.0), Bend(18_000.0, 40.0)
+    points = (
+        CurvePoint(0.0, 0.0),
+        CurvePoint(500.0, 28.0),
+        CurvePoint(9000.0, -9.0),
+        CurvePoint(18_000.0, 40.0),
+    )
     curve = Nonlinearity(0.16, -0.3, bends=points)
 
     def beside(brightest: float) -> Any:

@@ -98,7 +98,7 @@ def test_without_effects_the_frames_are_the_fits_model(acquired: Callable[..., E
     evidence = acquired()
     replica = Replica(evidence)
     for name, found in evidence.fringes.items():
-        electrons = (replica.taken(name) - evidence.bias) * evidence.gain
+        electrons = (replica.simulated_samples(name) - evidence.bias) * evidence.gain
         # Noise of the darks may be below zero, a mean is not.
         dark = np.maximum(evidence.dark_rate, 0) * found.exptime_s
         electrons = (electrons - dark) / evidence.flat

@@ -132,7 +132,7 @@ def test_what_is_there_is_taken_and_what_is_not_is_left() -> None:
     found, left = search({"left": 0.03}, [candidate("left", 0.0301), candidate("right", 0.03)])
     assert found.accepted == ("left",)
     assert left < 0.05
-    assert found.candidates["right"].reason == "the held-out frames are not fitted better"
+    assert found.candidates["right"].reason == "does not improve the fit of the held-out frames"
 
 
 @dataclass(frozen=True)
@@ -392,7 +392,7 @@ def test_a_small_remainder_that_only_the_held_out_frames_show_is_not_claimed() -
 def test_a_cause_that_closes_much_less_than_stays_open_is_not_claimed(
     monkeypatch: pytest.MonkeyPatch, open_still: float, closed: float, claimed: bool
 ) -> None:
-    """However sure it is: it may stand in for what the law of the first does not describe."""
+    """However significant: it may be a proxy for deviations of the first from its law."""
     comparison = Comparison(REFERENCE, REFERENCE.on_scale(curves((), 500)))
     both, without = (replace(comparison.nominal, log_likelihood=n) for n in (1.0, 0.0))
     left = {both.log_likelihood: open_still, without.log_likelihood: open_still + closed}

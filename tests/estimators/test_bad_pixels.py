@@ -14,7 +14,7 @@ from pixcal.estimators.detector.bad_pixels import (
     nonlinear,
     variance_nearby,
 )
-from pixcal.estimators.detector.calibration import Rung, step_levels
+from pixcal.estimators.detector.calibration import ExposureLevel, step_levels
 
 F64 = NDArray[np.float64]
 CLEAN = (1200, 1000)
@@ -89,54 +89,57 @@ def test_columns_without_light_are_dead_and_those_beside_them_are_not() -> None:
 
 def ladder(
     rng: np.random.Generator, shape: tuple[int, int], frames: int = 4
-) -> tuple[list[Rung], F64]:
+) -> tuple[list[ExposureLevel], F64]:
     response = rng.normal(1, 0.02, shape)
-    rungs = []
+    steps = []
     for t in (0.1, 0.2, 0.4, 0.8):
         expected = 4e4 * t * response
         variance = np.full(shape, (4e4 * t + 225) / frames)
         signal = rng.normal(expected, np.sqrt(variance))
-        rungs.append(Rung(t, frames, signal, variance, 4e4 * t + 225))
-    return rungs, response
+        steps.append(ExposureLevel(t, frames, signal, variance, 4e4 * t + 225))
+    return steps, response
 
 
 def test_a_clean_ladder_is_linear() -> None:
-    rungs, _ = ladder(np.random.default_rng(5), CLEAN)
-    assert nonlinear(rungs, step_levels(rungs), 0.03).sum() < FEW
+    steps, _ = ladder(np.random.default_rng(5), CLEAN)
+    assert nonlinear(steps, step_levels(steps), 0.03).sum() < FEW
     # Even without the allowance, by significance alone.
-    assert nonlinear(rungs, step_levels(rungs), 1e-9).sum() < FEW
+    assert nonlinear(steps, step_levels(steps), 1e-9).sum() < FEW
 
 
 def test_a_curve_that_all_pixels_share_flags_none() -> None:
-    rungs, _ = ladder(np.random.default_rng(6), (100, 100))
-    bent = [Rung(r.exptime, 4, r.signal - 2e-6 * r.signal**2, r.variance, r.noise) for r in rungs]
+    steps, _ = ladder(np.random.default_rng(6), (100, 100))
+    bent = [
+        ExposureLevel(r.exptime, 4, r.signal - 2e-6 * r.signal**2, r.variance, r.noise)
+        for r in steps
+    ]
     assert not nonlinear(bent, step_levels(bent), 0.03).any()
 
 
 def test_a_pixel_that_bends_is_nonlinear() -> None:
-    rungs, _ = ladder(np.random.default_rng(7), (50, 60))
-    for rung in rungs:
-        rung.signal[3, 4] *= 1 - 0.2 * rung.exptime
-        rung.signal[5, 6] *= 1 - 0.005 * rung.exptime
-    assert np.argwhere(nonlinear(rungs, step_levels(rungs), 0.03)).tolist() == [[3, 4]]
+    steps, _ = ladder(np.random.default_rng(7), (50, 60))
+    for step in steps:
+        step.signal[3, 4] *= 1 - 0.2 * step.exptime
+        step.signal[5, 6] *= 1 - 0.005 * step.exptime
+    assert np.argwhere(nonlinear(steps, step_levels(steps), 0.03)).tolist() == [[3, 4]]
 
 
 def test_two_levels_do_not_tell() -> None:
-    rungs, _ = ladder(np.random.default_rng(8), (20, 20))
-    rungs[2].signal[3, 4] = rungs[3].signal[3, 4] = np.nan
-    rungs[0].signal[3, 4] *= 2
-    rungs[0].signal[5, 4] *= 2
-    assert np.argwhere(nonlinear(rungs, step_levels(rungs), 0.03)).tolist() == [[5, 4]]
-    assert not nonlinear(rungs[:2], step_levels(rungs[:2]), 0.03).any()
+    steps, _ = ladder(np.random.default_rng(8), (20, 20))
+    steps[2].signal[3, 4] = steps[3].signal[3, 4] = np.nan
+    steps[0].signal[3, 4] *= 2
+    steps[0].signal[5, 4] *= 2
+    assert np.argwhere(nonlinear(steps, step_levels(steps), 0.03)).tolist() == [[5, 4]]
+    assert not nonlinear(steps[:2], step_levels(steps[:2]), 0.03).any()
 
 
 @pytest.mark.parametrize("columns", [3, 20, 70])
 def test_columns_without_light_leave_the_others_linear(columns: int) -> None:
-    rungs, _ = ladder(np.random.default_rng(8), (101, 97))
+    steps, _ = ladder(np.random.default_rng(8), (101, 97))
     rng = np.random.default_rng(9)
-    for rung in rungs:
-        rung.signal[:, :columns] = rng.normal(0, 2, (101, columns))
-    assert not nonlinear(rungs, step_levels(rungs), 0.03)[:, columns:].any()
+    for step in steps:
+        step.signal[:, :columns] = rng.normal(0, 2, (101, columns))
+    assert not nonlinear(steps, step_levels(steps), 0.03)[:, columns:].any()
 
 
 def test_colours_of_a_mosaic_are_not_dead() -> None:

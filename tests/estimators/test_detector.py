@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from pixcal.estimators.detector.calibration import (
-    Rung,
+    ExposureLevel,
     dark_line,
     linearity,
     relative_response,
@@ -64,12 +64,12 @@ def test_a_pixel_without_samples_has_no_line() -> None:
 def test_the_response_is_all_charge_over_all_light() -> None:
     rate = np.random.default_rng(1).normal(1e5, 1e3, SHAPE)
     times = (0.1, 0.2, 0.4)
-    rungs = [
-        Rung(t, n, rate * t, full(rate.mean() * t / n), rate.mean() * t)
+    steps = [
+        ExposureLevel(t, n, rate * t, full(rate.mean() * t / n), rate.mean() * t)
         for t, n in zip(times, (3, 5, 7), strict=True)
     ]
-    levels = step_levels(rungs)
-    found, error = relative_response(rungs, levels)
+    levels = step_levels(steps)
+    found, error = relative_response(steps, levels)
     np.testing.assert_allclose(found, rate / np.median(rate))
     light = sum(level * n for level, n in zip(levels, (3, 5, 7)))  # noqa: B905
     seconds = sum(t * n for t, n in zip(times, (3, 5, 7)))  # noqa: B905
@@ -81,8 +81,11 @@ def test_a_saturated_rung_does_not_count() -> None:
     short, long = full(1e4), full(4e4)
     long[3, 3] = np.nan
     short[5, 5] = long[5, 5] = np.nan
-    rungs = [Rung(0.1, 4, short, full(1.0), 1.0), Rung(0.4, 4, long, full(1.0), 1.0)]
-    found, _ = relative_response(rungs, step_levels(rungs))
+    steps = [
+        ExposureLevel(0.1, 4, short, full(1.0), 1.0),
+        ExposureLevel(0.4, 4, long, full(1.0), 1.0),
+    ]
+    found, _ = relative_response(steps, step_levels(steps))
     assert found[3, 3] == pytest.approx(1)
     assert np.isnan(found[5, 5])
 
@@ -146,12 +149,12 @@ def test_median_and_sigma_of_a_gaussian_with_outliers() -> None:
 
 def test_a_lamp_that_changes_leaves_the_response_of_saturated_pixels() -> None:
     pattern = np.random.default_rng(4).normal(1, 0.1, SHAPE)
-    rungs = [Rung(0.1, 2, light * pattern, full(1.0), 1.0) for light in (1e3, 2e3, 4e3)]
-    whole, _ = relative_response(rungs, step_levels(rungs))
-    for rung in rungs:
-        rung.signal[rung.signal > 4.3e3] = np.nan
-    assert np.isnan(rungs[2].signal).any()
-    found, _ = relative_response(rungs, step_levels(rungs))
+    steps = [ExposureLevel(0.1, 2, light * pattern, full(1.0), 1.0) for light in (1e3, 2e3, 4e3)]
+    whole, _ = relative_response(steps, step_levels(steps))
+    for step in steps:
+        step.signal[step.signal > 4.3e3] = np.nan
+    assert np.isnan(steps[2].signal).any()
+    found, _ = relative_response(steps, step_levels(steps))
     np.testing.assert_allclose(found, whole)
 
 
@@ -159,8 +162,8 @@ def test_levels_are_those_of_pixels_that_see_the_lamp() -> None:
     signal = np.random.default_rng(5).normal(1e3, 10, SHAPE)
     signal[:, :2] = np.random.default_rng(6).normal(0, 2, (len(signal), 2))
     ended = np.where(signal > 100, np.nan, signal)
-    rungs = [Rung(0.1, 2, s, full(1.0), 1.0) for s in (signal, 2 * signal, ended)]
-    levels = step_levels(rungs)
+    steps = [ExposureLevel(0.1, 2, s, full(1.0), 1.0) for s in (signal, 2 * signal, ended)]
+    levels = step_levels(steps)
     assert levels[1] == pytest.approx(2 * levels[0])
     assert levels[0] == pytest.approx(1e3, rel=0.01)
     assert np.isnan(levels[2])

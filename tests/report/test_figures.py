@@ -212,7 +212,7 @@ def test_the_allan_plot(changes: dict[str, Any]) -> None:
     open_png(png(figure))
 
 
-def test_the_linearity_plot_leaves_out_unused_rungs() -> None:
+def test_the_linearity_plot_leaves_out_unused_steps() -> None:
     levels = [
         {"level_e": 1e4 * n, "deviation_percent": 0.1 * n if n < 3 else None} for n in (1, 2, 3)
     ]

@@ -33,7 +33,8 @@ _TURNS = 4  # iterations of the inverse; each cuts the error to a few per cent
 class BrighterFatter(Effect):
     """Pixel boundaries shift with the charge around them (`pixcal.kernels.boundaries`).
 
-    It is not linear in the intensity, so maps alone do not tell it; `restored` undoes it on frames.
+    It is not linear in the intensity, so maps alone cannot show it; `undo_samples` corrects the
+    frames.
     """
 
     name = "brighter_fatter"
@@ -96,11 +97,11 @@ class BrighterFatter(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Shared noise of neighbours, and what sets of other fringe spacing have otherwise.
+        """From the covariance of neighbours and the second harmonic of the fringes.
 
-        The noise alone tells it from a response; the second harmonic of the fringes, which depends
-        on their spacing and direction, is far more precise, and is used unless it contradicts the
-        noise. Where it explains all harmonics, no response is taken to be beside it.
+        Only the noise distinguishes it from a nonlinear response; the second harmonic, which
+        depends on fringe spacing and direction, is far more precise, and is used unless it
+        contradicts the noise. If it explains all harmonics, no nonlinearity is assumed in addition.
         """
         evidence = central_crop(evidence)
         explaining = _explaining(evidence, cls().falloff_px) if evidence.fringes else None

@@ -1,4 +1,4 @@
-"""Fringes that wash out, a little, differently in every frame."""
+"""Visibility that varies from frame to frame."""
 
 from dataclasses import dataclass, replace
 from typing import Self

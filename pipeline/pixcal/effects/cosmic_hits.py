@@ -142,10 +142,10 @@ class CosmicHits(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Outliers upwards in single frames, less those downwards, beside all light.
+        """Upward outliers in single frames, less downward ones, in all frames.
 
-        A pixel that does it again is noisy and does not count. Drawn tracks tell how many stay
-        below the noise; frames of several exposure times tell hits while they are read out.
+        Repeatedly hit pixels are excluded as noisy. Simulated tracks give the fraction hidden by
+        noise; frames of several exposure times separate hits during readout.
         """
         searches = list(_searches(evidence))
         if not searches:
@@ -169,7 +169,7 @@ class CosmicHits(Effect):
             "samples in single frames far above the pixel's other frames",
             {"hits": count, "expected_by_chance": chance, "seen_cm2_s": seen},
             (*({n: error} for n, error in errors.items()), step) if step else (),
-            refused=_NOISY_PIXELS if _come_back(searches) else "",
+            refused=_NOISY_PIXELS if _recur(searches) else "",
         )
 
     @classmethod
@@ -301,7 +301,7 @@ def _hits(outliers: Mask, joined: Mask, residual: F32) -> _Hits:
     return _Hits(*np.array(found, float).reshape(-1, 5).T)
 
 
-def _struck(hits: _Hits, shape: tuple[int, ...]) -> tuple[I64, I64]:
+def _hits_per_pixel(hits: _Hits, shape: tuple[int, ...]) -> tuple[I64, I64]:
     """Hits on each pixel in the first and the second half of frames (t, y, x)."""
     count, pixels = shape[0], hits.pixels.astype(np.int64)
     late = 2 * hits.frames >= count
@@ -309,11 +309,11 @@ def _struck(hits: _Hits, shape: tuple[int, ...]) -> tuple[I64, I64]:
     return np.bincount(pixels[~late], minlength=size), np.bincount(pixels[late], minlength=size)
 
 
-def _come_back(searches: Sequence[_Search]) -> bool:
+def _recur(searches: Sequence[_Search]) -> bool:
     """Whether hits recur on the same pixels far more often than by chance."""
-    parts = np.stack([part for s in searches for part in _struck(s.hits, s.sigma.shape)]).astype(
-        float
-    )
+    parts = np.stack(
+        [part for s in searches for part in _hits_per_pixel(s.hits, s.sigma.shape)]
+    ).astype(float)
 
     def pairs(counts: F64) -> F64:
         return np.asarray((counts.sum(axis=0) ** 2 - (counts**2).sum(axis=0)) / 2)

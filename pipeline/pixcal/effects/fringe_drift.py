@@ -1,4 +1,4 @@
-"""A bench that warms and creeps: a fringe vector that changes in the course of a run."""
+"""Slow drift of the fringe vector."""
 
 from dataclasses import dataclass, replace
 from typing import Self

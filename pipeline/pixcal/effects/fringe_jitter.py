@@ -1,4 +1,4 @@
-"""Fibres that shake: a fringe vector of its own in every frame."""
+"""Frame-to-frame jitter of the fringe vector."""
 
 from dataclasses import dataclass, replace
 from typing import Self

@@ -1,4 +1,4 @@
-"""A conversion gain that is not the one that samples were turned into electrons with."""
+"""Gain differs from the declared value."""
 
 from dataclasses import dataclass, replace
 
@@ -35,10 +35,9 @@ _STEP = 1e-4  # step of the deviations of a response, for derivatives
 class GainError(Effect):
     """The true gain (e-/ADU) differs from the one used; the samples in ADU do not change.
 
-    Light and dark signal are as many ADU as before, which are other numbers of electrons: their
-    shot noise in ADU changes by ``1 / sqrt(1 + relative)``, and nothing else does. Read noise is
-    known in ADU. Maps of a fit keep their offsets, so maps alone do not tell of it and there is
-    nothing to undo on them: SIGMA is mended by the right gain.
+    Light and dark signal in ADU stay, and stand for other numbers of electrons: only their shot
+    noise in ADU changes, by ``1 / sqrt(1 + relative)``. Read noise is known in ADU. Maps neither
+    show it nor need correction; only SIGMA depends on the gain.
     """
 
     name = "gain_error"
@@ -82,14 +81,12 @@ class GainError(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """What the noise that grows with the level is of that expected, in fringes and in flats.
+        """Ratio of signal-dependent noise to its expected value, in fringes and in flats.
 
-        Noise that neighbours share counts with that of the pixels themselves: crosstalk and
-        brighter-fatter move it from one to the other and leave the sum, as far as `STEPS` reach
-        (noise of single pixels alone is lower by the sum of the kernel's squares; the diagnosis
-        allows for the rest by simulation). Noise that is the same at all levels is left out. In the
-        fringes anything that the fit cannot follow adds to it, so flats are believed alone where
-        the two do not agree.
+        Covariances of neighbours up to `STEPS` are added to the variances: crosstalk and
+        brighter-fatter move noise from one to the other and keep the sum (the diagnosis allows for
+        the rest by simulation). Noise that does not depend on the level is left out. In the
+        fringes, any misfit adds to the noise: if the two disagree, only the flats are used.
         """
         ways = {
             "fringes": shot_share(

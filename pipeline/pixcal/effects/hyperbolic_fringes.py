@@ -34,9 +34,9 @@ class HyperbolicFringes(Effect):
     """Difference between the exact phase of two fibre tips and its paraxial limit.
 
     To leading order the curvature is ``-K·q q² / (2 D²)``, q from the foot of the fibres' centre:
-    in pixels it does not depend on the baseline, but its shape tells the foot and the difference in
-    height of the tips. ``pairs`` has the position of each set's fibres, where it is not that of
-    all. ``fit --model hyperbolic`` takes it up.
+    in pixels it does not depend on the baseline, but its shape gives the offset of the fibre pair
+    and the difference in height of the tips. ``pairs`` has the positions of fibre pairs that differ
+    between sets. ``fit --model hyperbolic`` absorbs it.
     """
 
     name = "hyperbolic_fringes"
@@ -79,7 +79,7 @@ class HyperbolicFringes(Effect):
         bench = recording.bench
         x = np.arange(bench.detector.shape[1]) + maps.delta_x.astype(float)
         y = np.arange(*rows)[:, None] + maps.delta_y.astype(float)
-        turn = self.share * bending(x, y, self.geometry(bench, recording.number))
+        turn = self.share * curvature_phase(x, y, self.geometry(bench, recording.number))
         beams = (b.delayed(turn) if b.fibre == MODULATED else b for b in light.beams)
         return replace(light, beams=tuple(beams))
 
@@ -119,6 +119,6 @@ class HyperbolicFringes(Effect):
         ]
 
 
-def bending(x: F64, y: F64, where: Geometry) -> F64:
+def curvature_phase(x: F64, y: F64, where: Geometry) -> F64:
     """Exact minus paraxial phase, rad, at pixels x, y."""
     return optics.phase(x, y, where) - optics.paraxial_phase(x, y, where)

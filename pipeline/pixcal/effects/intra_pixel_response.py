@@ -1,4 +1,4 @@
-"""Pixels that have a width: the fringe is averaged over their response."""
+"""Intra-pixel response: the fringe is averaged over each pixel."""
 
 from dataclasses import dataclass, replace
 from itertools import combinations

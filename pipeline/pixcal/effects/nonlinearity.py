@@ -35,7 +35,7 @@ _OTHER_ORDER = 4
 
 
 @dataclass(frozen=True)
-class Bend:
+class CurvePoint:
     """A point of a measured response."""
 
     level_e: float = quantity(unit="e-", low=0, high=1e8, doc="charge")
@@ -50,8 +50,8 @@ class Bend:
 class Nonlinearity(Effect):
     """Signal ``S (1 + quadratic u + cubic u²)`` of a charge S, with ``u = S / level_e``.
 
-    ``bends`` are points of a measured response beside the polynomial, joined by a natural spline.
-    Offsets hardly change, and maps do not tell it; `linearised` undoes it on samples.
+    ``bends`` are points of a measured response, added to the polynomial as a natural spline.
+    Offsets hardly change and maps do not show it; `linearised` corrects samples.
     """
 
     name = "nonlinearity"
@@ -88,7 +88,7 @@ class Nonlinearity(Effect):
         high=1e7,
         doc="signal at which the deviations are given: the full well",
     )
-    bends: tuple[Bend, ...] = quantity(
+    bends: tuple[CurvePoint, ...] = quantity(
         (), doc="measured points of the response curve, in rising order"
     )
 
@@ -114,8 +114,8 @@ class Nonlinearity(Effect):
         bent = u * (1 + u * (np.float32(self.quadratic) + np.float32(self.cubic) * u))
         signal = np.asarray(bent * np.float32(self.level_e), np.float32)
         if self.bends:
-            levels = np.array([bend.level_e for bend in self.bends])
-            changes = np.array([bend.change_e for bend in self.bends])
+            levels = np.array([point.level_e for point in self.bends])
+            changes = np.array([point.change_e for point in self.bends])
             signal += departure(charge, levels, changes)
         return signal
 
@@ -156,7 +156,7 @@ class Nonlinearity(Effect):
             # The last point lies beyond the flats.
             size = _size(bent.charge[-2], bent.change[-2], bent.error[-2])
             return Estimate(
-                cls(0.0, 0.0, found.level_e, tuple(map(Bend, *points))),
+                cls(0.0, 0.0, found.level_e, tuple(map(CurvePoint, *points))),
                 named,
                 *told,
                 steps,
@@ -264,7 +264,7 @@ def _size(charge: float, change: float, error: float) -> dict[str, object]:
 
 def _bends(
     evidence: Evidence, response: Callable[[F32], F32], chi2_of_polynomial: float
-) -> tuple[tuple[tuple[Bend, ...], list[float]] | None, Agreement]:
+) -> tuple[tuple[tuple[CurvePoint, ...], list[float]] | None, Agreement]:
     """Points of the response on top of a polynomial, errors (or None); the sets' agreement."""
     ends = [np.nanquantile(f.electrons[::7], [TAIL, 1 - TAIL]) for f in evidence.fringes.values()]
     low, top = max(min(float(a) for a, _ in ends), 0.0), max(float(b) for _, b in ends)
@@ -275,11 +275,13 @@ def _bends(
     told = sigmas_of_chi2(chi2, len(change) - 2) > SIGNIFICANT
     if not told or chi2 < BESIDE * chi2_of_polynomial:
         return None, agreement
-    bends = tuple(Bend(float(k), float(c)) for k, c in zip(knots, [0.0, *change], strict=True))
+    bends = tuple(
+        CurvePoint(float(k), float(c)) for k, c in zip(knots, [0.0, *change], strict=True)
+    )
     return (bends, [0.0, *map(float, np.sqrt(np.diag(covariance)))]), agreement
 
 
-def _straight_on(curve: Nonlinearity, evidence: Evidence) -> list[Bend]:
+def _straight_on(curve: Nonlinearity, evidence: Evidence) -> list[CurvePoint]:
     """Points up to the brightest flats; beyond the fringes the response is extended linearly."""
     flats = [(s.adu[0] - evidence.bias) * evidence.gain for s in evidence.of_kind("flat")]
     top = curve.bends[-1].level_e
@@ -290,7 +292,7 @@ def _straight_on(curve: Nonlinearity, evidence: Evidence) -> list[Bend]:
     middle, end = curve.response(levels[:2]).astype(float)
     straight = end + (end - middle) * (levels[2:] / top - 1) * 2
     change = straight - replace(curve, bends=()).response(levels[2:])
-    return [Bend(float(at), float(c)) for at, c in zip(levels[2:], change, strict=True)]
+    return [CurvePoint(float(at), float(c)) for at, c in zip(levels[2:], change, strict=True)]
 
 
 def _full_scale(evidence: Evidence, usual: float) -> float:

@@ -1,4 +1,4 @@
-"""Noise of the electronics that all pixels of a row, or of a column, have in common in a frame.
+"""Readout noise common to all pixels of a row or a column.
 
 Each row is cut into blocks, and only products of blocks that are not neighbours count: noise that
 pixels have of their own, or share with pixels near them, drops out. The products are taken mode by
@@ -36,13 +36,11 @@ _ROUNDS = 4
 class RowNoise(Effect):
     """Noise of the reference or of the readout that all pixels of a row or a column share.
 
-    White and flicker noise from row to row; rows that two amplifiers read in turn, whose levels
-    part and meet from frame to frame, or each of which keeps half of the noise of the row that it
-    read before; and columns, white from column to column and frame to frame.
-    What the whole frame has in common is `bias_drift`: flicker noise is given without its mean.
-    Nothing of it is constant in time, so maps do not tell of it; and frames of fringes do not hold
-    the rows' offsets well enough to take them off (shot noise is larger), only bars of dark pixels
-    would.
+    White and flicker noise from row to row; alternate rows read by two amplifiers whose levels vary
+    independently, or each of which keeps half of the noise of the row that it read before; and
+    columns, white from column to column and frame to frame. Noise of the whole frame is
+    `bias_drift`: flicker noise is given without its mean. It averages out in time, so maps do not
+    show it; subtracting it needs dark or overscan pixels, since shot noise hides it in the fringes.
     """
 
     name = "row_noise"

@@ -136,7 +136,7 @@ class TelegraphNoise(Effect):
         series = tuple(_series(evidence))
         if not series:
             return None
-        found = find_telegraph(series, partial(_lit, evidence), _turned_away(evidence))
+        found = find_telegraph(series, partial(_lit, evidence), _rejected_by_fit(evidence))
         if found is None:
             return None
         return _estimate(cls, found, evidence)
@@ -297,7 +297,7 @@ def _lit(evidence: Evidence, pixels: Indices) -> list[LitSeries]:
     return found
 
 
-def _turned_away(evidence: Evidence) -> Indices:
+def _rejected_by_fit(evidence: Evidence) -> Indices:
     """Pixels that the fit excluded for their noise."""
     noisy = np.zeros(evidence.good.shape, bool)
     for fringes in evidence.fringes.values():

@@ -1,4 +1,4 @@
-"""A laser whose colour drifts or hops: fringes that open and close like an accordion."""
+"""Laser wavelength that drifts or hops between modes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -84,7 +84,7 @@ class WavelengthDrift(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Ramp and walk as of `Effect`, beside the hops that stand out, which are counted."""
+        """Ramp and walk as of `Effect`, and the number of significant mode hops."""
         motion, slow = motion_of(evidence), fit_frames(cls, evidence, leave=("hop",))
         if motion is None or slow is None:
             return None

@@ -268,7 +268,7 @@ class SimulatedFrames:
             if name not in names:
                 raise InputError(f"compress: {name!r} is not one of {', '.join(names)}")
         for key, ladder in (("darks", self.darks), ("flats", self.flats)):
-            times = [rung.exptime_s for rung in ladder]
+            times = [step.exptime_s for step in ladder]
             if len(set(times)) < len(times):
                 raise InputError(f"{key}: two entries have the same exptime_s; join them")
         if self.flats and self.flat_rate_e_s is None:
@@ -286,7 +286,7 @@ class SimulatedFrames:
         if moment.tzinfo is not None and moment.utcoffset() != timedelta(0):
             raise InputError(f"start: {self.start!r:.80} is not in UTC; omit the time zone")
         counts = [(self.bias, self.bias_exptime_s), *((s.count, 0.0) for s in self.fringes)]
-        counts += [(rung.count, rung.exptime_s) for rung in (*self.darks, *self.flats)]
+        counts += [(step.count, step.exptime_s) for step in (*self.darks, *self.flats)]
         seconds = sum(count * max(self.period_s, exptime) for count, exptime in counts)
         if seconds > MAX_DURATION_S or not 1858 < moment.year < 2200:
             raise InputError(f"start: {self.start!r:.80} and {seconds:g} s from there: not a date")

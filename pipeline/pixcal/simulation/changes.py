@@ -37,7 +37,7 @@ LINEAR = ("residual", "frames", "maps")
 
 
 @dataclass(frozen=True)
-class Way:
+class Response:
     """How a model shows."""
 
     random: bool  # its change depends on the random numbers, and is zero on average
@@ -124,7 +124,7 @@ class Changes:
             for (of, name), value in template.mean.items()
         )
 
-    def way(self, model: ForwardModel) -> Way:
+    def response(self, model: ForwardModel) -> Response:
         """How a model shows."""
         every = [(of, name) for of, look in self._looks.items() for name in look.linear]
         draws = [self._linear(model, seed, every) for seed in SEEDS]
@@ -140,38 +140,38 @@ class Changes:
         mixes = model.acts_at >= Stage.CHARGE and self._repeats(
             *(self._mixed(model, seed, pairs) for seed in SEEDS)
         )
-        return Way(random, mixes, tuple(dict.fromkeys([*keys, *(pairs if mixes else ())])))
+        return Response(random, mixes, tuple(dict.fromkeys([*keys, *(pairs if mixes else ())])))
 
     def _repeats(self, one: Draw, other: Draw) -> bool:
         """Whether most of a change is common to two draws."""
         keys = tuple(one)
         return self.product(keys, one, other) > COMMON * self.product(keys, one, one)
 
-    def template(self, model: ForwardModel, way: Way) -> Template:
+    def template(self, model: ForwardModel, response: Response) -> Template:
         """Change of deviations by a model, given how it shows."""
-        linear = [key for key in way.keys if key[1] in LINEAR]
-        pairs = [key for key in way.keys if key[1] == "pairs"]
+        linear = [key for key in response.keys if key[1] in LINEAR]
+        pairs = [key for key in response.keys if key[1] == "pairs"]
         one = other = self._linear(model, SEEDS[0], linear)
-        if way.random:
-            one, other = (self._second_moments(model, seed, way.keys) for seed in SEEDS)
-        if way.mixes:
+        if response.random:
+            one, other = (self._second_moments(model, seed, response.keys) for seed in SEEDS)
+        if response.mixes:
             a, b = (self._mixed(model, seed, pairs) for seed in SEEDS)
             one = {**one, **{k: one.get(k, 0) + v for k, v in a.items()}}
             other = {**other, **{k: other.get(k, 0) + v for k, v in b.items()}}
         return Template.of(one, other)
 
-    def scatter(self, model: ForwardModel, way: Way, template: Template) -> float:
+    def scatter(self, model: ForwardModel, response: Response, template: Template) -> float:
         """Relative rms scatter of the second moments that single draws of a random model add."""
-        total = {k: self.measured(k).weight * template.mean[k] for k in way.keys}
+        total = {k: self.measured(k).weight * template.mean[k] for k in response.keys}
         sizes = []
         for seed in SCATTER_SEEDS:
-            drawn = self._second_moments(model, seed, way.keys)
-            sizes.append(sum(float((total[k] * drawn[k]).sum()) for k in way.keys))
+            drawn = self._second_moments(model, seed, response.keys)
+            sizes.append(sum(float((total[k] * drawn[k]).sum()) for k in response.keys))
         return float(np.std(sizes, ddof=1)) / max(float(np.mean(sizes)), 1e-300)
 
-    def _taken(self, of: str | int) -> F32:
+    def _simulated(self, of: str | int) -> F32:
         if of not in self._plain:
-            self._plain[of] = self._replica.taken(of)
+            self._plain[of] = self._replica.simulated_samples(of)
         return self._plain[of]
 
     def _linear(self, model: ForwardModel, seed: int, keys: Iterable[Key]) -> Draw:
@@ -184,7 +184,7 @@ class Changes:
         bias = rate = relative = np.zeros(e.good.shape)
         maps = any("maps" in own for own in names.values())
         for of in [n for n in stacks if maps or n in names]:
-            samples = self._replica.taken(of, [model], seed=seed) - self._taken(of)
+            samples = self._replica.simulated_samples(of, [model], seed=seed) - self._simulated(of)
             look, stack = self._looks.get(of), e.stacks[of]
             if of in names and isinstance(look, StackDeviations):
                 found |= _named(of, look.change(samples, bias, names[of]))
@@ -194,13 +194,13 @@ class Changes:
             elif stack.kind == "dark" and seconds > 0:
                 rate = (mean - bias) * e.gain / seconds
             elif stack.kind == "flat":
-                light = float(self._taken(of).mean() - np.median(e.bias)) * e.gain
+                light = float(self._simulated(of).mean() - np.median(e.bias)) * e.gain
                 relative = (mean - bias) * e.gain - rate * seconds
                 relative = relative / self._flat / max(light, 1.0)
         for of in [n for n in e.fringes if n in names]:
             look = self._looks[of]
             assert isinstance(look, SetDeviations)
-            samples = self._replica.taken(of, [model], seed=seed) - self._taken(of)
+            samples = self._replica.simulated_samples(of, [model], seed=seed) - self._simulated(of)
             samples *= self._per_adu
             seconds = np.nan_to_num(look.found.exptime_s)
             constant = (bias * e.gain + rate * seconds) / self._flat
@@ -220,10 +220,10 @@ class Changes:
         """Change of quadratic deviations by the action of the model on the noise of samples."""
         found: Draw = {}
         for of, name in keys:
-            noise = self._replica.taken(of, noise=True, seed=seed, most=MIXED)
-            noise -= self._taken(of)[: len(noise)]
-            other = self._replica.taken(of, [model], noise=True, seed=seed, most=MIXED)
-            other -= self._replica.taken(of, [model], seed=seed, most=MIXED)
+            noise = self._replica.simulated_samples(of, noise=True, seed=seed, most=MIXED)
+            noise -= self._simulated(of)[: len(noise)]
+            other = self._replica.simulated_samples(of, [model], noise=True, seed=seed, most=MIXED)
+            other -= self._replica.simulated_samples(of, [model], seed=seed, most=MIXED)
             found[of, name] = self._looks[of].pairs_between(noise, other, self._per_adu)
         return found
 

@@ -71,7 +71,7 @@ class FringeMaps:
     name: str = ""
     frames: FittedFrames | None = None
 
-    def turned(self, phase: F64) -> "FringeMaps":
+    def phase_shifted(self, phase: F64) -> "FringeMaps":
         """The maps with the phase shifted by (y, x) rad; no shift where that is NaN."""
         iota, sine, cosine = self.theta
         z = (cosine + 1j * sine) * np.exp(1j * np.nan_to_num(phase))
@@ -127,15 +127,17 @@ class Estimate:
     size: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def sure(self) -> "Effect":
+    def significant_part(self) -> "Effect":
         """The effect without strengths and optional parameters that are consistent with zero.
 
         Poorly known parameters may be tiny in some frames and extreme in others.
         """
         nothing = self.effect.scaled(0.0)
-        unsure = {n: getattr(nothing, n) for n in self.effect.strengths if not self._is_sure(n)}
-        unsure |= {n: 0.0 for n in self.effect.optional_parameters if not self._is_sure(n)}
-        pruned = dataclasses.replace(self.effect, **unsure)
+        unclear = {
+            n: getattr(nothing, n) for n in self.effect.strengths if not self._is_significant(n)
+        }
+        unclear |= {n: 0.0 for n in self.effect.optional_parameters if not self._is_significant(n)}
+        pruned = dataclasses.replace(self.effect, **unclear)
         return self.effect if pruned.is_null else pruned
 
     def scattered(self, effect: "Effect", seed: int) -> "Effect":
@@ -154,7 +156,7 @@ class Estimate:
             return effect
         return moved if numbers(moved) == values else effect
 
-    def _is_sure(self, name: str) -> bool:
+    def _is_significant(self, name: str) -> bool:
         value = getattr(self.effect, name)
         parts = {f"{name}[{n}]": v for n, v in enumerate(value if isinstance(value, tuple) else ())}
         return not all(
@@ -212,7 +214,7 @@ class Effect(ForwardModel):
         found = score(cls, evidence)
         if found is None:
             return None
-        ask = partial(score_again, found.model, found.way, template=found.template)
+        ask = partial(score_again, found.model, found.response, template=found.template)
         again = Again(found.model, ask)
         return Estimate(found.model, found.errors, found.significance, found.why, again=again)
 

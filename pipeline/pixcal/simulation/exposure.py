@@ -51,7 +51,7 @@ class Camera:
     ) -> None:
         self.bench = bench if noise else replace(bench, shot_noise=False)
         self.noise = noise
-        self.effects = sorted((e for e in effects if not e.is_null), key=lambda e: e.turn)
+        self.effects = sorted((e for e in effects if not e.is_null), key=lambda e: e.sort_key)
         halo = sum(e.halo for e in self.effects)
         self.inside = rows
         self.rows: Rows = (max(0, rows[0] - halo), min(bench.detector.shape[0], rows[1] + halo))

@@ -3,7 +3,7 @@
 A frozen dataclass of parameters, made with `pixcal.model.config.quantity`: units, ranges, and
 default sizes from the literature, cited in ``sources``. A model overrides the steps of the exposure
 on which it acts; by default, a step changes nothing. Steps follow the order in a camera
-(`pixcal.simulation.exposure`); within a step, models act in the order of `ForwardModel.turn`.
+(`pixcal.simulation.exposure`); within a step, models act in the order of `ForwardModel.sort_key`.
 """
 
 import dataclasses
@@ -84,7 +84,7 @@ class ForwardModel:
         return dataclasses.replace(self, **changed)
 
     @property
-    def turn(self) -> tuple[int, int, str]:
+    def sort_key(self) -> tuple[int, int, str]:
         """Sort key of the order of action; ties are sorted by name."""
         return self.acts_at, self.order, self.name
 

@@ -109,7 +109,7 @@ def strengths_of(
     every: Sequence[Watched], start: ForwardModel, leave: Sequence[str]
 ) -> list[Strength]:
     """Strengths of a model that change some series."""
-    start, found = _heard(start), []
+    start, found = _off_resonance(start), []
     for key, value in numbers(start).items():
         field = field_of(key)
         if field in start.strengths and field not in leave:
@@ -118,7 +118,7 @@ def strengths_of(
     return found
 
 
-def _heard(start: ForwardModel) -> ForwardModel:
+def _off_resonance(start: ForwardModel) -> ForwardModel:
     """The model with frequencies such that an exposure is no whole number of periods."""
     lines = [f.name for f in fields(start) if unit_of(start, f.name) == "Hz"]
     return replace(start, **{name: OTHER * getattr(start, name) for name in lines})
@@ -169,7 +169,7 @@ class FrameChanges:
 
     def series(self, start: ForwardModel) -> list[Watched]:
         """Series of the kinds that a strong model changes."""
-        strong = _heard(start)
+        strong = _off_resonance(start)
         return [
             w
             for every in self._every

@@ -240,7 +240,7 @@ def fit_frames(
     model, errors = fit.values()
     for own, line in found.lines:
         if line is not None and line.sure:
-            model, of_line = _swung(model, own, line, fit.basis)
+            model, of_line = _with_line(model, own, line, fit.basis)
             errors |= of_line
     kinds = {w.channels is LIGHT for w in fit.basis.every}
     told = ["intensity and contrast"] * (True in kinds) + ["the fringe vector"] * (False in kinds)
@@ -400,7 +400,7 @@ class _Fit:
         return of.value(float(sizes[self._place(of)]))
 
 
-def _swung(
+def _with_line(
     model: ForwardModel, own: Sequence[Strength], line: Line, basis: FrameBasis
 ) -> tuple[ForwardModel, dict[str, float]]:
     """The model with a line, with strengths set by its amplitude in the series."""

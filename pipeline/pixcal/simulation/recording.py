@@ -87,11 +87,11 @@ def recordings(bench: Bench) -> list[Recording]:
     planned: list[tuple[str, int, str, int, float, float]] = []
     if f.bias:
         planned.append(("bias", 0, "bias", f.bias, f.bias_exptime_s, 0.0))
-    for n, rung in enumerate(f.darks):
-        planned.append(("dark", n, "dark", rung.count, rung.exptime_s, 0.0))
-    for n, rung in enumerate(f.flats):
-        mean = (f.flat_rate_e_s or 0.0) * rung.exptime_s
-        planned.append(("flat", n, "flat", rung.count, rung.exptime_s, mean))
+    for n, step in enumerate(f.darks):
+        planned.append(("dark", n, "dark", step.count, step.exptime_s, 0.0))
+    for n, step in enumerate(f.flats):
+        mean = (f.flat_rate_e_s or 0.0) * step.exptime_s
+        planned.append(("flat", n, "flat", step.count, step.exptime_s, mean))
     for n, scan in enumerate(f.fringes):
         electrons = electrons_per_unit(bench, n)
         planned.append(("fringes", n, scan.name, scan.count, f.exptime_s, electrons))

@@ -81,7 +81,7 @@ class Replica:
             self._recordings[n] = _of_stack(self._bench, n, stack, evidence, starts[n])
             self._frames[n] = stack.frame - stack.frame[0]
 
-    def taken(
+    def simulated_samples(
         self,
         of: str | int,
         models: Sequence[ForwardModel] = (),

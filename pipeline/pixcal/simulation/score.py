@@ -22,7 +22,7 @@ from pixcal.estimators.frame_series.variance_components import log_chance, log_c
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.significance import root_with_error
 from pixcal.model.arrays import F64
-from pixcal.simulation.changes import LINEAR, Changes, Key, Template, Way
+from pixcal.simulation.changes import LINEAR, Changes, Key, Response, Template
 from pixcal.simulation.forward import ForwardModel, field_of, numbers, with_numbers
 
 STEP = 1.1  # factor on a parameter for its derivative
@@ -48,7 +48,7 @@ class Scored:
     errors: dict[str, float]  # 1-sigma errors of the parameters that were fitted
     significance: float
     why: str
-    way: Way  # how it shows, in the most informative deviations
+    response: Response  # how it shows, in the most informative deviations
     # its change of these, if valid for other frames too: second moments
     template: Template | None = None
 
@@ -63,22 +63,22 @@ def score(kind: type[ForwardModel], evidence: Evidence) -> Scored | None:
     if not names:
         raise NotImplementedError("none of its strengths is a number: define estimate")
     changes = _changes(evidence)
-    way = changes.way(start)
-    fit = _Fit(changes, way, names)
-    if way.random or way.mixes:
+    response = changes.response(start)
+    fit = _Fit(changes, response, names)
+    if response.random or response.mixes:
         # If frames without light hold all information, the others need not be simulated.
         keys, _ = fit.telling(start)
-        fit = _Fit(changes, dataclasses.replace(way, keys=keys), names)
+        fit = _Fit(changes, dataclasses.replace(response, keys=keys), names)
     return fit.result(start)
 
 
 def score_again(
-    model: ForwardModel, way: Way, evidence: Evidence, template: Template | None = None
+    model: ForwardModel, response: Response, evidence: Evidence, template: Template | None = None
 ) -> float:
     """Significance of an effect in other frames, with its parameters fixed."""
     # Compute the template again if it does not match these pixels.
     changes = _changes(evidence)
-    fit = _Fit(changes, way, ())
+    fit = _Fit(changes, response, ())
     if template is None or not changes.fits(template):
         template = fit.template(model)
     return float(fit.together([template])[2])
@@ -93,12 +93,12 @@ class _Fit:
     """Score tests of an effect, and the fit of its parameters."""
 
     changes: Changes
-    way: Way
+    response: Response
     strengths: tuple[str, ...]
 
     def template(self, model: ForwardModel) -> Template:
         """Change of the deviations by a model."""
-        return self.changes.template(model, self.way)
+        return self.changes.template(model, self.response)
 
     def sums(
         self, templates: Sequence[Template], at: Template | None = None
@@ -109,7 +109,7 @@ class _Fit:
         """
         count = len(templates)
         right, normal, variance = np.zeros(count), np.zeros((count, count)), np.zeros((count,) * 2)
-        keys, product = self.way.keys, self.changes.product
+        keys, product = self.response.keys, self.changes.product
         rest = {k: self.changes.measured(k).value for k in keys}
         if at is not None:
             rest = {k: v - at.mean[k] for k, v in rest.items()}
@@ -152,14 +152,14 @@ class _Fit:
         model, errors = self._scaled(shape, size, error)
         if significance > HINT and not model.is_null:
             model, errors = self._fitted(model, errors)
-        if self.way.random:
+        if self.response.random:
             # An acquisition holds a single draw, whose scatter dominates at high significance.
-            scatter = self.changes.scatter(model, self.way, self.template(model)) / 2
+            scatter = self.changes.scatter(model, self.response, self.template(model)) / 2
             for name in set(errors) & set(self.strengths):
                 errors[name] = float(np.hypot(errors[name], scatter * abs(numbers(model)[name])))
-        why = RANDOM if self.way.random else STEADY
+        why = RANDOM if self.response.random else STEADY
         keys, template = self.telling(shape)
-        telling = dataclasses.replace(self.way, keys=keys)
+        telling = dataclasses.replace(self.response, keys=keys)
         return Scored(model, errors, significance, why, telling, template)
 
     def _best_shape(self, start: ForwardModel) -> tuple[ForwardModel, tuple[F64, F64, float], int]:
@@ -183,7 +183,7 @@ class _Fit:
     def telling(self, model: ForwardModel) -> tuple[tuple[Key, ...], Template | None]:
         """Most informative deviations, and their change if it is valid for other frames."""
         template = self.template(model)
-        mean, every = template.mean, self.way.keys
+        mean, every = template.mean, self.response.keys
         sizes = {k: self.changes.product((k,), mean, mean) for k in every}
         least, whole = TELLING * sum(sizes.values()), self.changes.product(every, mean, mean)
 
@@ -199,11 +199,11 @@ class _Fit:
         self, shape: ForwardModel, size: F64, error: F64
     ) -> tuple[ForwardModel, dict[str, float]]:
         """A model of these amplitudes: square roots if they are from second moments."""
-        power = 0.5 if self.way.random else 1.0
+        power = 0.5 if self.response.random else 1.0
         values, errors, usual = {}, {}, numbers(shape)
         for name, a, da in zip(self.strengths, size, error, strict=True):
             values[name] = float(usual[name] * np.sign(a) * abs(a) ** power)
-            error = root_with_error(a, da)[1] if self.way.random else da
+            error = root_with_error(a, da)[1] if self.response.random else da
             errors[name] = float(abs(usual[name]) * error)
         return with_numbers(shape, values), {n: e for n, e in errors.items() if e > 0}
 
@@ -250,7 +250,7 @@ class _Fit:
 
     def _misfit(self, at: Template) -> float:
         """Weighted square of the residuals of a model, less that of the deviations."""
-        keys, product = self.way.keys, self.changes.product
+        keys, product = self.response.keys, self.changes.product
         rest = {k: at.mean[k] - 2 * self.changes.measured(k).value for k in keys}
         drawn = [k for k in keys if k in at.half]
         return product(keys, at.mean, rest) - product(drawn, at.half, at.half)

@@ -68,7 +68,7 @@ class Treatments:
     def _those(self, how: str) -> tuple[Treatment, ...]:
         """To correct in one way, the last that acted first."""
         matching = [t for t in self.every if t.how == how]
-        return tuple(sorted(matching, key=lambda t: t.effect.turn, reverse=True))
+        return tuple(sorted(matching, key=lambda t: t.effect.sort_key, reverse=True))
 
     @property
     def on_samples(self) -> tuple[Effect, ...]:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import chdtri
 
-from pixcal.estimators.detector.calibration import MIN_RUNGS, Rung
+from pixcal.estimators.detector.calibration import MIN_STEPS, ExposureLevel
 from pixcal.kernels.robust import lit, median_and_sigma
 from pixcal.model.arrays import F64, Mask
 
@@ -168,18 +168,18 @@ def noisy_factor(least: float, variance: F64, dof: int, quantum: float) -> float
     return max(least, float(np.exp(_POPULATION * median_and_sigma(np.log(known))[1] / 2)))
 
 
-def nonlinear(rungs: Sequence[Rung], levels: F64, limit: float) -> Mask:
+def nonlinear(steps: Sequence[ExposureLevel], levels: F64, limit: float) -> Mask:
     """Pixels whose signal departs from that of others over exposure-time steps of flats.
 
-    Compared with pixels of equal brightness: a nonlinearity of all is no defect. ``rungs``:
-    any number; with fewer than three none is flagged. ``levels``: (rung,) of `step_levels`.
+    Compared with pixels of equal brightness: a nonlinearity of all is no defect. ``steps``:
+    any number; with fewer than three none is flagged. ``levels``: (step,) of `step_levels`.
     ``limit``: largest relative change of the pixel's share of the level.
     """
-    shape = rungs[0].signal.shape
-    if len(rungs) < MIN_RUNGS:
+    shape = steps[0].signal.shape
+    if len(steps) < MIN_STEPS:
         return np.zeros(shape, np.bool_)
-    signal = np.stack([rung.signal for rung in rungs])
-    variance = np.stack([rung.variance for rung in rungs])
+    signal = np.stack([step.signal for step in steps])
+    variance = np.stack([step.variance for step in steps])
     levels = levels[:, None, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         share = signal / levels
@@ -195,12 +195,12 @@ def nonlinear(rungs: Sequence[Rung], levels: F64, limit: float) -> Mask:
         spread = np.sqrt(np.maximum(error**2 - 1 / total, 0))
         off = np.abs(share - mean)
         beyond = (off > limit * np.abs(mean)) & (off > _MANY_SIGNIFICANT * spread) & (weight > 0)
-    enough = (weight > 0).sum(axis=0) >= MIN_RUNGS
+    enough = (weight > 0).sum(axis=0) >= MIN_STEPS
     return np.asarray(beyond.any(axis=0) & enough)
 
 
 def _common(off: F64, brightness: F64, used: Mask) -> F64:
-    """Part of departures (rung, y, x) that pixels of equal brightness (y, x) share."""
+    """Part of departures (step, y, x) that pixels of equal brightness (y, x) share."""
     seen = lit(brightness)
     usual, scale = median_and_sigma(brightness[seen])
     x = (brightness - usual) / scale if scale > 0 else 0 * brightness

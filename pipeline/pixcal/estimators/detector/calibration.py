@@ -11,7 +11,7 @@ from scipy.special import chdtr, chdtri
 from pixcal.kernels.robust import finite_median, lit, median, median_and_sigma
 from pixcal.model.arrays import F64, Mask
 
-MIN_RUNGS = 3  # fewest exposure times that separate a line from a curve
+MIN_STEPS = 3  # fewest exposure times that separate a line from a curve
 # Variance over the signal, in units of the least at lower levels, below which pixels are full. A
 # slope lower by a fifth reduces it to 0.64.
 COLLAPSED = 0.25
@@ -79,10 +79,10 @@ def usual_rate(rate: NDArray[Any], hot_sigma: float) -> float:
 
 
 @dataclass(frozen=True)
-class Rung:
+class ExposureLevel:
     """Combined flats of one exposure time, bias and dark subtracted; maps are (y, x) float64."""
 
-    exptime: float  # seconds; any number above zero when there is a single rung
+    exptime: float  # seconds; any number above zero with a single exposure time
     frames: int  # how many were combined
     signal: F64  # mean (ADU); NaN where any of the frames is saturated or not finite
     variance: F64  # of `signal` (ADU²)
@@ -104,61 +104,61 @@ def usual_variance(variance: NDArray[Any], dof: int) -> float:
     return usual
 
 
-def step_levels(rungs: Sequence[Rung]) -> F64:
-    """Median signal (rung,) of the lit pixels of a tile; NaN if most are saturated.
+def step_levels(steps: Sequence[ExposureLevel]) -> F64:
+    """Median signal (step,) of the lit pixels of a tile; NaN if most are saturated.
 
     All levels use the same pixels, and saturated ones rank brightest: without them the median would
     be that of dim pixels.
     """
-    seen = lit(np.fmax.reduce([rung.signal for rung in rungs]))
+    seen = lit(np.fmax.reduce([step.signal for step in steps]))
     if not seen.any():
-        return np.full(len(rungs), np.nan)
-    whole = (np.nan_to_num(rung.signal[seen], nan=np.inf) for rung in rungs)
+        return np.full(len(steps), np.nan)
+    whole = (np.nan_to_num(step.signal[seen], nan=np.inf) for step in steps)
     levels = np.array([median(signal) for signal in whole])
     return np.where(np.isfinite(levels), levels, np.nan)
 
 
-def relative_response(rungs: Sequence[Rung], levels: F64) -> tuple[F64, F64]:
+def relative_response(steps: Sequence[ExposureLevel], levels: F64) -> tuple[F64, F64]:
     """Signal (y, x) of flats over that of the tile, and its error; NaN where no step can be used.
 
-    Total charge over total ``levels`` (rung,) of `step_levels`: weighted for photon noise.
+    Total charge over total ``levels`` (step,) of `step_levels`: weighted for photon noise.
     """
-    charge = variance = light = np.zeros(rungs[0].signal.shape)
-    for rung, level in zip(rungs, levels, strict=True):
-        used = np.isfinite(rung.signal) & np.isfinite(level)
-        light = light + np.where(used, rung.frames * level, 0.0)
-        charge = charge + np.where(used, rung.frames * rung.signal, 0.0)
-        variance = variance + np.where(used, rung.frames**2 * rung.variance, 0.0)
+    charge = variance = light = np.zeros(steps[0].signal.shape)
+    for step, level in zip(steps, levels, strict=True):
+        used = np.isfinite(step.signal) & np.isfinite(level)
+        light = light + np.where(used, step.frames * level, 0.0)
+        charge = charge + np.where(used, step.frames * step.signal, 0.0)
+        variance = variance + np.where(used, step.frames**2 * step.variance, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         return charge / light, np.sqrt(variance) / np.abs(light)
 
 
 def unsaturated(
-    rungs: Sequence[Rung], levels: F64, dark_variance: float = 0.0
-) -> tuple[Sequence[Rung], F64]:
+    steps: Sequence[ExposureLevel], levels: F64, dark_variance: float = 0.0
+) -> tuple[Sequence[ExposureLevel], F64]:
     """Flats with the signal of full pixels replaced by NaN, and their levels.
 
     A full well, maybe far below the highest code, has no photon noise and would outweigh the rest.
-    ``levels``: (rung,) of `step_levels`. ``dark_variance``: of a usual sample without light (ADU²).
+    ``levels``: (step,) of `step_levels`. ``dark_variance``: of a usual sample without light (ADU²).
     """
-    full, least, most = np.zeros(len(rungs), np.bool_), np.inf, 0.0
+    full, least, most = np.zeros(len(steps), np.bool_), np.inf, 0.0
     for n in np.argsort(levels):
         if not levels[n] > 0:
             continue
-        noise = rungs[n].noise
+        noise = steps[n].noise
         slope = (noise - dark_variance) / levels[n]
         full[n] = slope < COLLAPSED * least < np.inf and noise < most
         most = max(most, noise)
-        samples = max(np.isfinite(rungs[n].signal).sum() * (rungs[n].frames - 1), 1)
+        samples = max(np.isfinite(steps[n].signal).sum() * (steps[n].frames - 1), 1)
         if not full[n] and noise > (1 + max(SHOT, CERTAIN * np.sqrt(2 / samples))) * dark_variance:
             least = min(least, slope)
     if not full.any():
-        return rungs, levels
-    well = np.mean([rung.signal for rung, ended in zip(rungs, full, strict=True) if ended], axis=0)
+        return steps, levels
+    well = np.mean([step.signal for step, ended in zip(steps, full, strict=True) if ended], axis=0)
     limit = np.where(np.isfinite(well), (1 - NEARLY) * well, np.inf)
     left = [
-        replace(rung, signal=np.where(ended | (rung.signal > limit), np.nan, rung.signal))
-        for rung, ended in zip(rungs, full, strict=True)
+        replace(step, signal=np.where(ended | (step.signal > limit), np.nan, step.signal))
+        for step, ended in zip(steps, full, strict=True)
     ]
     return left, step_levels(left)
 
@@ -168,7 +168,7 @@ class Linearity:
     """Linearity of the signal of flats with exposure time."""
 
     max_deviation: float  # largest relative distance from the straight line
-    # (rung,) relative distance of each level from the line; NaN for one that is not used
+    # (step,) relative distance of each level from the line; NaN for one that is not used
     deviation: F64
     # slope, intercept: of the line (ADU/s; ADU). The intercept absorbs an error common to all
     # exposure times
@@ -179,11 +179,11 @@ class Linearity:
 def linearity(exptimes: F64, levels: F64, used: Mask) -> Linearity | None:
     """Line of least squared relative distances through the levels of flats.
 
-    ``exptimes, levels``: (rung,) s, and ADU above bias and dark; ``used``: (rung,) those without
-    saturation. None with fewer than `MIN_RUNGS` levels.
+    ``exptimes, levels``: (step,) s, and ADU above bias and dark; ``used``: (step,) those without
+    saturation. None with fewer than `MIN_STEPS` levels.
     """
     used = used & (levels > 0)
-    if used.sum() < MIN_RUNGS:
+    if used.sum() < MIN_STEPS:
         return None
     weight = 1 / levels[used]
     design = np.stack([exptimes[used], np.ones(used.sum())], axis=1)

@@ -17,7 +17,7 @@ from pixcal.kernels.sample_sums import frame_means
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 
-MIN_RUNGS = 3  # fewest levels of flats that separate a curve from a line
+MIN_STEPS = 3  # fewest levels of flats that separate a curve from a line
 LAMP = 1e-3  # least relative error of the light of a flat, exposure time included
 STEADY = 0.1  # relative rms of levels about the curve above which the lamp was changed
 RATES = 1.3  # largest ratio of light per second among few levels of one lamp
@@ -163,7 +163,7 @@ def _ladder(evidence: Evidence) -> Ladder | None:
     light = [light_of(evidence, s) for s in stacks]
     times = np.array([s.exptime_s for s in stacks])
     levels = np.array([one.mean() for one in light])
-    if len(times) < MIN_RUNGS or len(set(times)) < len(times) or not levels.min() > 0:
+    if len(times) < MIN_STEPS or len(set(times)) < len(times) or not levels.min() > 0:
         return None
     if not evidence.dithered:
         return None

@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 
-from pixcal.estimators.detector.flat_ladder import MIN_RUNGS, ladder, straight_line
+from pixcal.estimators.detector.flat_ladder import MIN_STEPS, ladder, straight_line
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics import Curve, statistic
 from pixcal.estimators.test_statistics.look import CODES, Look
@@ -80,7 +80,7 @@ def _measured_noise_of_flats(evidence: Evidence) -> F64:
 def photon_transfer_shape(evidence: Evidence) -> Curve | None:
     """The same over its mean: how the noise bends is known better than the gain is."""
     values = _noise_of_flats(evidence)
-    if len(values) < MIN_RUNGS:
+    if len(values) < MIN_STEPS:
         return None
     return Curve.numbered(values / values.mean())
 

@@ -381,7 +381,7 @@ def flat_error(bench: Bench) -> float | None:
     if not f.flats or f.flat_rate_e_s is None:
         return None
     variance = sample_variance(bench)
-    levels = [(rung.count, f.flat_rate_e_s * rung.exptime_s) for rung in f.flats]
+    levels = [(step.count, f.flat_rate_e_s * step.exptime_s) for step in f.flats]
     weight = sum(count * level**2 / (level + variance) for count, level in levels if level > 0)
     return float(weight**-0.5) if weight > 0 else None
 

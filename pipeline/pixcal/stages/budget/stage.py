@@ -172,7 +172,7 @@ def _calibration(bench: Bench, s: SetBound) -> dict[str, Any]:
         "bias_frames": f.bias,
         "bias_error_e": (sample_variance(bench) / f.bias) ** 0.5 if f.bias else None,
         "flats_needed": flats_needed(errors, level, s.variance),
-        "flats": sum(rung.count for rung in f.flats),
+        "flats": sum(step.count for step in f.flats),
         "flat_error": flat,
         "flat_cost": errors.scale * (flat**2 if flat is not None else bench.detector.prnu_rms**2),
     }

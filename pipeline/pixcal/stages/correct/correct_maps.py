@@ -137,7 +137,7 @@ def _correct_tile(
     inside = swept.inside(y, x)
     maps, good, known = maps_of(swept, part)
     border = border_change(swept, part)
-    maps = maps.turned(border)
+    maps = maps.phase_shifted(border)
     after, steps = corrected(maps, swept.effects)
     change = np.sum(steps, axis=0) if steps else np.zeros(maps.theta.shape[1:])
     moved = (change + border)[inside].astype(np.float32)
@@ -153,7 +153,7 @@ def _correct_tile(
     for n in range(HALVES * swept.has_halves):
         half = ArrayReader(target / "half_phase").read((n, n + 1), *swept.within(part))[0]
         half_phase = padded(half.astype(float), swept, part)
-        its = corrected(maps.turned(half_phase), swept.effects)[1]
+        its = corrected(maps.phase_shifted(half_phase), swept.effects)[1]
         rest = np.sum(its, axis=0) - change if its else 0.0
         variants.append((half_phase + rest)[inside])
         errors.append(ArrayReader(target / "half_sigma").read((n, n + 1), y, x)[0] * factor)
@@ -220,7 +220,7 @@ def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, phase: F64) -> list
     variants = []
     for a, b in SIGNS:
         sign = 1.0 - 2.0 * ((a * y + b * x) % 2)
-        moved = maps.turned(scatter * sign * beyond)
+        moved = maps.phase_shifted(scatter * sign * beyond)
         moved.theta[1:] *= np.where(unknown, 1 + sign, 1.0)
         variants.append(moved)
     return variants

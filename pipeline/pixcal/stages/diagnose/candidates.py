@@ -19,7 +19,7 @@ class Candidate:
     reason: str = ""  # why it was rejected; empty when it was accepted
     needs: tuple[str, ...] = ()  # frames needed for an estimate, if there is none
     alone: Trial | None = None  # the bench with this effect only
-    ways: int = 1  # number of variants simulated; the likeliest one counts
+    variants_tried: int = 1  # number of variants simulated; the likeliest one counts
     # fraction of its significance that the previously accepted causes do not produce
     share: float = 1.0
     replay: Effect | None = None  # the effect as measured, without a law
@@ -50,15 +50,16 @@ class Candidate:
 
         ``share``: fraction of its significance that the accepted causes do not produce.
         """
-        assert self.estimate is not None
+        found = self.estimate
+        assert found is not None
         laws = [self.law] if self.law else []
-        ways = list(dict.fromkeys([self.estimate.effect, self.estimate.sure, *laws]))
+        variants = list(dict.fromkeys([found.effect, found.significant_part, *laws]))
         if share < NEARLY_ALL:
-            ways += [way.scaled(share) for way in ways]
+            variants += [one.scaled(share) for one in variants]
         if self.replay is not None:
-            ways.append(self.replay)
-        self.ways = max(self.ways, len(ways))
-        return ways
+            variants.append(self.replay)
+        self.variants_tried = max(self.variants_tried, len(variants))
+        return variants
 
     def by_law(self, effect: Effect) -> Effect | None:
         """The effect by its best-fitting law; None if the effect is itself a law."""

@@ -42,7 +42,7 @@ class IntensityBeforeEffects:
         """Levels (e-) of uniform frames without the effects."""
         frames = np.broadcast_to(levels[:, None, None], (len(levels), ACROSS, ACROSS))
         found = start = np.asarray(frames, np.float32)
-        for effect in sorted(self.effects, key=lambda e: e.turn, reverse=True):
+        for effect in sorted(self.effects, key=lambda e: e.sort_key, reverse=True):
             undone = effect.undo_samples(found)
             found = found if undone is None else undone
         if found is start:
@@ -164,7 +164,7 @@ class FittedSet:
     def without(self, effects: Sequence[Effect]) -> "FittedSet":
         """The set with effects on maps undone: offsets as fitted with the effects known."""
         maps = before = self.maps
-        for effect in sorted(effects, key=lambda e: e.turn, reverse=True):
+        for effect in sorted(effects, key=lambda e: e.sort_key, reverse=True):
             maps = self.undone(effect, maps) or maps
         if maps is before:
             return self._untouched

@@ -68,15 +68,15 @@ def inquire(
     candidates: dict[str, Candidate] = {}
     signatures: tuple[Signature, ...] = ()
 
-    def learnt(evidence: Evidence, unseen: Evidence, few: Runtime) -> tuple[Signature, ...]:
+    def on_evidence(evidence: Evidence, unseen: Evidence, few: Runtime) -> tuple[Signature, ...]:
         nonlocal signatures
         candidates.update(_candidates(evidence, kinds, base, few))
         for candidate in candidates.values():
             candidate.replay = _replayed(candidate, unseen)
-        signatures = weakly_seen(candidates, kinds, slow=bool(evidence.fringes))
+        signatures = marginal_candidates(candidates, kinds, slow=bool(evidence.fringes))
         return signatures
 
-    look = look_at(run_dir, runtime, learnt)
+    look = look_at(run_dir, runtime, on_evidence)
     for name, candidate in candidates.items():
         if candidate.estimate is None and not candidate.reason:
             candidate.needs = _needs(kinds[name], look.facts)
@@ -92,9 +92,9 @@ def inquire(
         trials = Trials(look.windows, scratch, look.runtime, signatures, estimates, SCREEN)
         reference, data = _nominal(trials, look, base, run_dir)
 
-    asking = _Asking(look, base, kinds, candidates, trials)
+    services = _SearchServices(look, base, kinds, candidates, trials)
     most = affordable(trials.samples)
-    search = Search(reference, data, asking.simulate, asking.again, most)
+    search = Search(reference, data, services.simulate, services.again, most)
     return Inquiry(base, look, trials, reference, data, search, search.run(candidates))
 
 
@@ -111,7 +111,7 @@ def _nominal(
 
 
 @dataclass(frozen=True)
-class _Asking:
+class _SearchServices:
     """Services for a search: simulations, and estimates on simulations of the fitted frames."""
 
     look: DiagnosisInput
@@ -213,7 +213,7 @@ def _again(candidate: Candidate) -> Again | None:
     return None if candidate.estimate is None else candidate.estimate.again
 
 
-def weakly_seen(
+def marginal_candidates(
     candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]], *, slow: bool = True
 ) -> tuple[Signature, ...]:
     """Candidates significant in the fitted frames; a slow one only if weak and the strongest.

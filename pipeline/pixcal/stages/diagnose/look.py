@@ -57,11 +57,11 @@ class DiagnosisInput:
 def look_at(
     run_dir: Path,
     runtime: Runtime,
-    learnt: Callable[[Evidence, Evidence, Runtime], Sequence[Signature]] = lambda *_: (),
+    on_evidence: Callable[[Evidence, Evidence, Runtime], Sequence[Signature]] = lambda *_: (),
 ) -> DiagnosisInput:
     """Select the parts of a reduced run to analyse, and measure their nominal bench.
 
-    ``learnt``: given the evidence to fit and to test, and the runtime of estimates, returns the
+    ``on_evidence``: from the evidence to fit and to test, and the runtime of estimates, gives the
     estimates to use as statistics. Raises InputError: too few frames, or a part cannot be fitted.
     """
     ingested = Ingested(run_dir / "ingest")
@@ -102,7 +102,7 @@ def look_at(
         full = halves[0].saturated | halves[1].saturated
         halves = [replace(half, full=full) for half in halves]
         if not windows:
-            signatures = tuple(learnt(halves[0], halves[1], few))
+            signatures = tuple(on_evidence(halves[0], halves[1], few))
         bench = nominal_bench(
             acquisition,
             ingested.tables,

@@ -47,7 +47,7 @@ def too_little(gain: float, candidate: Candidate) -> str:
     if candidate.in_maps_alone and gain < MIN_LOGLIK_GAIN:
         return "the maps of the held-out frames show no more of it than true offsets can by chance"
     if gain < MIN_LOGLIK_GAIN:
-        return "the held-out frames are not fitted better"
+        return "does not improve the fit of the held-out frames"
     return (
         f"the log-likelihood of the held-out frames rises by only {gain:.1f}; an effect of weak "
         f"significance needs {MIN_LOGLIK_GAIN_WEAK:g}"
@@ -68,8 +68,8 @@ def redundant(
 def stands_in(closed: float, still_open: float) -> str:
     """Why a cause is rejected that closes little of a large gap."""
     return (
-        f"closes only {_weighted(closed)} while {still_open:.0%} of it stays open; it may stand in "
-        "for an unknown cause"
+        f"closes only {_weighted(closed)} while {still_open:.0%} of it stays open; it may be a "
+        "proxy for an unknown cause"
     )
 
 
@@ -103,7 +103,7 @@ def doubtful(
     without: Mapping[str, Trial],
     candidates: Mapping[str, Candidate],
 ) -> Rejection | None:
-    """A cause that closes little of the gap and may stand in for another.
+    """A cause that closes little of the gap and may be a proxy for another.
 
     For an unknown cause: it closes little of a large gap, or the largest difference remains. For
     another law of other causes: these produce much of its significance, or it has none.
@@ -133,7 +133,7 @@ def doubtful(
     tried = not any(one.reason.startswith(UNTRIED) for one in strong)
     if closed and least is None and tried and comparison.strongest_stays(current):
         least = min(closed, key=lambda name: closed[name])
-        return least, "the largest difference remains; it may stand in for an unknown cause"
+        return least, "the largest difference remains; it may be a proxy for an unknown cause"
     if least is None:
         return None
     if open_still > OPEN or least not in imitated:

@@ -176,7 +176,7 @@ class _Description:
         if same_samples or candidate.in_maps_alone:
             # Both parts hold the same samples, or the same offsets: the second adds no information.
             chance = float(ndtr(-own))
-        chance *= len(found.candidates) * candidate.ways
+        chance *= len(found.candidates) * candidate.variants_tried
         return {
             "effect": name,
             "title": effect.title,

@@ -33,7 +33,7 @@ from pixcal.storage.place import Place
 ROUNDING_ADU = math.sqrt(SHEPPARD)  # noise of a converter that rounds to whole ADU
 
 _LINEAR_SHARE = 0.7
-_SATURATED_RUNG = 1e-2
+_SATURATED_STEP = 1e-2
 _KNOWN = 0.2  # largest relative error of a variance that replaces that of frames without light
 # least relative error of the noise of frames without light that is not on the curve of the flats,
 # if these do not tell it
@@ -109,7 +109,7 @@ class Summary:
 def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     """Combine the statistics of all columns; InputError if the flats hold no light."""
     tables = ArrayReader(folder / "levels").read()
-    levels, usable, nearly = _rungs(tables, job)
+    levels, usable, nearly = _exposure_steps(tables, job)
     sums = pair_sums(folder, job)
     # Full pixels saturate the flats even if the converter does not saturate.
     points = transfer_points(add_neighbours(sums[1], sums[0]).sums)
@@ -241,7 +241,7 @@ def _steps(job: Measuring) -> tuple[float, float]:
     return rounding + variance * job.quantum**2, density * job.quantum**3
 
 
-def _rungs(tables: F64, job: Measuring) -> tuple[F64, Mask, Mask]:
+def _exposure_steps(tables: F64, job: Measuring) -> tuple[F64, Mask, Mask]:
     """Level of each step (ADU) over the columns that have one at all steps, and which to use.
 
     Also the steps at which some pixels are full, or nearly so.
@@ -250,12 +250,12 @@ def _rungs(tables: F64, job: Measuring) -> tuple[F64, Mask, Mask]:
         return np.zeros(0), np.zeros(0, np.bool_), np.zeros(0, np.bool_)
     level, pixels, lost, nearly = (tables.reshape(-1, len(job.flat), 4)[..., n] for n in range(4))
     frames = np.array([len(group.frames) for group in job.flat])
-    usable = np.less_equal(lost.sum(axis=0), _SATURATED_RUNG * frames * pixels.sum(axis=0))
+    usable = np.less_equal(lost.sum(axis=0), _SATURATED_STEP * frames * pixels.sum(axis=0))
     common = np.isfinite(level[:, usable]).all(axis=1, keepdims=True)
     weight = np.where(common & np.isfinite(level), pixels, 0.0)
     total = (weight * np.nan_to_num(level)).sum(axis=0)
     seen = weight.sum(axis=0)
-    ended = nearly.sum(axis=0) > _SATURATED_RUNG * pixels.sum(axis=0)
+    ended = nearly.sum(axis=0) > _SATURATED_STEP * pixels.sum(axis=0)
     return np.divide(total, seen, out=np.zeros_like(total), where=seen > 0), usable, ended
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.estimators.detector.calibration import MIN_RUNGS
+from pixcal.estimators.detector.calibration import MIN_STEPS
 from pixcal.model.arrays import F32
 
 # relative tolerance of equal exposure times: cameras may write measured times
@@ -123,7 +123,7 @@ def _group_flats(found: Exposures, times: list[float | None], steps: Sequence[in
     if not found.flat:
         found.known = False
         found.flat = _groups("flat", [1.0] * len(times), steps)
-        lost = ["linearity is not measured"] if len(found.flat) >= MIN_RUNGS else []
+        lost = ["linearity is not measured"] if len(found.flat) >= MIN_STEPS else []
         lost += ["their dark signal is not removed"] if found.has_rate else []
         if lost:
             lacking = "an EXPTIME of 0" if unexposed else "no EXPTIME"

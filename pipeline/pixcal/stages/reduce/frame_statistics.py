@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pixcal.estimators.detector.bad_pixels import noisy, noisy_factor, nonlinear, variance_nearby
 from pixcal.estimators.detector.calibration import (
     DarkLine,
-    Rung,
+    ExposureLevel,
     dark_line,
     relative_response,
     step_levels,
@@ -95,14 +95,14 @@ class Measuring:
 
 def statistics_writers(folder: Place, shape: tuple[int, int], flats: int) -> dict[str, ArrayWriter]:
     """Make the arrays that `measure` writes: one chunk of each for `STRIP` columns."""
-    tiles, n, rungs = grid(shape), len(STATISTICS), max(flats, 1)
+    tiles, n, steps = grid(shape), len(STATISTICS), max(flats, 1)
     wide = min(STRIP, tiles[1])
     create_group(folder)
     made = {}
     for name, whole, chunks, dtype in (
         ("maps", (n, *shape), (n, *map_chunk(shape)), np.float32),
         ("pairs", (*tiles, 2, N_BINS, COLUMNS), (1, wide, 2, N_BINS, COLUMNS), np.float64),
-        ("levels", (*tiles, rungs, 4), (1, wide, rungs, 4), np.float64),
+        ("levels", (*tiles, steps, 4), (1, wide, steps, 4), np.float64),
     ):
         dims = [f"axis{axis}" for axis in range(len(whole))]
         made[name] = create_array(folder / name, whole, dtype, chunks=chunks, dims=dims)
@@ -128,7 +128,7 @@ class _Column:
     loud: NDArray[np.bool_]  # pixels noisy without light, which photon transfer leaves out
     line_noise: LineNoise = field(default_factory=LineNoise)
     line: DarkLine | None = None
-    rungs: list[Rung] = field(default_factory=list)
+    steps: list[ExposureLevel] = field(default_factory=list)
 
     @classmethod
     def begin(cls, job: Measuring, index: Index) -> "_Column":
@@ -238,20 +238,20 @@ def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined)
     variance = np.fmax(found.variance, usual + photons * brighter) / frames
     if line is not None:
         variance = variance + column.noise * line.variance(exptime)
-    column.rungs.append(Rung(group.exptime, frames, signal, variance, usual))
+    column.steps.append(ExposureLevel(group.exptime, frames, signal, variance, usual))
 
 
 def _measure_response(job: Measuring, column: _Column) -> None:
     """Measure the response, the levels of the tile, and pixels with deviating levels."""
-    maps, levels = column.maps, step_levels(column.rungs)
+    maps, levels = column.maps, step_levels(column.steps)
     column.levels[:, 0] = levels
-    rungs, levels = unsaturated(column.rungs, levels, float(np.median(column.noise)))
+    steps, levels = unsaturated(column.steps, levels, float(np.median(column.noise)))
     column.levels[:, 3] = [
         np.isfinite(before.signal).sum() - np.isfinite(after.signal).sum()
-        for before, after in zip(column.rungs, rungs, strict=True)
+        for before, after in zip(column.steps, steps, strict=True)
     ]
-    maps["response"], maps["response_error"] = relative_response(rungs, levels)
-    maps["flags"][nonlinear(rungs, levels, job.options.nonlinear_share)] += int(PixelFlag.NONLINEAR)
+    maps["response"], maps["response_error"] = relative_response(steps, levels)
+    maps["flags"][nonlinear(steps, levels, job.options.nonlinear_share)] += int(PixelFlag.NONLINEAR)
 
 
 def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[Combined]:

@@ -181,7 +181,7 @@ def signs(parts: Sequence[Moments]) -> Signs:
         stay += float(part @ (m.products[0] / m.variance + 1 / n))
         stay_variance += float(part**2 @ ((n - 2) ** 2 / (n**2 * (n - 1)))) / m.pairs
         for sign, counts in ((1, m.above), (-1, m.below)):
-            again, by_chance = _come_back(counts)
+            again, by_chance = _recur(counts)
             more += sign * (again - by_chance)
             more_variance += again + by_chance
         noisy.update(m.pixel[m.excess > 0].tolist())
@@ -191,7 +191,7 @@ def signs(parts: Sequence[Moments]) -> Signs:
     return Signs(flat / flat_variance**0.5, one_sided, stay / stay_variance**0.5, len(noisy))
 
 
-def _come_back(counts: F64) -> tuple[int, float]:
+def _recur(counts: F64) -> tuple[int, float]:
     """Number of pixels with several outliers, and that expected from random hits."""
     once = np.count_nonzero(counts == 1) / len(counts)
     # Of a Poisson distribution with this share of ones: the root below one.

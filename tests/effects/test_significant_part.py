@@ -10,46 +10,50 @@ from pixcal.effects.straylight import Straylight
 from pixcal.simulation.effect import Effect, Estimate
 
 
-def sure(effect: Effect, **errors: float) -> Effect:
-    return Estimate(effect, errors, 5.0, "").sure
+def significant_part(effect: Effect, **errors: float) -> Effect:
+    return Estimate(effect, errors, 5.0, "").significant_part
 
 
 def test_a_strength_within_its_error_is_left_out() -> None:
     drift = BiasDrift(jitter_rms=2.0, ramp_e_h=3000.0, walk_e_h=0.0, settle_e=0.0, settle_s=60.0)
-    found = sure(drift, jitter_rms=0.3, ramp_e_h=1300.0, walk_e_h=50.0)
+    found = significant_part(drift, jitter_rms=0.3, ramp_e_h=1300.0, walk_e_h=50.0)
     assert found == BiasDrift(
         jitter_rms=2.0, ramp_e_h=0.0, walk_e_h=0.0, settle_e=0.0, settle_s=60.0
     )
-    assert sure(drift, jitter_rms=0.3, ramp_e_h=900.0) == drift
+    assert significant_part(drift, jitter_rms=0.3, ramp_e_h=900.0) == drift
 
 
 def test_one_sure_part_keeps_all_parts() -> None:
     light = Straylight(share=0.05, slope_per_px=(1e-5, 1e-6))
     errors = {"slope_per_px[0]": 1e-6, "slope_per_px[1]": 1e-6}
-    assert sure(light, share=0.1, **errors) == Straylight(share=0.0, slope_per_px=(1e-5, 1e-6))
-    assert sure(light, share=0.001, **dict.fromkeys(errors, 1e-4)) == Straylight(
+    assert significant_part(light, share=0.1, **errors) == Straylight(
+        share=0.0, slope_per_px=(1e-5, 1e-6)
+    )
+    assert significant_part(light, share=0.001, **dict.fromkeys(errors, 1e-4)) == Straylight(
         share=0.05, slope_per_px=(0.0, 0.0)
     )
 
 
 def test_a_part_that_was_not_there_to_be_measured_is_no_sure_part() -> None:
     light = Straylight(share=0.05, slope_per_px=(1e-6, 0.0))
-    found = sure(light, share=0.001, **{"slope_per_px[0]": 1e-5})
+    found = significant_part(light, share=0.001, **{"slope_per_px[0]": 1e-5})
     assert found == Straylight(share=0.05, slope_per_px=(0.0, 0.0))
 
 
 def test_finer_points_that_may_be_nothing_are_left_out() -> None:
     lag = Lag(share=1e-4, decay_frames=0.9, spread=0.7)
     errors = {"share": 7e-6, "decay_frames": 0.08, "spread": 0.4}
-    assert sure(lag, **errors) == Lag(share=1e-4, decay_frames=0.9, spread=0.0)
-    assert sure(lag, **errors | {"spread": 0.2}) == lag
+    assert significant_part(lag, **errors) == Lag(share=1e-4, decay_frames=0.9, spread=0.0)
+    assert significant_part(lag, **errors | {"spread": 0.2}) == lag
 
 
 def test_an_effect_stays_what_it_is_where_nothing_of_it_is_sure_or_errors_are_not_told() -> None:
     drift = BiasDrift()
-    assert sure(drift, jitter_rms=9.0, ramp_e_h=9.0, walk_e_h=9.0, settle_e=9.0) == drift
-    assert sure(drift) == drift
-    assert sure(Ipc(), **{"couplings[0].share": 1.0}) == Ipc()
+    assert (
+        significant_part(drift, jitter_rms=9.0, ramp_e_h=9.0, walk_e_h=9.0, settle_e=9.0) == drift
+    )
+    assert significant_part(drift) == drift
+    assert significant_part(Ipc(), **{"couplings[0].share": 1.0}) == Ipc()
 
 
 def test_parameters_are_moved_by_their_errors_and_what_is_zero_stays() -> None:

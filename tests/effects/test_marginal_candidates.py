@@ -8,7 +8,7 @@ from pixcal.effects.row_noise import RowNoise
 from pixcal.estimators.test_statistics.gap import Difference
 from pixcal.simulation.effect import Again, Effect, Estimate
 from pixcal.stages.diagnose.candidates import Candidate
-from pixcal.stages.diagnose.inquiry import needs_slow, weakly_seen
+from pixcal.stages.diagnose.inquiry import marginal_candidates, needs_slow
 
 KINDS: dict[str, type[Effect]] = {"ipc": Ipc, "row_noise": RowNoise}
 
@@ -31,7 +31,7 @@ def test_a_slow_estimate_is_a_statistic_only_if_weak_and_the_strongest(
     assert RowNoise.quick
     sizes = {"ipc": crosstalk, "row_noise": rows}
     found = {n: Candidate(n, Estimate(KINDS[n](), {}, s, "")) for n, s in sizes.items()}
-    assert set(weakly_seen(found, KINDS)) == made
+    assert set(marginal_candidates(found, KINDS)) == made
 
 
 @pytest.mark.parametrize(("strongest", "tested"), [(90.0, True), (130.0, False)])
@@ -43,7 +43,7 @@ def test_a_score_test_is_no_statistic_beside_a_far_stronger_effect(
         "ipc": Candidate("ipc", Estimate(Ipc(), {}, strongest, "")),
         "row_noise": Candidate("row_noise", Estimate(RowNoise(), {}, 5.0, "", again=again)),
     }
-    assert weakly_seen(found, KINDS) == ((again,) if tested else ())
+    assert marginal_candidates(found, KINDS) == ((again,) if tested else ())
 
 
 @pytest.mark.parametrize(
