@@ -26,7 +26,6 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
-from pixcal.simulation.exposure import Camera
 from pixcal.stages.simulate import acquire
 from pixcal.storage.lock import lock
 from pixcal.storage.manifest import digest
@@ -98,7 +97,7 @@ def _case(folder: Path, size: str, item: tuple[int, Bench, Truth]) -> None:
         record_second(truth.second, LAYOUTS[size], made)
     else:
         made.mkdir(parents=True)
-        acquire(bench, effects_of(truth, bench), made, Runtime(cluster="sync"), Camera)
+        acquire(bench, effects_of(truth, bench), made, Runtime(cluster="sync"))
     made.rename(final)
 
 

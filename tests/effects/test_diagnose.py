@@ -226,7 +226,7 @@ def test_a_bent_ladder_of_flats_is_a_gap_and_its_response_closes_it(
 
 
 @pytest.mark.long
-def test_a_saturated_rung_of_the_ladder_is_left_out(reduced: Callable[..., Path]) -> None:
+def test_a_saturated_step_of_the_ladder_is_left_out(reduced: Callable[..., Path]) -> None:
     """Whether or not its level is declared; the rest is looked at as before."""
     steps = [{"exptime_s": t, "count": 20} for t in (0.01, 0.02, 0.03, 0.08)]
     short = {"frames.fringes.0.count": 60, "frames.fringes.1.count": 60}

@@ -77,7 +77,7 @@ def test_the_response_is_all_charge_over_all_light() -> None:
     np.testing.assert_allclose(error, np.sqrt(rate.mean() * seconds) / light)
 
 
-def test_a_saturated_rung_does_not_count() -> None:
+def test_a_saturated_step_does_not_count() -> None:
     short, long = full(1e4), full(4e4)
     long[3, 3] = np.nan
     short[5, 5] = long[5, 5] = np.nan
@@ -110,7 +110,7 @@ def test_a_bent_ladder_is_bent() -> None:
     assert found.deviation[0] * found.deviation[4] < 0
 
 
-def test_rungs_that_are_not_used_have_no_deviation() -> None:
+def test_steps_that_are_not_used_have_no_deviation() -> None:
     times = np.array([0.1, 0.2, 0.3, 0.4])
     levels = np.array([1e4, 2e4, 3e4, 3.1e4])
     found = linearity(times, levels, np.array([True, True, True, False]))

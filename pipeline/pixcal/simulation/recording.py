@@ -22,15 +22,16 @@ class Recording:
     bench: Bench
     kind: str  # ``bias``, ``dark``, ``flat`` or ``fringes``
     number: int  # among those of its kind
-    folder: str  # folder, stem: of its files
-    stem: str
     count: int  # frames
     exptime_s: float
     # start_s, period_s: first frame after the start of the acquisition, and from frame to frame
     start_s: float
     period_s: float
     # electrons for unit light: of a flat its mean, of fringes as in `electrons_per_unit`
-    electrons: float
+    electrons: float = 1.0
+    # folder, stem: of its files
+    folder: str = ""
+    stem: str = ""
     # number of the window, if several windows of a detector are simulated separately: they share
     # changes of whole frames, but not the noise of their pixels
     window: int = 0
@@ -100,7 +101,7 @@ def recordings(bench: Bench) -> list[Recording]:
         period = max(f.period_s, exptime)
         stem = f"{folder}-{number}" if kind in ("dark", "flat") else folder
         found.append(
-            Recording(bench, kind, number, folder, stem, count, exptime, clock, period, electrons)
+            Recording(bench, kind, number, count, exptime, clock, period, electrons, folder, stem)
         )
         clock += count * period
     return found

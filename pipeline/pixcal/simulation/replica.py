@@ -180,18 +180,8 @@ def _starts(evidence: Evidence, sets: Sequence[FringeEvidence]) -> dict[str | in
 
 def _of_set(bench: Bench, number: int, found: FringeEvidence, start_s: float) -> Recording:
     exposure = found.exptime_s if np.isfinite(found.exptime_s) else 0.0
-    return Recording(
-        bench,
-        "fringes",
-        number,
-        found.name,
-        found.name,
-        int(found.frame[-1]) + 1,
-        exposure,
-        start_s,
-        _period(found.time_s),
-        1.0,
-    )
+    count, period = int(found.frame[-1]) + 1, _period(found.time_s)
+    return Recording(bench, "fringes", number, count, exposure, start_s, period)
 
 
 def _of_stack(
@@ -204,19 +194,8 @@ def _of_stack(
         light = (stack.adu.mean(axis=0) - evidence.bias) * evidence.gain
         light = (light - evidence.dark_rate * exposure)[good] / evidence.flat[good]
         electrons = float(np.median(light)) if light.size else 0.0
-    count = int(np.ptp(stack.frame)) + 1
-    return Recording(
-        bench,
-        stack.kind,
-        number,
-        stack.kind,
-        stack.kind,
-        count,
-        exposure,
-        start_s,
-        _period(stack.time_s),
-        electrons,
-    )
+    count, period = int(np.ptp(stack.frame)) + 1, _period(stack.time_s)
+    return Recording(bench, stack.kind, number, count, exposure, start_s, period, electrons)
 
 
 def _bench(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Bench:

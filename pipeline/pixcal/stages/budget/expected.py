@@ -148,18 +148,8 @@ def frame_rms(bench: Bench, number: int) -> tuple[float, float]:
     """Relative frame-to-frame rms of light and of contrast, from the effects of a bench."""
     scan, f = replace(bench.frames.fringes[number], count=FRAMES_DRAWN), bench.frames
     sets = (*f.fringes[:number], scan, *f.fringes[number + 1 :])
-    drawn = Recording(
-        replace(bench, frames=replace(f, fringes=sets)),
-        "fringes",
-        number,
-        scan.name,
-        scan.name,
-        scan.count,
-        f.exptime_s,
-        0.0,
-        f.period_s,
-        1.0,
-    )
+    bench = replace(bench, frames=replace(f, fringes=sets))
+    drawn = Recording(bench, "fringes", number, scan.count, f.exptime_s, 0.0, f.period_s)
     states = states_of(drawn, own_effects(bench, "bench"))
     contrast = states.amplitude / np.maximum(states.level, DARKNESS)
     return float(states.level.std()), float(contrast.std() / contrast.mean())

@@ -116,8 +116,6 @@ def recordings_of(
                     bench,
                     kind,
                     listed.get(name, n),
-                    name,
-                    name,
                     len(numbers),
                     exposure,
                     start[name] + float(times[numbers[0]]),

@@ -161,7 +161,7 @@ def _measured(job: Measuring, strip: Strip) -> list[_Column]:
     del combined
     for number, group in enumerate(job.flat):
         for column, combination in zip(columns, _combine(job, group, columns), strict=True):
-            _measure_rung(job, column, number, combination)
+            _measure_level(job, column, number, combination)
     for column in columns:
         if job.flat:
             _measure_response(job, column)
@@ -218,7 +218,7 @@ def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined])
     maps["dark_rate_error"] = np.sqrt(line.per_rate * column.noise)
 
 
-def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined) -> None:
+def _measure_level(job: Measuring, column: _Column, number: int, found: Combined) -> None:
     """Measure a level of the flats, and count its samples without weight."""
     group, line = job.flat[number], column.line
     exptime = group.exptime if job.flats_timed else 0.0

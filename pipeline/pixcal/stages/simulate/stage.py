@@ -18,7 +18,7 @@ from functools import partial
 from itertools import product
 from operator import call
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from pixcal.effects import known_effects, parse_effects
 from pixcal.engine.plan import within_memory
@@ -26,7 +26,6 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels import optics, synthesis
 from pixcal.kernels.scene import DetectorMaps, Rows, geometry
 from pixcal.model import acquisition as described
-from pixcal.model.arrays import U16
 from pixcal.model.bench import Bench, load_bench
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError, naming
@@ -67,15 +66,6 @@ Effects = tuple[Effect, ...]
 TRUTH_MAPS = tuple(f for f in fields(DetectorMaps) if f.name not in ("read_noise", "adu_per_e"))
 
 
-class Exposes(Protocol):
-    """A camera of a range of rows, such as `Camera`."""
-
-    def expose(self, recording: Recording, frames: range) -> Iterator[tuple[int, U16]]:
-        """Frames as in `Camera.expose`."""
-
-
-Cameras = Callable[[Bench, Rows, Effects], Exposes]
-
 # a range of frames of a recording, and their files by number
 Span = tuple[Recording, range, dict[int, FrameWriter]]
 
@@ -108,22 +98,20 @@ def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
         shutil.copyfile(bench, truth_made / "bench.yaml")
         for file in config.own:
             shutil.copyfile(file, truth_made / file.name)
-        _write_frames(plan, effects, recorded, made, runtime, Camera)
+        _write_frames(plan, effects, recorded, made, runtime)
         _write_description(plan, made)
         apart.put_in_place(key, to_plain(plan))
         return there.put_in_place(key, {})
 
 
-def acquire(
-    bench: Bench, effects: Effects, folder: Path, runtime: Runtime, camera: Cameras = Camera
-) -> None:
+def acquire(bench: Bench, effects: Effects, folder: Path, runtime: Runtime) -> None:
     """Write an acquisition into an empty folder, without manifest or truth.
 
-    ``effects`` replace those that the bench names; ``camera`` makes the frames of a range of rows.
+    ``effects`` replace those that the bench names.
     """
     recorded = recordings(bench)
     runtime = _fitting(bench, recorded, effects, runtime)
-    _write_frames(bench, effects, recorded, folder, runtime, camera)
+    _write_frames(bench, effects, recorded, folder, runtime)
     _write_description(bench, folder)
 
 
@@ -151,12 +139,7 @@ def _fitting(
 
 
 def _write_frames(
-    bench: Bench,
-    effects: Effects,
-    recorded: list[Recording],
-    folder: Path,
-    runtime: Runtime,
-    camera: Cameras,
+    bench: Bench, effects: Effects, recorded: list[Recording], folder: Path, runtime: Runtime
 ) -> None:
     batches: list[list[Span]] = [[]]
     ready: list[Callable[[], Path]] = []
@@ -172,7 +155,7 @@ def _write_frames(
                 batches.append([])
             batches[-1].append((recording, frames, {n: files[n] for n in used}))
     pieces = list(product(row_blocks(bench), filter(None, batches)))
-    run_tasks(partial(_write_piece, bench, effects, camera), pieces, runtime, label="frames")
+    run_tasks(partial(_write_piece, bench, effects), pieces, runtime, label="frames")
     run_tasks(call, ready, runtime, label="files")
 
 
@@ -208,13 +191,11 @@ def _cards(bench: Bench, recording: Recording, frame: int) -> dict[str, Any]:
     }
 
 
-def _write_piece(
-    bench: Bench, effects: Effects, camera: Cameras, piece: tuple[Rows, list[Span]]
-) -> None:
+def _write_piece(bench: Bench, effects: Effects, piece: tuple[Rows, list[Span]]) -> None:
     rows, spans = piece
-    there = camera(bench, rows, effects)
+    camera = Camera(bench, rows, effects)
     for recording, frames, files in spans:
-        for frame, samples in there.expose(recording, frames):
+        for frame, samples in camera.expose(recording, frames):
             number, plane = divmod(frame, bench.frames.per_file)
             files[number].write_rows(rows[0], samples, plane)
 
