@@ -169,6 +169,7 @@ def test_tracks_of_another_law_are_described(acquired: Callable[..., Evidence]) 
 def test_one_hit_is_no_claim_and_two_are(acquired: Callable[..., Evidence]) -> None:
     evidence = acquired()
     (dark,) = evidence.of_kind("dark")
+    rates = []
     for hits in (1, 2):
         adu = dark.adu.copy()
         y, x = np.argwhere(evidence.good)[[500, 2500][:hits]].T
@@ -176,8 +177,10 @@ def test_one_hit_is_no_claim_and_two_are(acquired: Callable[..., Evidence]) -> N
         stacks = tuple(s for s in evidence.stacks if s is not dark)
         found = CosmicHits.estimate(replace(evidence, stacks=(*stacks, replace(dark, adu=adu))))
         assert found is not None
-        assert found.details["hits"] == hits
+        assert isinstance(found.effect, CosmicHits)
+        rates.append(found.effect.rate_cm2_s)
         assert (found.significance > 4) == (hits > 1)
+    assert rates[1] == pytest.approx(2 * rates[0], rel=0.2)
 
 
 def test_what_comes_again_in_a_pixel_is_no_hit(acquired: Callable[..., Evidence]) -> None:

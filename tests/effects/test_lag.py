@@ -9,8 +9,8 @@ import pytest
 
 from pixcal.effects.lag import Lag
 from pixcal.estimators.detector.flat_ladder import warming
-from pixcal.estimators.detector.frame_lag import lag_of_flats
-from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.estimators.detector.frame_lag import Uneven, lag_of_flats
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack, central_crop
 from pixcal.kernels.normals import Key, pixel_normals
 from pixcal.kernels.scene import Rows
 from pixcal.model.arrays import F32
@@ -164,12 +164,13 @@ def test_pixels_that_differ_tell_where_the_contrast_is_noisy(
     }
     white = {"vibration_rad": 0.0, "polarisation": 0.03, "polarisation_s": 0.0}
     effects = {"contrast_noise": white, "lag": {"share": 0.004, "spread": 0.2}}
-    found = Lag.estimate(acquired(noisy, effects))
+    evidence = acquired(noisy, effects)
+    found = Lag.estimate(evidence)
     assert found is not None
     assert isinstance(found.effect, Lag)
     assert 1e-3 < found.errors["share"] < 4e-3
     assert abs(found.effect.share - 0.004) < 4 * found.errors["share"]
-    assert found.details["by_pixels_sigmas"] > 10
+    assert Uneven.of(central_crop(evidence).fringes.values()).sigmas > 10
     assert found.significance > 10
     nothing = Lag.estimate(acquired(noisy, {"contrast_noise": white}))
     assert nothing is not None

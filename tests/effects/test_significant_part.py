@@ -97,7 +97,7 @@ def test_what_would_leave_its_range_is_not_moved() -> None:
 def test_parameters_whose_errors_hang_together_are_moved_together() -> None:
     drift = BiasDrift(jitter_rms=2.0, ramp_e_h=3000.0, walk_e_h=0.0, settle_e=0.0, settle_s=60.0)
     steps = {"jitter_rms": 0.1, "ramp_e_h": -500.0}
-    known = Estimate(drift, {"jitter_rms": 0.1, "ramp_e_h": 500.0}, 5.0, "", {}, (steps,))
+    known = Estimate(drift, {"jitter_rms": 0.1, "ramp_e_h": 500.0}, 5.0, "", (steps,))
     for seed in range(10):
         moved = known.scattered(drift, seed)
         assert isinstance(moved, BiasDrift)

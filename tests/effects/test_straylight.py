@@ -11,6 +11,7 @@ from pixcal.estimators.maps.structure import flattened
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import FringeMaps
 from pixcal.simulation.exposure import frames_of
+from pixcal.simulation.light_fit import fit_light
 from pixcal.simulation.recording import recordings
 
 
@@ -58,8 +59,10 @@ def test_a_bump_is_found(acquired: Callable[..., Evidence], bump: float) -> None
     assert found is not None
     assert isinstance(found.effect, Straylight)
     assert found.significance > 8
-    for kind in ("in_mean_light", "in_visibility"):
-        assert found.details[kind] == pytest.approx(1, abs=0.3)
+    fit = fit_light(Straylight.starts(evidence), evidence, Straylight.smooth_degree)
+    assert fit is not None
+    for kind in ("the mean light", "the visibility"):
+        assert fit.agreed[kind] == pytest.approx(1, abs=0.3)
     rows, columns = ((0, n) for n in evidence.good.shape)
     truth = Straylight(0.0, (0.0, 0.0), bump, (40.0, 20.0), 18.0).pattern(rows, columns)
     for name in evidence.fringes:

@@ -253,12 +253,6 @@ class BiasDrift(Effect):
             sigmas(log_chance_of_any(changes)),
             "levels of " + ", ".join(dict.fromkeys(s.name for s in every)) + " against time, beyond"
             " the noise of pixels, rows and columns",
-            {
-                "noise_sigmas": sigmas(changes[0]),
-                "settling_sigmas": sigmas(changes[1]),
-                "ramp_sigmas": sigmas(changes[2]),
-                "ramp_over_walk_sigmas": steady,
-            },
         )
 
 

@@ -12,7 +12,7 @@ from pixcal.estimators.detector.response import (
     boundaries_beside,
 )
 from pixcal.estimators.diagnosis.evidence import Evidence, central_crop
-from pixcal.kernels.boundaries import REACH, area_changes, boundary_shifts, moved_charge
+from pixcal.kernels.boundaries import REACH, boundary_shifts, moved_charge
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import F32, F64
 from pixcal.model.config import quantity
@@ -112,12 +112,10 @@ class BrighterFatter(Effect):
         if noise is None:
             return None
         size, variance = noise.size, noise.variance
-        details = {"of_noise": size, "of_noise_error": float(np.sqrt(variance))}
         significance = float(size / np.sqrt(variance))
         why = "covariance of neighbours that rises with the square of the level"
         if evidence.fringes:
             free = boundaries_beside(evidence, falloff)
-            details |= {"of_harmonics": free.shift, "of_harmonics_error": float(free.variance**0.5)}
             if abs(free.shift - size) < _DISAGREE * np.sqrt(variance + free.variance):
                 both = boundaries_beside(evidence, falloff, (size, variance))
                 size, variance = both.shift, both.variance
@@ -138,9 +136,8 @@ class BrighterFatter(Effect):
             falloff, size, along_y = alone.falloff_px, alone.shift, alone.along_y
             errors, together = _errors(alone)
             why += "; no nonlinearity is needed in addition"
-        details["a_00"] = size * float(area_changes(falloff)[REACH, REACH])
         effect = cls(float(np.clip(size, 0, _MAX_SHIFT)), falloff, along_y)
-        return Estimate(effect, errors, significance, why, details, together)
+        return Estimate(effect, errors, significance, why, together)
 
 
 def _by_axis(noise: SharedCharge) -> tuple[float, float, float, float]:

@@ -154,20 +154,18 @@ class CosmicHits(Effect):
         found = _fitted(law, searches, evidence.pitch_um)
         if found is None:
             return None
-        effect, errors, seen = found
+        effect, errors = found
         step: dict[str, float] = {}
         for other, apart in others:
             if (as_likely := _fitted(other, searches, evidence.pitch_um)) is not None:
                 steps = _steps(effect, as_likely[0], max(apart, 1.0))
                 step = max(step, steps, key=lambda one: abs(one.get("rate_cm2_s", 0.0)))
         counts, chances = _counts(searches)
-        count, chance = int(counts.sum()), float(chances.sum())
         return Estimate(
             effect,
             {n: float(np.hypot(errors.get(n, 0.0), step.get(n, 0.0))) for n in {**errors, **step}},
-            sigmas_of_count(count, chance),
+            sigmas_of_count(int(counts.sum()), float(chances.sum())),
             "samples in single frames far above the pixel's other frames",
-            {"hits": count, "expected_by_chance": chance, "seen_cm2_s": seen},
             (*({n: error} for n, error in errors.items()), step) if step else (),
             refused=_NOISY_PIXELS if _recur(searches) else "",
         )
@@ -404,8 +402,8 @@ def _laws(
 
 def _fitted(
     law: CosmicHits, searches: list[_Search], pitch_um: float
-) -> tuple[CosmicHits, dict[str, float], float] | None:
-    """A law with its best rates and charge, errors, and cm² s searched; None without detection."""
+) -> tuple[CosmicHits, dict[str, float]] | None:
+    """A law with its best rates and charge, and errors; None without detection."""
     drawn = _Drawn(law, pitch_um)
     places = [drawn.noise_at(s.sigma) for s in searches]
     scale, scale_error = _scale(searches, places, drawn)
@@ -425,7 +423,7 @@ def _fitted(
         errors[charge] = law.electrons_per_um * scale_error
     rates = dict.fromkeys(law.strengths, 0.0) | dict(zip(of, values, strict=True))
     fitted = replace(law, **rates | {charge: law.electrons_per_um * scale})
-    return fitted, errors, float(exposures[0].sum())
+    return fitted, errors
 
 
 def _steps(effect: CosmicHits, other: CosmicHits, errors: float) -> dict[str, float]:

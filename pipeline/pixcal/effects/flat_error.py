@@ -140,7 +140,6 @@ class FlatError(Effect):
             | ({"scale_px": ring.scale_error} if waves else {}),
             float(all_of_it.mean() / all_of_it.std() * np.sqrt(weight)),
             "structure common to mean light and fringe amplitude after division by the flat",
-            {"variance": float(all_of_it.mean())},
         )
 
 

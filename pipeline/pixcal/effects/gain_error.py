@@ -97,8 +97,6 @@ class GainError(Effect):
         found = {name: way for name, way in ways.items() if way is not None}
         if not found:
             return None
-        details = {f"of_{n}": 1 / share - 1 for n, (share, _) in found.items()}
-        details |= {f"of_{n}_error": error / share**2 for n, (share, error) in found.items()}
         share, error = _joined(found)
         relative, error = 1 / share - 1, error / share**2
         return Estimate(
@@ -107,7 +105,6 @@ class GainError(Effect):
             float(abs(relative) / error),
             f"noise that grows with the level in the {' and the '.join(found)} is "
             f"{share:.3f} times that expected with the gain used",
-            details,
         )
 
 

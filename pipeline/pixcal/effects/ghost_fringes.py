@@ -197,7 +197,6 @@ class GhostFringes(Effect):
             errors,
             found.significance if _of_a_beam(found.waves, law, left, evidence) else 0.0,
             "fringes of a common vector in " + " and ".join(found.seen_in),
-            {"sigmas_by_map": found.by_map},
             law=law,
             by_law=cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=by_law),
         )

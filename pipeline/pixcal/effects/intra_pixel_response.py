@@ -111,7 +111,6 @@ class IntraPixelResponse(Effect):
             # Of the scatter only, because unequal fibre powers also change a visibility.
             float(scatter / its_error),
             "visibility that varies from pixel to pixel, more strongly at shorter fringe periods",
-            {"of_width": float(square / error), "of_scatter": float(scatter / its_error)},
             refused=SHARED if shared else "",
         )
 

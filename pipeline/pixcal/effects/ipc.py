@@ -145,7 +145,6 @@ class Ipc(Effect):
             errors,
             kernel.significance,
             _why(kernel),
-            {"covariance": kernel.covariance.tolist()},
             law=f"a kernel of {len(kernel.couplings)} couplings, all significant",
             in_full=cls(_worth_it(kernel.whole)) if kernel.whole else None,
         )
@@ -181,7 +180,7 @@ class Ipc(Effect):
     def measured_again(self, parts: Iterable[Evidence]) -> Estimate | None:
         """All couplings within two pixels, and those found beyond, with the period found before.
 
-        Shares that are not significant are shrunk by their errors; the details hold the covariance.
+        Shares that are not significant are shrunk by their errors.
         """
         if not self.couplings or any(c.per_ke for c in self.couplings):
             return None
@@ -194,7 +193,7 @@ class Ipc(Effect):
             {f"couplings[{n}].share": float(s) for n, s in enumerate(sigma)},
             float("nan"),
             "every coupling within two pixels, measured on all frames",
-            {"covariance": found.covariance.tolist(), "pattern_px": found.pattern_px},
+            covariance=found.covariance,
         )
 
     def phase_slopes(self, maps: FringeMaps) -> F64:

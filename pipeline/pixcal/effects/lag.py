@@ -244,7 +244,6 @@ class Lag(Effect):
                 {"share": found.error},
                 found.share / found.error,
                 f"the first flat of each level is fainter, as after {before}",
-                {"share": found.share},
             )
         fringes = tuple(evidence.fringes.values())
         common = common_lag(
@@ -279,7 +278,6 @@ class Lag(Effect):
             sigmas_of_best(common.sigmas, uneven.sigmas),
             "the contrast falls with the phase step from the previous frame"
             + (", unevenly from pixel to pixel" if unalike else ""),
-            {"by_contrast_sigmas": common.sigmas, "by_pixels_sigmas": uneven.sigmas},
         )
 
     @classmethod

@@ -1,6 +1,6 @@
 """Response of the pixel and its amplifier that is not a straight line."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -147,7 +147,7 @@ class Nonlinearity(Effect):
         quadratic, cubic = (float(np.clip(v, -0.3, 0.3)) for v in found.sizes)
         effect = cls(quadratic, cubic, found.level_e)
         more, refused = None, ""
-        told = found.significance, found.why, found.details
+        told = found.significance, found.why
         bent = None if evidence.fringes else ladder_curve(evidence)
         if bent is not None:
             points = np.pad(bent.charge, (1, 0)).tolist(), np.pad(bent.change, (1, 0)).tolist()
@@ -198,7 +198,6 @@ class _Polynomial:
     sizes: F64  # (2,)
     covariance: F64  # (2, 2)
     why: str
-    details: Mapping[str, object]
     top_e: float  # highest level measured
 
     @property
@@ -239,16 +238,9 @@ def _polynomial(evidence: Evidence) -> _Polynomial | None:
         why = "flat noise that is not proportional to the level"
     else:
         return None
-    details: dict[str, object] = {}
-    if curve is not None:
-        details["of_noise"], details["of_noise_error"] = curve[0][0], curve[1][0, 0] ** 0.5
-    if levels is not None:
-        errors = np.sqrt(np.diag(levels[1]))
-        details["of_flats"] = [float(v) for v in levels[0]]
-        details["of_flats_errors"] = [float(v) for v in errors]
     measured = ladder(evidence) if by_levels else transfer_curve(evidence)
     top = level if evidence.fringes or measured is None else measured.top
-    return _Polynomial(level, sizes[:2], covariance[:2, :2], why, details, top)
+    return _Polynomial(level, sizes[:2], covariance[:2, :2], why, top)
 
 
 def _size(charge: float, change: float, error: float) -> dict[str, object]:

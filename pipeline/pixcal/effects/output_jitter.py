@@ -120,7 +120,6 @@ class OutputJitter(Effect):
             dict(zip(cls.strengths, rms_error.tolist(), strict=True)),
             found.sigmas,
             "steps between outputs that change in each frame without light",
-            {"white_e2": found.size[0], "walk_e2_s": found.size[1]},
         )
 
     @classmethod

@@ -217,7 +217,6 @@ class Quantisation(Effect):
             errors,
             significance,
             "missing codes, and code counts compared with neighbouring codes",
-            {"sigmas": found.sigmas, "codes": 0 if widths is None else len(widths.number)},
             (*found.together, *({n: e} for n, e in errors.items() if n[:4] != "bits")),
             law="" if effect == by_law else _LAW,
             by_law=None if effect == by_law else by_law,

@@ -257,11 +257,6 @@ class RollingShutter(Effect):
             },
             float(ramp.slope / ramp.error),
             f"light of the {'next' if ramp.way > 0 else 'previous'} frame in the residuals, by row",
-            {
-                "share_per_row_of_next": sums[0].slope,
-                "share_per_row_of_last": sums[1].slope,
-                "errors": [float(s.error) for s in sums],
-            },
             law="rows exposed one after the other",
         )
 

@@ -116,15 +116,14 @@ class RowNoise(Effect):
         columns = [line_spectrum(_turned(r), good.T, n) for r, good, n in dark]
         rows += [_of_fringes(f, across=False) for f in fringes]
         columns += [_of_fringes(f, across=True) for f in fringes]
-        found, size, error, sigmas = [], np.zeros(5), np.full(5, np.nan), []
+        size, error, sigmas = np.zeros(5), np.full(5, np.nan), []
         for part, spectra, own in (([0, 1, 2, 4], rows, _row_shapes), ([3], columns, _flat)):
             there = [s for s in spectra if s is not None]
             if there:
                 noise = fit_lines(there, [own(s) for s in there])
                 size[part], error[part] = noise.roots
                 sigmas += [float(z) for z in noise.sigmas]
-                found.append(noise)
-        if not found:
+        if not sigmas:
             return None
         return Estimate(
             cls(*map(float, size)),
@@ -132,7 +131,6 @@ class RowNoise(Effect):
             sigmas_of_best(*sigmas),
             f"covariance of distant pixels of a row or column in "
             f"{'frames without light' if dark else 'the residuals of the fringes'}",
-            {"variances_e2": [float(v) for noise in found for v in noise.size], "sigmas": sigmas},
         )
 
 

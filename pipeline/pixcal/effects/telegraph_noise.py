@@ -179,12 +179,6 @@ def _estimate(cls: type[TelegraphNoise], found: Telegraph, evidence: Evidence) -
         | ({"amplitude_shape": found.shape_error} if found.shape_error else {}),
         found.signs.significance,
         "noisy pixels have two levels or stay in one from frame to frame",
-        {
-            "flat_top_sigmas": found.signs.flat_top,
-            "one_sided_sigmas": found.signs.one_sided,
-            "staying_sigmas": found.signs.staying,
-            "noisy": found.signs.noisy,
-        },
         law="" if effect == by_law else _LAW,
         by_law=None if effect == by_law else by_law,
     )

@@ -95,9 +95,8 @@ class WavelengthDrift(Effect):
             values, hop_errors = _hops(motion, jumps, walks=walks)
             effect, errors = replace(effect, **values), errors | hop_errors
         significance = max(slow.significance, _sharpest(motion))
-        details = {**slow.details, "hops": len(jumps), "sets_differ_sigmas": slow.sets_differ}
         refused = SETS_DIFFER if slow.sets_differ > SIGNIFICANT else ""
-        return Estimate(effect, errors, significance, slow.why, details, refused=refused)
+        return Estimate(effect, errors, significance, slow.why, refused=refused)
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:

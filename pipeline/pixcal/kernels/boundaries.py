@@ -33,20 +33,6 @@ def boundary_shifts(falloff_px: float) -> F64:
     return shift
 
 
-def area_changes(falloff_px: float) -> F64:
-    """Area that a pixel gains by a charge in its neighbour: a_ij of Astier et al. 2019.
-
-    In flats the covariance of two pixels is this, times the shift by an electron, times the mean
-    charge squared. Of charges at rows and columns ``-REACH`` to ``REACH``, in units of the shift by
-    an electron in px; of those at the rim only the nearer boundaries count.
-    """
-    right = np.pad(boundary_shifts(falloff_px), ((0, 0), (1, 0)))
-    left = right[:, ::-1]
-    across = right + left
-    area: F64 = across + across.T
-    return area
-
-
 # Loops, where a slice could be assigned: that takes seconds to compile.
 @kernel()
 def _push(charge: Any, shifts: Any, wide: Any, right: Any, below: Any) -> None:

@@ -92,11 +92,11 @@ class Estimate:
         Deviation from no effect, in sigma.
     why : str
         One sentence: the frames and the statistic that show it.
-    details : mapping
-        Numbers to compare different methods of measurement.
     together : tuple of mapping
         Joint 1-sigma steps of several parameters, independent of one another, if errors are
         correlated; otherwise the errors of the parameters are independent.
+    covariance : (n, n) float64, optional
+        Of the parameters of `Effect.phase_slopes`, if measured together.
     law : str
         The best-fitting law of the mechanism, in words; empty if the effect is itself a law.
     by_law : Effect, optional
@@ -117,8 +117,8 @@ class Estimate:
     errors: Mapping[str, float]
     significance: float
     why: str
-    details: Mapping[str, Any] = field(default_factory=dict)
     together: tuple[Mapping[str, float], ...] = ()
+    covariance: F64 | None = None
     law: str = ""
     by_law: "Effect | None" = None
     again: "Again | None" = None
@@ -208,9 +208,7 @@ class Effect(ForwardModel):
             series = fit_frames(cls, evidence)
             if series is None:
                 return None
-            return Estimate(
-                series.model, series.errors, series.significance, series.why, series.details
-            )
+            return Estimate(series.model, series.errors, series.significance, series.why)
         found = score(cls, evidence)
         if found is None:
             return None
@@ -304,16 +302,10 @@ class Effect(ForwardModel):
 
 @dataclass(frozen=True)
 class Again:
-    """An effect as measured, with a faster way to detect it in other frames.
-
-    Attributes
-    ----------
-    effect : Effect
-    detect : callable
-        Its significance in evidence; None if undetermined.
-    """
+    """An effect as measured, with a faster way to detect it in other frames."""
 
     effect: Effect
+    # its significance in evidence; None if undetermined
     detect: Callable[[Evidence], float | None] = field(repr=False, compare=False)
 
     @property
@@ -340,10 +332,6 @@ def _of_light(found: LightFit, degree: int) -> Estimate:
         found.errors,
         found.significance,
         found.why,
-        {
-            f"in_{kind.removeprefix('the ').replace(' ', '_')}": v
-            for kind, v in found.agreed.items()
-        },
         law=found.start.law,
         again=Again(found.model, partial(_of_light_again, here, degree)),
     )

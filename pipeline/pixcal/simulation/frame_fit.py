@@ -224,7 +224,6 @@ class FrameFit:
     errors: dict[str, float]
     significance: float
     why: str
-    details: dict[str, float]  # significance of each field, sigma
     # significance (sigma) of different steady strengths in each set
     sets_differ: float = -np.inf
 
@@ -250,7 +249,6 @@ def fit_frames(
         found.significance,
         f"changes of {' and '.join(told)} from frame to frame, the same in two halves of the "
         f"pixels{ALIKE if False in kinds and not changes.crossed else ''}",
-        {f"{field}_sigmas": sigmas(chance) for field, chance in found.chances.items()},
         fit.sets_differ(),
     )
 

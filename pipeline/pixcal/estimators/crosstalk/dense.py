@@ -41,8 +41,6 @@ class Dense:
 
     couplings: tuple[Coupling, ...]
     covariance: F64  # (n, n) of their shares
-    # rms of the true pattern of offsets that the data require in addition to the couplings
-    pattern_px: float
     ways: tuple[str, ...]  # methods of measurement
 
     @property
@@ -112,7 +110,7 @@ class CouplingFrames:
         couplings = tuple(
             replace(c, share=float(k), per_ke=per_ke) for c, k in zip(every, shares, strict=True)
         )
-        return Dense(couplings, found[1], found[2], (*ways, *["maps"] * (maps is not None)))
+        return Dense(couplings, found[1], (*ways, *["maps"] * (maps is not None)))
 
 
 def frames_of(

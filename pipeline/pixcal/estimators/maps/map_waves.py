@@ -65,7 +65,6 @@ class Waves:
     # that is the best
     significance: float
     seen_in: tuple[str, ...]  # maps in which it is significant, or the two best
-    by_map: Mapping[str, float]  # its standard deviations in each map
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,7 @@ def find_waves(evidence: Evidence, most: int = MOST) -> Waves | None:
             if more.significance < SIGNIFICANT:
                 break
             waves += more.waves
-    return Waves(tuple(waves), best.in_flats, best.significance, best.seen_in, best.by_map)
+    return Waves(tuple(waves), best.in_flats, best.significance, best.seen_in)
 
 
 def _maps(fringes: FringeEvidence, evidence: Evidence, in_flats: bool) -> list[_Map]:
@@ -181,7 +180,6 @@ def _strongest(maps: Maps, allowed: Mapping[str, Mask], in_flats: bool) -> Waves
         in_flats,
         significance,
         tuple(kind for kind in order if by_map[kind] > SIGNIFICANT) or tuple(order[:2]),
-        by_map,
     )
 
 

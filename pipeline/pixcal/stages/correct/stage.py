@@ -264,13 +264,12 @@ def _again(treatment: Treatment, parts: Iterator[Evidence]) -> Treatment:
     estimate = treatment.effect.measured_again(parts)
     if estimate is None:
         return treatment
-    covariance = estimate.details.get("covariance")
     return replace(
         treatment,
         effect=estimate.effect,
         errors=estimate.errors,
         why=f"{treatment.why}; {estimate.why}",
-        covariance=None if covariance is None else np.asarray(covariance, float),
+        covariance=estimate.covariance,
     )
 
 
