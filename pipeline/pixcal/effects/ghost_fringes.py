@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
 from pixcal.model.arrays import C128, F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
+from pixcal.simulation.forward import Part
 from pixcal.simulation.recording import Recording
 
 Beat = tuple[float, float]
@@ -41,8 +41,10 @@ ALIKE, ALIKE_SIGMAS = 0.1, 5.0
 
 
 @dataclass(frozen=True)
-class GhostWave:
+class GhostWave(Part):
     """One ghost as it is measured in the maps of a fringe set, with no assumption on its origin."""
+
+    strengths = ("static", "forward", "backward")
 
     beat_rad_px: tuple[float, float] = quantity(
         unit="rad/px", low=-np.pi, high=np.pi, doc="beat vector along x and y"
@@ -63,16 +65,6 @@ class GhostWave:
         """Amplitudes of the three ghosts that make this wave, in the order of `_EVERY_PARENT`."""
         forward, backward = complex(*self.forward), complex(*self.backward).conjugate()
         return forward, backward, complex(*self.static).conjugate() - forward - backward
-
-    def scaled(self, factor: float) -> Self:
-        """The same wave, ``factor`` times as strong."""
-        (s, t), (f, g), (b, c) = self.static, self.forward, self.backward
-        return replace(
-            self,
-            static=(factor * s, factor * t),
-            forward=(factor * f, factor * g),
-            backward=(factor * b, factor * c),
-        )
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import SETS_DISAGREE, Effect, Estimate, Stage
+from pixcal.simulation.forward import Part
 from pixcal.simulation.shot import Shot
 
 FALLOFF_PX = 0.5  # falloff of boundary shifts (brighter-fatter effect) fitted with the response
@@ -35,15 +35,13 @@ _OTHER_ORDER = 4
 
 
 @dataclass(frozen=True)
-class CurvePoint:
+class CurvePoint(Part):
     """A point of a measured response."""
+
+    strengths = ("change_e",)
 
     level_e: float = quantity(unit="e-", low=0, high=1e8, doc="charge")
     change_e: float = quantity(unit="e-", low=-1e7, high=1e7, doc="deviation from the polynomial")
-
-    def scaled(self, factor: float) -> Self:
-        """The same point of a response ``factor`` times as far from the polynomial."""
-        return replace(self, change_e=factor * self.change_e)
 
 
 @dataclass(frozen=True)

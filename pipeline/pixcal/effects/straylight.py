@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Self
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
@@ -13,6 +12,7 @@ from pixcal.kernels.scene import DetectorMaps, Rows
 from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, FringeMaps, LightStart, Stage
+from pixcal.simulation.forward import Part
 from pixcal.simulation.recording import Recording
 
 DEGREE = 8  # of the polynomials of a measured pattern
@@ -25,8 +25,10 @@ def _polynomials(places: bytes) -> F64:
 
 
 @dataclass(frozen=True)
-class StrayPattern:
+class StrayPattern(Part):
     """Stray light as measured in one fringe set, on a part of the detector."""
+
+    strengths = ("coefficients",)
 
     set: str = quantity(doc="name of the fringe set")
     rows: tuple[int, int] = quantity(doc="first row of the part, and the one after the last")
@@ -34,10 +36,6 @@ class StrayPattern:
     coefficients: tuple[float, ...] = quantity(
         low=-20, high=20, doc="coefficients of Legendre products in log(1 + share), by total degree"
     )
-
-    def scaled(self, factor: float) -> Self:
-        """The same pattern, ``factor`` times as strong."""
-        return replace(self, coefficients=tuple(factor * c for c in self.coefficients))
 
     def share(self, rows: F64, columns: F64) -> F64:
         """Share (y, x) of the fibres' light, never negative; outside the part, that at its edge."""

@@ -6,7 +6,6 @@ on which it acts; by default, a step changes nothing. Steps follow the order in 
 (`pixcal.simulation.exposure`); within a step, models act in the order of `ForwardModel.sort_key`.
 """
 
-import dataclasses
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -38,7 +37,19 @@ class Stage(IntEnum):
 
 
 @dataclass(frozen=True)
-class ForwardModel:
+class Part:
+    """A model, or a part of it, with strengths of its own."""
+
+    strengths: ClassVar[tuple[str, ...]]
+
+    def scaled(self, factor: float) -> Self:
+        """The same, ``factor`` times as strong."""
+        changed = {name: _times(getattr(self, name), factor) for name in self.strengths}
+        return replace(self, **changed)
+
+
+@dataclass(frozen=True)
+class ForwardModel(Part):
     """Base of all effects; a subclass is a frozen dataclass in a file of its own in ``effects/``.
 
     Attributes
@@ -72,16 +83,10 @@ class ForwardModel:
     acts_at: ClassVar[Stage]
     order: ClassVar[int] = 100
     domains: ClassVar[tuple[str, ...]]
-    strengths: ClassVar[tuple[str, ...]]
     optional_parameters: ClassVar[tuple[str, ...]] = ()
     frames_needed: ClassVar[tuple[str, ...]] = ("dark", "flat", "ladder", "baseline", "axis")
     sources: ClassVar[tuple[str, ...]]
     quick: ClassVar[bool] = True
-
-    def scaled(self, factor: float) -> Self:
-        """The effect, ``factor`` times as strong."""
-        changed = {name: _times(getattr(self, name), factor) for name in self.strengths}
-        return dataclasses.replace(self, **changed)
 
     @property
     def sort_key(self) -> tuple[int, int, str]:

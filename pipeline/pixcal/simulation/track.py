@@ -11,12 +11,15 @@ from pixcal.estimators.frame_series.fringe_motion import vector_courses
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
+from pixcal.simulation.forward import Part
 from pixcal.simulation.recording import Recording
 
 
 @dataclass(frozen=True)
-class Track:
+class Track(Part):
     """A quantity of the frames of a fringe set, linear between points, constant beyond them."""
+
+    strengths = ("value",)
 
     set: str = quantity(doc="name of the fringe set")
     time_s: tuple[float, ...] = quantity(
@@ -29,10 +32,6 @@ class Track:
         """From arrays (t,)."""
         values = np.clip(value, -1e6, 1e6)
         return cls(name, tuple(map(float, time_s)), tuple(map(float, values)))
-
-    def scaled(self, factor: float) -> Self:
-        """The same series, ``factor`` times as large."""
-        return replace(self, value=tuple(factor * v for v in self.value))
 
 
 def at(tracks: Iterable[Track], name: str, time_s: F64 | float) -> F64:
