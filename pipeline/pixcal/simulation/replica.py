@@ -33,25 +33,32 @@ TOP_ADU = 65535.0
 
 
 @dataclass(frozen=True)
-class Fitted(ForwardModel):
-    """The light and the pixels of an acquisition, as fitted."""
+class OfAcquisition(ForwardModel):
+    """Light and pixels of an acquisition, in place of those of a bench file."""
 
-    name = " fitted"
-    title = "as fitted"
     acts_at = Stage.LIGHT
     domains = ()
     strengths = ()
     sources = ()
 
     maps: DetectorMaps
-    theta: tuple[F64, ...]  # maps of each fringe set, e-, for unit response
-    k: tuple[tuple[float, float], ...]  # fringe vector of each, rad/px
-    frames: tuple[FrameStates, ...]  # of each set, from the first frame of its recording
 
     @property
     def is_null(self) -> bool:
         """Never."""
         return False
+
+
+@dataclass(frozen=True)
+class Fitted(OfAcquisition):
+    """The light and the pixels of an acquisition, as fitted."""
+
+    name = " fitted"
+    title = "as fitted"
+
+    theta: tuple[F64, ...]  # maps of each fringe set, e-, for unit response
+    k: tuple[tuple[float, float], ...]  # fringe vector of each, rad/px
+    frames: tuple[FrameStates, ...]  # of each set, from the first frame of its recording
 
     def light(self, light: Light, recording: Recording, rows: Rows, maps: DetectorMaps) -> Light:
         """As in `ForwardModel.light`; changes of offsets change the light."""

@@ -12,6 +12,7 @@ from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.exposure import Camera
+from pixcal.simulation.forward import ForwardModel
 from pixcal.simulation.recording import Recording
 
 DECLARED_ERROR = 0.01  # least relative error of a declared gain
@@ -50,7 +51,7 @@ class MeasuredGain:
 
 def photon_transfer_change(
     bench: Bench,
-    measured: Effect,
+    measured: ForwardModel,
     effects: Sequence[Effect],
     recordings: Sequence[Recording],
     neighbours: Sequence[tuple[int, int]] = (),

@@ -22,10 +22,10 @@ from pixcal.kernels.scene import DetectorMaps, FrameStates, Rows
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F32, F64, Indices
 from pixcal.model.bench import Bench
-from pixcal.simulation.effect import Effect, Stage
+from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import SEEDS_APART, Recording
-from pixcal.simulation.replica import TOP_ADU
+from pixcal.simulation.replica import TOP_ADU, OfAcquisition
 from pixcal.simulation.shot import Shot
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.fitted_set import FittedSet, IntensityBeforeEffects
@@ -61,26 +61,16 @@ class SetTruth:
 
 
 @dataclass(frozen=True)
-class Measured(Effect):
-    """Measured properties of a bench, in place of those of a bench file."""
+class Measured(OfAcquisition):
+    """Light and pixels of an acquisition, as measured."""
 
     name = " measured"
     title = "as measured"
-    acts_at = Stage.LIGHT
     # It acts before all effects, because it would overwrite their changes.
     order = -1
-    domains = ()
-    strengths = ()
-    sources = ()
 
-    maps: DetectorMaps
     sets: tuple[SetTruth, ...]
     lamp: FlatLight = FlatLight()
-
-    @property
-    def is_null(self) -> bool:
-        """Never."""
-        return False
 
     def light(self, light: Light, recording: Recording, rows: Rows, maps: DetectorMaps) -> Light:
         """As in `Effect.light`."""
