@@ -268,9 +268,9 @@ def test_a_corner_without_light_is_left_out(
     reduce.run(other, reduce.Config(), SYNC)
     look = look_at(other, SYNC)
     (left,) = look.facts.left_out
-    assert left.window == ((9, 49), (9, 49))
-    assert left.reason
-    assert len(look.facts.tried_on.windows) == len(look.windows) == 3
+    assert left["window"] == ((9, 49), (9, 49))
+    assert left["reason"]
+    assert len(look.facts.tried_on["windows"]) == len(look.windows) == 3
     # Nothing of the one that failed gets into those after it.
     levels = [w.bench.measured.sets[0].light.mean() for w in look.windows]
     assert min(levels) > 0.5 * max(levels) > 1000

@@ -6,11 +6,11 @@ The fields are keys of ``diagnosis.json``.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from pixcal.model.acquisition import Acquisition
 from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.parts import Half, Table
-from pixcal.stages.evidence import Part
 
 # first frame, last frame and count, by array
 Frames = dict[str, tuple[int, int, int]]
@@ -28,37 +28,13 @@ def frames_of(half: Half) -> Frames:
 
 
 @dataclass(frozen=True)
-class FittedOn:
-    """Window and frames to which effects were fitted."""
-
-    window: Part
-    frames: Frames
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """Windows and frames on which effects were tested."""
-
-    windows: tuple[Part, ...]
-    frames: Frames
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """A window that could not be fitted."""
-
-    window: Part
-    reason: str
-
-
-@dataclass(frozen=True)
 class FramesUsed:
     """Entry ``looked_at`` of ``diagnosis.json``."""
 
     shape: tuple[int, int]  # rows and columns of the detector
-    fitted_on: FittedOn
-    tried_on: HeldOut
-    left_out: tuple[LeftOut, ...]
+    fitted_on: dict[str, Any]  # ``window`` and ``frames`` to which effects were fitted
+    tried_on: dict[str, Any]  # ``windows`` and ``frames`` on which effects were tested
+    left_out: tuple[dict[str, Any], ...]  # ``window`` that cannot be fitted, and ``reason``
     # arrays too short to split: effects are fitted and tested on the same frames
     shared: tuple[str, ...]
     kinds: tuple[str, ...]  # of calibration frames
@@ -68,10 +44,10 @@ class FramesUsed:
     @property
     def on_the_same_pixels(self) -> bool:
         """Whether effects were tested on pixels to which they were fitted."""
-        (y0, y1), (x0, x1) = self.fitted_on.window
+        (y0, y1), (x0, x1) = self.fitted_on["window"]
         return any(
             y0 < b1 and b0 < y1 and x0 < a1 and a0 < x1
-            for (b0, b1), (a0, a1) in self.tried_on.windows
+            for (b0, b1), (a0, a1) in self.tried_on["windows"]
         )
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from pixcal.engine.plan import Plan, make_plan
 from pixcal.engine.run import Runtime, run_tasks
@@ -12,10 +13,7 @@ from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.frames_used import (
-    FittedOn,
     FramesUsed,
-    HeldOut,
-    LeftOut,
     frames_of,
     missing_frames,
 )
@@ -77,7 +75,7 @@ def look_at(
     runtime, few, room = _memory(own.test, pixels, runtime)
     dtypes = {name: array.dtype for name, array in ingested.arrays.items()}
     windows: list[Window] = []
-    left_out: list[LeftOut] = []
+    left_out: list[dict[str, Any]] = []
     measured: list[Curves] = []
     signatures: tuple[Signature, ...] = ()
     seed: int | None = None
@@ -94,7 +92,7 @@ def look_at(
             # A corner may have no light; effects are fitted in the middle.
             if part == first or len(left_out) == len(parts) - 1:
                 raise
-            left_out.append(LeftOut(part, str(error)))
+            left_out.append({"window": part, "reason": str(error)})
             continue
         finally:
             del raws
@@ -121,8 +119,8 @@ def look_at(
     steps = [s.step for s in windows[0].bench.measured.sets]
     facts = FramesUsed(
         shape,
-        FittedOn(first, frames_of(own.learn)),
-        HeldOut(tuple(w.part for w in tried), frames_of(own.test)),
+        {"window": first, "frames": frames_of(own.learn)},
+        {"windows": tuple(w.part for w in tried), "frames": frames_of(own.test)},
         tuple(left_out),
         tuple(name for name, frames in own.learn.items() if set(frames) & set(own.test[name])),
         tuple(kind for kind in ("bias", "dark", "flat") if kind in ingested.tables),
