@@ -185,17 +185,20 @@ def _stacks(ingested: Ingested, part: Part) -> tuple[Stack, ...]:
         exposures = np.array([np.nan if t is None else t for t in table["exptime_s"]], float)
         frames = ingested.arrays[kind].read((0, len(exposures)), *part)
         times = np.asarray(table["time_s"], float)
-        steps = np.array(table.get("step") or np.zeros(len(exposures)), int)
-        for exposure in np.unique(exposures):
-            same = (exposures == exposure) | (np.isnan(exposures) & np.isnan(exposure))
-            for step in np.unique(steps[same]):
-                own = same & (steps == step)
-                adu, start = frames[own].astype(np.float32), _start(ingested, kind)
-                numbers = frame_numbers(table)[own]
-                found.append(
-                    Stack(kind, float(exposure), numbers, times[own], adu, start, int(step))
-                )
+        for own in groups(table):
+            adu, start = frames[own].astype(np.float32), _start(ingested, kind)
+            step = int(table["step"][own[0]]) if table.get("step") else 0
+            exposure, numbers = float(exposures[own[0]]), frame_numbers(table)[own]
+            found.append(Stack(kind, exposure, numbers, times[own], adu, start, step))
     return tuple(found)
+
+
+def groups(table: Mapping[str, list[Any]]) -> list[Indices]:
+    """Numbers of the frames of each exposure time and lamp, in ascending order; unknown last."""
+    exposures = np.array([np.inf if t is None else t for t in table["exptime_s"]], float)
+    steps = np.array(table.get("step") or np.zeros(len(exposures)), int)
+    pairs = sorted(set(zip(exposures.tolist(), steps.tolist(), strict=True)))
+    return [np.flatnonzero((exposures == t) & (steps == step)) for t, step in pairs]
 
 
 def frame_numbers(table: Mapping[str, list[Any]]) -> Indices:

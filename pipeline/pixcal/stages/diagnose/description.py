@@ -16,7 +16,8 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import plain_bench
 from pixcal.stages.diagnose.nominal import SetTruth
-from pixcal.stages.diagnose.parts import Half, Table, groups
+from pixcal.stages.diagnose.parts import Half, Table
+from pixcal.stages.evidence import groups
 
 _LATE = 0.05  # fraction of a period above which a frame counts as late
 _LIFTED = 8.0  # level without light after the pedestal, in units of the read noise

@@ -59,14 +59,6 @@ class Raw:
         return found
 
 
-def groups(table: Table) -> list[Indices]:
-    """Numbers of the frames of each exposure time and lamp, in ascending order; unknown last."""
-    exposures = np.array([np.inf if t is None else t for t in table["exptime_s"]], float)
-    steps = np.array(table.get("step") or np.zeros(len(exposures)), int)
-    pairs = sorted(set(zip(exposures.tolist(), steps.tolist(), strict=True)))
-    return [np.flatnonzero((exposures == t) & (steps == step)) for t, step in pairs]
-
-
 def take(
     ingested: Ingested,
     acquisition: Acquisition,

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixcal.model.arrays import Indices
-from pixcal.stages.diagnose.parts import Half, Table, groups
-from pixcal.stages.evidence import Part
+from pixcal.stages.diagnose.parts import Half, Table
+from pixcal.stages.evidence import Part, groups
 
 SIDE = 128  # side (pixels) of a window on a large detector: the width of a chunk of the cube
 LARGEST = 288  # most rows or columns of a detector used whole; beyond, windows do not overlap
