@@ -45,6 +45,14 @@ class ArrayFrames:
         return sums
 
 
+def no_prior(nominal: Geometry) -> Prior:
+    return Prior(nominal, np.full(6, np.inf))
+
+
+def fit_freely(paths: CrestPaths, start: Geometry) -> CrestFit:
+    return fit_crests(paths, start, no_prior(start))
+
+
 def crests_of_frames(
     frames: NDArray[Any],
     nominal: tuple[float, float],
@@ -119,7 +127,7 @@ def test_without_noise_the_fibres_are_found_to_numerical_precision() -> None:
     truth = fibres(shape, 9.6, offset=(5.0, -3.0), tilt=0.01)
     paths = crests_of_frames(exposed(shape, truth), paraxial_vector(truth))
     assert np.abs(errors(paths, truth)).max() < 1e-9
-    fit = fit_crests(paths, misplaced(truth, 10.0, 18.0, 0.05))
+    fit = fit_freely(paths, misplaced(truth, 10.0, 18.0, 0.05))
     # A nanometre in 40 cm; the worst known combination is that of distance, length and centre.
     assert np.abs(fit.geometry.vector() - truth.vector()) == pytest.approx(0, abs=1e-5)
     assert fit.cost < 1e-15
@@ -178,7 +186,7 @@ def test_errors_are_honest(pitch: float) -> None:
     points, pulls = [], []
     for _ in range(seeds):
         truth = nominal = fibres(shape, 6.0, 0.3, pitch)
-        prior = Prior.none(nominal)
+        prior = no_prior(nominal)
         if pitch == 4.4e-3:
             prior = Prior.of_bench(nominal)
             truth = nominal.with_vector(nominal.vector() + prior.sigma * rng.normal(size=6))
@@ -254,8 +262,8 @@ def test_every_start_ends_at_the_same_minimum(
     seen: tuple[CrestPaths, Geometry], sign: int, distance: float, share: float
 ) -> None:
     paths, truth = seen
-    best = fit_crests(paths, truth)
-    found = fit_crests(paths, misplaced(truth, distance, 18.0 * sign, share))
+    best = fit_freely(paths, truth)
+    found = fit_freely(paths, misplaced(truth, distance, 18.0 * sign, share))
     assert np.abs(found.geometry.vector() - best.geometry.vector()).max() < 1e-4 * best.sigma.max()
     assert found.evaluations < 40
 
@@ -263,7 +271,7 @@ def test_every_start_ends_at_the_same_minimum(
 @pytest.mark.long
 def test_the_cost_has_one_minimum(seen: tuple[CrestPaths, Geometry]) -> None:
     paths, truth = seen
-    fit = fit_crests(paths, truth)
+    fit = fit_freely(paths, truth)
     length = float(np.hypot(fit.geometry.baseline_x, fit.geometry.baseline_y))
     steps = np.linspace(-1, 1, 9)
     distance = fit.geometry.distance + 12 * steps
@@ -291,7 +299,7 @@ def test_the_curvature_of_the_cost_is_the_error_of_the_distance() -> None:
     paths = crests_of_frames(
         exposed(shape, truth, np.random.default_rng(9)), paraxial_vector(truth)
     )
-    fit = fit_crests(paths, truth)
+    fit = fit_freely(paths, truth)
     away = 0.1 * fit.sigma[2] * np.array([-1.0, 0.0, 1.0])
     _, cost = valley(paths, fit, fit.geometry.distance + away)
     assert cost[[0, 2]].mean() - cost[1] == pytest.approx(0.1**2, rel=0.02)
@@ -316,7 +324,7 @@ def test_outliers_are_left_out(seen: tuple[CrestPaths, Geometry]) -> None:
     wrong = np.arange(0, len(paths), 23)
     paths.k[wrong] += 2
     try:
-        fit = fit_crests(paths, misplaced(truth, 3.0, 5.0, 0.01))
+        fit = fit_freely(paths, misplaced(truth, 3.0, 5.0, 0.01))
     finally:
         paths.k[wrong] -= 2
     assert np.array_equal(np.flatnonzero(~fit.used), wrong)
@@ -325,7 +333,7 @@ def test_outliers_are_left_out(seen: tuple[CrestPaths, Geometry]) -> None:
 
 def test_what_is_held_stays_and_what_is_known_pulls(seen: tuple[CrestPaths, Geometry]) -> None:
     paths, truth = seen
-    free = fit_crests(paths, truth)
+    free = fit_freely(paths, truth)
 
     def with_sigma(sigma: list[float]) -> CrestFit:
         return fit_crests(paths, truth, Prior(truth, np.array(sigma)))
@@ -406,4 +414,4 @@ def test_too_few_fringes_are_counted() -> None:
 def test_too_few_paths_for_the_geometry(seen: tuple[CrestPaths, Geometry]) -> None:
     paths, truth = seen
     with pytest.raises(InputError, match=r"too few fringes: .* on 1 crests"):
-        fit_crests(paths.take(paths.k == paths.k[0]), truth)
+        fit_freely(paths.take(paths.k == paths.k[0]), truth)

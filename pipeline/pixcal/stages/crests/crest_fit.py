@@ -33,11 +33,6 @@ class Prior:
         """Errors of a bench's nominal values as assumed by the hyperbolic fit."""
         return cls(nominal, prior_errors(nominal))
 
-    @classmethod
-    def none(cls, nominal: Geometry) -> "Prior":
-        """No prior: every parameter is free."""
-        return cls(nominal, np.full(len(PARAMETERS), np.inf))
-
 
 @dataclass(frozen=True)
 class CrestFit:
@@ -95,11 +90,10 @@ def relative_phase(paths: CrestPaths, geometry: Geometry) -> F64:
     return np.asarray(phase(paths.x, paths.y, geometry) - phase(rx, ry, geometry))
 
 
-def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior | None = None) -> CrestFit:
+def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior) -> CrestFit:
     """Fit equation 7 by weighted least squares over fibre positions and phase."""
     # Distant starts converge (tested: 10 mm of distance, 18 mm of offset, 5 % of the baseline).
     # Without a prior, only a large window determines all six parameters.
-    prior = Prior.none(start) if prior is None else prior
     unknown, number = 1 + int(np.isinf(prior.sigma).sum()), len(np.unique(paths.k))
     if len(paths) <= unknown or number < 3:
         raise InputError(
