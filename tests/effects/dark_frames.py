@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+from all_frames import frames_of
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
-from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from all_frames import frames_of
 
 from pixcal.effects.bias_drift import BiasDrift
 from pixcal.effects.row_noise import RowNoise
@@ -14,7 +15,6 @@ from pixcal.estimators.frame_series.offset import FEWEST, fringe_offsets
 from pixcal.kernels.processes import brownian
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect, FringeMaps
-from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
 from pixcal.simulation.track import Track
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from all_frames import frames_of
 
 from pixcal.effects.brighter_fatter import BrighterFatter
 from pixcal.estimators.detector.neighbours import shared_charge
@@ -18,7 +19,6 @@ from pixcal.kernels.boundaries import (
     shared_noise,
 )
 from pixcal.model.bench import Bench
-from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
 
 RNG = np.random.default_rng(12)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from all_frames import frames_of
 from numpy.typing import NDArray
 
 import pixcal.effects
@@ -18,7 +19,7 @@ from pixcal.model.bench import Bench
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps, Stage
-from pixcal.simulation.exposure import Camera, frames_of, states_of
+from pixcal.simulation.exposure import Camera, states_of
 from pixcal.simulation.own_effect import effect_of_file
 from pixcal.simulation.recording import Recording, recordings
 from pixcal.stages.diagnose.nominal import Measured

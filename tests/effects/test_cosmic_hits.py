@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from all_frames import frames_of
 from scipy import stats
 from scipy.special import erf
 
@@ -12,7 +13,6 @@ from pixcal.effects.cosmic_hits import CosmicHits, _rates
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.tracks import GRAZING, add_tracks, draw_tracks
 from pixcal.model.bench import Bench
-from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
 
 RNG = np.random.default_rng(3)

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from all_frames import frames_of
 
 from pixcal.effects.flat_error import FlatError
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.maps.map_fit import polynomial, without
 from pixcal.model.bench import Bench
-from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
 
 

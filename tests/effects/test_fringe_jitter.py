@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from all_frames import frames_of
 
 from pixcal.effects.fringe_jitter import FringeJitter
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
-from pixcal.simulation.exposure import frames_of, states_of
+from pixcal.simulation.exposure import states_of
 from pixcal.simulation.recording import recordings
 
 Benches = Callable[..., Bench]

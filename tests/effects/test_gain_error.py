@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from all_frames import frames_of
 
 from pixcal.effects.gain_error import GainError, shot_share_of_flats
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
-from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
 
 SHAPE = {"detector.shape": [41, 53]}

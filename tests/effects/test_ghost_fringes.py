@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from all_frames import frames_of
 
 from pixcal.effects.ghost_fringes import GhostFringes, GhostWave
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.maps import map_waves
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import FringeMaps
-from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
 
 

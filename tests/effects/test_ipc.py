@@ -6,6 +6,7 @@ from collections.abc import Callable
 import galsim
 import numpy as np
 import pytest
+from all_frames import frames_of
 from numpy.typing import NDArray
 
 from pixcal.effects.ipc import FOUR_ROWS, Ipc
@@ -19,7 +20,6 @@ from pixcal.model.bench import Bench
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Estimate, FringeMaps
-from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
 
 F64 = NDArray[np.float64]

@@ -8,13 +8,13 @@ from typing import Any
 import galsim
 import numpy as np
 import pytest
+from all_frames import frames_of
 
 from pixcal.effects.nonlinearity import CurvePoint, Nonlinearity, _straight_on
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Estimate
-from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
 
 QUIET = {

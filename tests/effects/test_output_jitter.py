@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from all_frames import frames_of
 from dark_frames import in_the_dark
 
 from pixcal.effects.bias_drift import BiasDrift
@@ -15,7 +16,6 @@ from pixcal.effects.telegraph_noise import TelegraphNoise
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
-from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
 
 SHAPE = (160, 96)

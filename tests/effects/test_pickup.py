@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import scipy.signal
+from all_frames import frames_of
 from dark_frames import in_the_dark
 
 from pixcal.effects.bias_drift import BiasDrift
@@ -17,7 +18,6 @@ from pixcal.model.arrays import F64
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
-from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
 
 

@@ -4,13 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from all_frames import frames_of
 
 from pixcal.effects.output_jitter import OutputJitter
 from pixcal.effects.pickup import Pickup
 from pixcal.effects.row_noise import RowNoise
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
-from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from all_frames import frames_of
 from joint_fit import fit_jointly
 
 from pixcal.effects.rolling_shutter import RollingShutter
@@ -14,7 +15,7 @@ from pixcal.kernels.scene import frame_states
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import FittedFrames, FringeMaps
-from pixcal.simulation.exposure import Camera, frames_of
+from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import recordings
 
 RINGING = tuple(0.015 * np.exp(-r / 0.9) * np.cos(12 * r) for r in np.linspace(0, 1, 25))

@@ -4,13 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from all_frames import frames_of
 
 from pixcal.effects.straylight import Straylight
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.maps.structure import flattened
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import FringeMaps
-from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.light_fit import fit_light
 from pixcal.simulation.recording import recordings
 

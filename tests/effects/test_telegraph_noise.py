@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from all_frames import frames_of
 
 from pixcal.effects.telegraph_noise import MeasuredPixels, TelegraphNoise, _pixels, _series
 from pixcal.estimators.detector.telegraph.moments import moments_of, signs
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.synthesis import BLOCK_ROWS
 from pixcal.model.bench import Bench, SimulatedDetector
-from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import Recording, recordings
 
 LONG = {

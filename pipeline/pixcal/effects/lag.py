@@ -27,7 +27,6 @@ from pixcal.simulation.shot import Shot
 
 TAIL = 1e-3  # truncated tail of the release, added to the last frame; share of the charge left
 _TELL_LAMP = 3  # fewest flats per level to distinguish a warming lamp from lag
-_TURNS = 3  # iterations of the inverse; each reduces the error by a factor of the share
 
 
 @dataclass(frozen=True)
@@ -204,18 +203,10 @@ class Lag(Effect):
         )
 
     def restored(self, frames: F32) -> F32:
-        """Frames (t, y, x) without lag, e-, except for scatter of the share between pixels.
+        """Frames (t, y, x) without a lag of one share for all pixels and levels, e-.
 
         ``frames``: (t, y, x) e-, in the order of time without gaps; the first one after darkness.
         """
-        if not self.bands and not self.capacity_e:
-            return self._restored_exactly(frames)
-        found = frames
-        for _ in range(_TURNS + 1):
-            found = frames + self.lost(found)[0]
-        return found
-
-    def _restored_exactly(self, frames: F32) -> F32:
         found = np.empty_like(frames)
         for n, frame in enumerate(frames):
             late = np.zeros_like(frame)

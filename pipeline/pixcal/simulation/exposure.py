@@ -24,7 +24,6 @@ from pixcal.kernels.scene import (
     frame_states,
     fringe_light,
 )
-from pixcal.kernels.synthesis import BLOCK_ROWS
 from pixcal.model.arrays import F32, U16
 from pixcal.model.bench import Bench
 from pixcal.simulation.forward import ForwardModel
@@ -241,14 +240,3 @@ def states_of(recording: Recording, effects: Sequence[ForwardModel]) -> FrameSta
     for effect in effects:
         states = effect.states(states, recording)
     return states
-
-
-def frames_of(bench: Bench, recording: Recording, effects: Sequence[ForwardModel] = ()) -> U16:
-    """All frames (time, y, x) of a recording, in memory."""
-    out = np.empty((recording.count, *bench.detector.shape), np.uint16)
-    for first in range(0, out.shape[1], BLOCK_ROWS):
-        rows = (first, min(first + BLOCK_ROWS, out.shape[1]))
-        camera = Camera(bench, rows, effects)
-        for frame, samples in camera.expose(recording, range(recording.count)):
-            out[frame, slice(*rows)] = samples
-    return out
