@@ -1,21 +1,19 @@
 """Errors of the corrected offsets from the errors of an effect's parameters."""
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from contextlib import suppress
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from pixcal.effects import parse_effects
 from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.fringe_fit.modes import solve_modes
 from pixcal.estimators.maps.corrected import phase_change, straight_modes
 from pixcal.model.arrays import F64, Mask
-from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps
+from pixcal.simulation.forward import numbers, with_numbers
 from pixcal.stages.correct.sweep_to_correct import Swept, corrected, maps_of
 from pixcal.stages.fit.sweep import scout_tiles
 
@@ -28,26 +26,16 @@ SLOPE_BYTES = 24  # and per parameter with a slope
 def moved(effect: Effect, errors: Mapping[str, float]) -> list[Effect]:
     """The effect with each parameter moved by its error; keys as in ``couplings[0].share``."""
     variants: list[Effect] = []
-    for name, error in errors.items():
-        for step in (error, -error):
-            plain = to_plain(effect)
-            try:
-                _add(plain, re.findall(r"\w+", name), step)
-                variants += parse_effects({effect.name: plain}, name, {effect.name: type(effect)})
-            except (InputError, LookupError, TypeError):
-                continue  # outside the range of the parameter: try the other side
-            break
+    values = numbers(effect)
+    for name in (name for name in errors if name in values):
+        for value in (values[name] + errors[name], values[name] - errors[name]):
+            with suppress(InputError):
+                other = with_numbers(effect, {name: value})
+                # Outside the range of the parameter: try the other side.
+                if numbers(other)[name] == value:
+                    variants.append(other)
+                    break
     return variants
-
-
-def _add(plain: Any, path: Sequence[str], step: float) -> None:
-    """Add a step to a number in nested plain data."""
-    first, *rest = path
-    key: Any = int(first) if isinstance(plain, list) else first
-    if rest:
-        _add(plain[key], rest, step)
-    else:
-        plain[key] += step
 
 
 def parameter_errors(swept: Swept, runtime: Runtime) -> dict[str, float | None]:
