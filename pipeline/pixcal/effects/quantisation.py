@@ -260,8 +260,11 @@ def _by_law(evidence: Evidence, far: bool = False) -> _ByLaw | None:
     widths = None
     if counts is not None:
         top = evidence.saturation_adu
-        if 1 < step < FEW_MISSING and _has_wrong_bits(code_widths(counts, noise, first, top)):
-            step = 1.0
+        if 1 < step < FEW_MISSING:
+            own = code_widths(counts, noise, first, top)
+            # Wrong bits leave codes out too.
+            if own is not None and "bits" in _uneven(own)[0]:
+                step = 1.0
         widths = code_widths(converter_counts(counts, step), noise, first, top / step)
     if widths is None and step == evidence.step_adu:
         return None
@@ -289,11 +292,6 @@ def _reached(effect: Quantisation, specimen: int, codes: int) -> tuple[F64, Indi
     begins = np.minimum.accumulate(begins[::-1])[::-1]
     lowest = np.searchsorted(begins, np.arange(codes * _CELLS) / _CELLS, "right") - 1
     return np.append(begins, np.inf), order, np.maximum(lowest, 0)
-
-
-def _has_wrong_bits(widths: CodeWidths | None) -> bool:
-    """Whether code widths depend on bit transitions beyond their scatter."""
-    return widths is not None and "bits" in _uneven(widths)[0]
 
 
 def _uneven(

@@ -126,11 +126,6 @@ def treatments(
     return Treatments(tuple(effects))
 
 
-def treatment_of(effect: Effect, model: str, models: Mapping[str, str]) -> Treatment:
-    """What to do about an effect that a diagnosis found; parameters as in `treatments`."""
-    return Treatment(effect, "diagnosis", {}, *treatment_of_kind(type(effect), model, models))
-
-
 def fitted_shapes(run_dir: Path) -> tuple[str, Mapping[str, str]]:
     """Shape of the fringes that was asked for, and the one fitted to each set."""
     if not (run_dir / "fit" / MANIFEST).exists():

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.random import default_rng
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
@@ -30,11 +31,6 @@ LARGEST = 1.0  # largest valid offset, px; pixels beyond are left out
 AXES = {"delta_x": ("x", (1.0, 0.0)), "delta_y": ("y", (0.0, 1.0))}
 ENOUGH = 4_000_000  # pixels that determine the modes; on larger detectors, bands are left out
 BAND = 16  # rows of a task of the fit of the modes
-
-
-def generator(seed: int, *key: int) -> np.random.Generator:
-    """Random generator keyed by purpose and position, independent of the task."""
-    return np.random.default_rng([seed, *key])
 
 
 @dataclass(frozen=True)
@@ -151,7 +147,7 @@ class PixelPositions:
         side, (rows, columns) = DRAW_TILE, [(a // DRAW_TILE, -(-b // DRAW_TILE)) for a, b in (y, x)]
         size = (len(self.components), side, side)
         tiles = [
-            [generator(self.seed, 1, i, j).standard_normal(size) for j in range(*columns)]
+            [default_rng([self.seed, 1, i, j]).standard_normal(size) for j in range(*columns)]
             for i in range(*rows)
         ]
         (y0, y1), (x0, x1) = (

@@ -26,7 +26,6 @@ from pixcal.stages.astrometry.detector import (
     DegenerateModes,
     PixelPositions,
     free_from_modes,
-    generator,
     open_components,
 )
 from pixcal.stages.astrometry.stars import (
@@ -192,7 +191,7 @@ def _axes(
     bounds = np.sqrt((detector.axes**2) @ observed.bound() ** 2)
     facts = {}
     for n, component in enumerate(detector.components):
-        rng = generator(detector.seed, 3, n)
+        rng = np.random.default_rng([detector.seed, 3, n])
         facts[component.name] = axis_facts(
             errors[..., n], float(bounds[n]), telescope.uas_per_px, drawn=detector.drawn, rng=rng
         )

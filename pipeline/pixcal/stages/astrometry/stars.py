@@ -15,7 +15,7 @@ from pixcal.kernels.psf import Psf, diffraction_psf
 from pixcal.model.acquisition import Detector as Declared
 from pixcal.model.arrays import C128, F64
 from pixcal.model.errors import InputError
-from pixcal.stages.astrometry.detector import PixelPositions, generator
+from pixcal.stages.astrometry.detector import PixelPositions
 from pixcal.storage.cube import ArrayWriter, create_group, create_map
 
 FULL_WELL_E = 50_000.0  # if the acquisition declares none (paper, table 1)
@@ -118,7 +118,7 @@ def _batch(detector: PixelPositions, plan: Observation, core: F64, stars: range)
 def observe_star(detector: PixelPositions, plan: Observation, core: F64, number: int) -> F64:
     """Errors (position, kind, component) of one star, px; ``core`` is that of `core_weights`."""
     star, half, axes = plan.star, plan.star.half, detector.axes
-    rng = generator(detector.seed, 2, number)
+    rng = np.random.default_rng([detector.seed, 2, number])
     # The whole window lies on the detector.
     first = np.full(2, half - 0.5)
     last = np.array(detector.shape[::-1]) - half - 0.5

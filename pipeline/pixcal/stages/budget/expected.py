@@ -260,11 +260,6 @@ class SetBound:
             before = now
         return factors
 
-    def calibration(self) -> WeightErrors:
-        """Cost of bias and flat errors for the typical pixel."""
-        n = self.typical
-        return WeightErrors.of(float(self.iota[n]), float(self.alpha[n]), self.variance)
-
 
 def grid(shape: tuple[int, int]) -> list[I64]:
     """Columns and rows of a window at which the bound is evaluated, edges included."""

@@ -23,6 +23,7 @@ from pixcal.stages.budget.expected import (
     JoinedBound,
     SetBound,
     Shares,
+    WeightErrors,
     bias_frames_needed,
     brightest_allowed,
     flat_error,
@@ -165,7 +166,8 @@ def _reached(reach: Reach, frames: Shares) -> dict[str, Any]:
 
 def _calibration(bench: Bench, s: SetBound) -> dict[str, Any]:
     """Bias and flat frames needed, and the cost of those planned."""
-    errors, f = s.calibration(), bench.frames
+    n, f = s.typical, bench.frames
+    errors = WeightErrors.of(float(s.iota[n]), float(s.alpha[n]), s.variance)
     level, flat = float(np.median(s.iota)), flat_error(bench)
     return {
         "bias_frames_needed": bias_frames_needed(errors, s.variance),

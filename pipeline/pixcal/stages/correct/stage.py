@@ -200,7 +200,7 @@ def _swept_sets(
 
 def _of_set(fitted: FittedSet, totals: Totals, gain: Json, before: Json, plan: Treatments) -> Json:
     """Entry of a set in ``correction.json``."""
-    summary = totals.sets[fitted.name]
+    masked, sigma_px = totals.sets[fitted.name]
     by_effect = dict(
         zip((t.effect.name for t in plan.on_maps), gain.pop("change_by_effect"), strict=True)
     )
@@ -208,10 +208,10 @@ def _of_set(fitted: FittedSet, totals: Totals, gain: Json, before: Json, plan: T
     if plan.on_samples:
         # Effects on samples are corrected together, in one sweep.
         by_effect[" and ".join(e.name for e in plan.on_samples)] = on_samples
-    after = describe(fitted, summary.masked, summary.sigma_px)
+    after = describe(fitted, masked, sigma_px)
     return gain | {
         "change_by_effect": by_effect,
-        "sigma_median_px": {"before": before["sigma_median_px"], "after": summary.sigma_px},
+        "sigma_median_px": {"before": before["sigma_median_px"], "after": sigma_px},
         "chi2_reduced": {"before": before["chi2_reduced"], "after": after["chi2_reduced"]},
         "fit": after,
     }

@@ -66,7 +66,7 @@ def by_domain(
     for domain in DOMAINS:
         keys = [k for k in before if statistic_named(k[0]).domain == domain]
         found[domain] = [
-            _rounded(sigmas_among(min(one[k].log_chance for k in keys), len(keys))) if keys else 0.0
+            rounded(sigmas_among(min(one[k].log_chance for k in keys), len(keys))) if keys else 0.0
             for one in (before, after)
         ]
     return found
@@ -119,9 +119,9 @@ class _Description:
             "causes": sorted(causes, key=lambda c: -float(c["gap_closed"])),
             "gap": {
                 "total": 1.0 if self.where else 0.0,
-                "after": _rounded(final.gap.total),
-                "interval": [_rounded(v) for v in gap_interval(self.data, final, found.final)],
-                "domains": {d: [_rounded(v) for v in final.gap.of_domain(d)] for d in DOMAINS},
+                "after": rounded(final.gap.total),
+                "interval": [rounded(v) for v in gap_interval(self.data, final, found.final)],
+                "domains": {d: [rounded(v) for v in final.gap.of_domain(d)] for d in DOMAINS},
                 "where": self._where(),
                 "absolute": self._absolute(),
                 "places": list(places),
@@ -193,9 +193,9 @@ class _Description:
                 _closed(v) for v in reversed(gap_interval(self.data, alone, by_itself))
             ],
             "gap_closed_by_law": _closed(by_law.gap.total),
-            "gain_over_rest": _rounded(without.gap.total - self.final.gap.total),
+            "gain_over_rest": rounded(without.gap.total - self.final.gap.total),
             "p_value": float(np.clip(chance, MIN_P_VALUE, 1.0)),
-            "sigmas": _rounded(estimate.significance),
+            "sigmas": rounded(estimate.significance),
             "why": estimate.why,
             "remedy": effect.remedy or "find and fix it on the bench",
             "given_away_by": self._telling(found.without[name]),
@@ -222,12 +222,12 @@ class _Description:
         closed = _closed(self._with(alone).gap.total) if alone is not None and self.where else 0.0
         about: Json = {
             "effect": candidate.name,
-            "gap_closed": _rounded(closed),
+            "gap_closed": rounded(closed),
             "rejected_because": candidate.reason,
             "tried_on_unseen_frames": alone is not None,
         }
         if estimate is not None:
-            about["sigmas"] = _rounded(estimate.significance)
+            about["sigmas"] = rounded(estimate.significance)
             about["parameters"] = to_plain(estimate.effect)
         return about
 
@@ -282,11 +282,11 @@ class _Description:
             "measured": curve["measured"][at],
             "simulated": curve["nominal"]["value"][at],
             "after": curve["with_effects"]["value"][at],
-            "z": _rounded(float(before.sigmas[at])),
-            "z_after": _rounded(float(after.sigmas[at])),
-            "size": _rounded(self.final.sizes.size[key]),
-            "significance": _rounded(sigmas_among(before.log_chance, len(self.final.before))),
-            "left": _rounded(self.final.gap.left.get(key, 0.0)),
+            "z": rounded(float(before.sigmas[at])),
+            "z_after": rounded(float(after.sigmas[at])),
+            "size": rounded(self.final.sizes.size[key]),
+            "significance": rounded(sigmas_among(before.log_chance, len(self.final.before))),
+            "left": rounded(self.final.gap.left.get(key, 0.0)),
             "stays": key in self.staying,
             "place": set_name + place(curve, at),
         }
@@ -328,8 +328,9 @@ def _natural(values: F64, usual: F64 | None) -> F64:
 
 def _closed(left: float) -> float:
     """Closed share of the gap, given the residual share; at least 0."""
-    return _rounded(max(1 - left, 0.0))
+    return rounded(max(1 - left, 0.0))
 
 
-def _rounded(value: float) -> float:
+def rounded(value: float) -> float:
+    """To four digits."""
     return float(f"{value:.4g}")

@@ -25,9 +25,9 @@ from pixcal.model.options import Diagnose as Config
 from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.inquiry import inquire, places
-from pixcal.stages.diagnose.result import describe
+from pixcal.stages.diagnose.result import describe, rounded
 from pixcal.stages.diagnose.trial import Effects
-from pixcal.stages.treatment import fitted_shapes, treatment_of
+from pixcal.stages.treatment import Treatment, fitted_shapes, treatment_of_kind
 from pixcal.storage.artefact import Build
 from pixcal.storage.formats import STAGES
 from pixcal.storage.manifest import Manifest, write_json
@@ -108,7 +108,8 @@ def on_map(effect: Effect, fits: Iterable[FittedSet], run_dir: Path) -> dict[str
 
     On maps of every set and window, modes removed; zero if free parameters absorb it.
     """
-    action = treatment_of(effect, *fitted_shapes(run_dir)).action
+    treated = treatment_of_kind(type(effect), *fitted_shapes(run_dir))
+    action = Treatment(effect, "diagnosis", {}, *treated).action
     square, count, most = 0.0, 0, 0.0
     for fit in fits if action != "unaffected" else ():
         change = _change(effect, fit)
@@ -116,7 +117,7 @@ def on_map(effect: Effect, fits: Iterable[FittedSet], run_dir: Path) -> dict[str
         count += change.size
         most = max(most, float(np.max(np.abs(change), initial=0.0)))
     rms = float(np.sqrt(square / count)) if count else 0.0
-    return {"rms_px": _rounded(rms), "max_px": _rounded(most), "action": action}
+    return {"rms_px": rounded(rms), "max_px": rounded(most), "action": action}
 
 
 def _change(effect: Effect, fit: FittedSet) -> F64:
@@ -130,7 +131,3 @@ def _change(effect: Effect, fit: FittedSet) -> F64:
     modes = straight_modes(maps.theta, fit.k)[:, good]
     taken = solve_modes(modes @ modes.T, (modes @ change)[:, None])[:, 0]
     return np.asarray((change - taken @ modes) / np.hypot(*fit.k))
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.4g}")

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import call
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -123,7 +124,7 @@ class Trials:
             results = run_tasks(work, moved, self.runtime, label=label)
         else:
             others: list[Callable[[], Any]] = [partial(work, item) for item in moved]
-            _, *results = run_tasks(_call, [beside, *others], self.runtime.here, label=label)
+            _, *results = run_tasks(call, [beside, *others], self.runtime.here, label=label)
         # A bench refused with drawn parameters may work with the estimated ones.
         again = [
             n
@@ -144,10 +145,6 @@ class Trials:
         """Statistics of one window, of a bench that `curves` has simulated."""
         made = [self._made[frozenset(bench), seed] for seed in range(seeds)]
         return [r[number] for r in made if not isinstance(r, str)]
-
-
-def _call(task: Callable[[], Any]) -> Any:
-    return task()
 
 
 def _kept_or_made(

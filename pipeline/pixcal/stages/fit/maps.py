@@ -39,18 +39,10 @@ TOLD, TOLD_IN_ALL = 4000, 4_000_000
 
 
 @dataclass(frozen=True)
-class SetTotals:
-    """Totals of a set over its written maps."""
-
-    masked: int
-    sigma_px: float
-
-
-@dataclass(frozen=True)
 class Totals:
     """Totals over all written maps."""
 
-    sets: dict[str, SetTotals]  # by name
+    sets: dict[str, tuple[int, float]]  # masked pixels and median error (px) of each set
     outputs: tuple[str, ...]  # combined maps of the sets
     # reduced chi-square of the sets' disagreement; None without redundant sets
     consistency: float | None
@@ -90,7 +82,7 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
     for n, f in enumerate(fitted):
         good = sum(t.good[n] for t in told)
         errors = np.concatenate([t.sigma[n] for t in told])
-        sets[f.name] = SetTotals(ny * nx - good, float(np.median(errors)))
+        sets[f.name] = ny * nx - good, float(np.median(errors))
     freedom = sum(t.freedom for t in told)
     square = sum(t.square for t in told)
     return Totals(sets, outputs, square / freedom if freedom else None)

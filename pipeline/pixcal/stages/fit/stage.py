@@ -54,10 +54,7 @@ def _fit_all(run_dir: Path, swept: Manifest, config: Config, runtime: Runtime, m
         "pixcal": __version__,
         "input": require(run_dir, "ingest").key,
         "model": config.model,
-        "sets": {
-            f.name: describe(f, totals.sets[f.name].masked, totals.sets[f.name].sigma_px)
-            for f in fitted
-        },
+        "sets": {f.name: describe(f, *totals.sets[f.name]) for f in fitted},
         "outputs": list(totals.outputs),
         "sets_chi2_reduced": totals.consistency,
     }

@@ -282,29 +282,19 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
                 column.loud |= _loud(job, frames - levels[:, None, None])
             if lamp or group == job.read_series:
                 frames[:, column.loud] = np.nan
+                # The pairs are frames 0 and 1, 2 and 3, and so on.
+                of_samples = job.read_noise, job.quantum
                 if lamp:
                     full = job.saturation - (0.0 if pedestal is None else pedestal)
-                    _add_flat_pairs(job, column, frames, levels, full, charge)
+                    column.pairs[1] += flat_pair_sums(
+                        frames, levels, job.gain, *of_samples, column.line_noise, full, charge
+                    )
                 else:
-                    _add_dark_pairs(job, column, frames, levels)
+                    frames -= levels[:, None, None]
+                    sums = dark_pair_sums(frames, *of_samples)
+                    column.line_noise.add(frames, sums, *of_samples)
+                    column.pairs[0] += sums
     return [combination.result() for combination in every]
-
-
-def _add_flat_pairs(
-    job: Measuring, column: _Column, frames: F32, levels: F32, full: F32 | float, dark: float
-) -> None:
-    """Add photon transfer of frames 0 and 1, 2 and 3, and so on; ``full`` and ``dark`` in ADU."""
-    of_samples = job.gain, job.read_noise, job.quantum
-    column.pairs[1] += flat_pair_sums(frames, levels, *of_samples, column.line_noise, full, dark)
-
-
-def _add_dark_pairs(job: Measuring, column: _Column, frames: F32, levels: F32) -> None:
-    """Add the noise of frames without light, 0 and 1, 2 and 3, and so on."""
-    of_samples = job.read_noise, job.quantum
-    frames -= levels[:, None, None]
-    sums = dark_pair_sums(frames, *of_samples)
-    column.line_noise.add(frames, sums, *of_samples)
-    column.pairs[0] += sums
 
 
 def _loud(job: Measuring, frames: F32) -> NDArray[np.bool_]:
