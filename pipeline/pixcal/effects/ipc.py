@@ -96,13 +96,10 @@ class Ipc(Effect):
 
     @classmethod
     def of_kernel(cls, kernel: F64) -> Self:
-        """A dense kernel, the same for all pixels.
+        """A dense kernel of odd size, the same for all pixels.
 
-        Parameters
-        ----------
-        kernel : (odd, odd) float64
-            ``kernel[c + dy, c + dx]`` is the share that the pixel at (dy, dx) receives. The centre
-            is not used: a pixel keeps the rest.
+        ``kernel[c + dy, c + dx]`` is the share that the pixel at (dy, dx) receives. The centre is
+        not used: a pixel keeps the rest.
         """
         return cls(tuple(_couplings_of(np.asarray(kernel, float))))
 

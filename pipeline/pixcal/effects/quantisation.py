@@ -157,18 +157,9 @@ class Quantisation(Effect):
     def converted(self, adu: F32, specimen: int, top_adu: float, normals: F32 | None = None) -> F32:
         """Codes in ADU: the number of thresholds that each sample reaches.
 
-        Swapped thresholds leave a code out, as in a flash converter that counts.
-
-        Parameters
-        ----------
-        adu : ndarray of float32
-            Samples. The float32 grid of large ones is as coarse as threshold displacements.
-        specimen : int
-            Seed of the detector.
-        top_adu : float
-            Highest sample.
-        normals : ndarray of float32, optional
-            Standard normals by which samples are scattered within the steps of that grid.
+        Swapped thresholds leave a code out, as in a flash converter that counts. ``specimen``: seed
+        of the detector. ``normals``: scatter the samples within the float32 grid, which for large
+        samples is as coarse as threshold displacements.
         """
         codes = int(top_adu / self.step_adu) + 3
         if any(self.bits) or any(self.widths):

@@ -46,29 +46,15 @@ class FittedFrames:
 
 @dataclass(frozen=True)
 class FringeMaps:
-    """Fitted maps of one fringe set, for effects that are linear in the intensity.
+    """Fitted maps of one fringe set, for effects that are linear in the intensity."""
 
-    Attributes
-    ----------
-    theta : (3, y, x) float64
-        (iota, alpha sin psi, alpha cos psi), e-.
-    k : (float, float)
-        Fringe vector (kx, ky) at the centre, rad/px.
-    origin : (int, int)
-        First row and column of these maps in the detector's window.
-    flat : (y, x) float64, optional
-        Relative response from flats, by which samples were divided; None without flats. An effect
-        that also acts on flats changes it.
-    name : str
-        Of the fringe set.
-    frames : FittedFrames, optional
-    """
-
-    theta: F64
-    k: tuple[float, float]
-    origin: tuple[int, int] = (0, 0)
+    theta: F64  # (3, y, x) iota, alpha sin psi, alpha cos psi, e-
+    k: tuple[float, float]  # fringe vector (kx, ky) at the centre, rad/px
+    origin: tuple[int, int] = (0, 0)  # first row and column of these maps in the detector's window
+    # (y, x) relative response from flats, by which samples were divided; None without flats. An
+    # effect that also acts on flats changes it
     flat: F64 | None = None
-    name: str = ""
+    name: str = ""  # of the fringe set
     frames: FittedFrames | None = None
 
     def phase_shifted(self, phase: F64) -> "FringeMaps":

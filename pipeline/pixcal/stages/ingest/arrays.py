@@ -110,14 +110,9 @@ def find_kept(
 ) -> list[Kept]:
     """Arrays of an earlier ingest that can be reused if their chunks are whole.
 
-    Arrays that its tables do not describe, or that are damaged, must be read again.
-
-    Parameters
-    ----------
-    folder, earlier : the earlier artefact and its manifest
-    same : present name to earlier name, of arrays made from the same files
-    sources : files of each array now
-    copy : only arrays whose samples were copied
+    Arrays that its tables do not describe, or that are damaged, must be read again. ``same``:
+    present name to earlier name, of arrays made from the same files. ``sources``: files of each
+    array now. ``copy``: only arrays whose samples were copied.
     """
     try:
         tables, places = (_intact(folder, earlier, name) for name in ("frames.json", "files.json"))

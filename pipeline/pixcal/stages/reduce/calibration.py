@@ -76,12 +76,7 @@ def on_grid(
 ) -> F64:
     """Maps that `measure` wrote, (name, pixel), of at most a million pixels on a regular grid.
 
-    Parameters
-    ----------
-    folder : where the maps are
-    shape : of the detector's window (y, x)
-    names : of `STATISTICS`
-    light : of each tile, a factor on its response
+    ``names``: of `STATISTICS`. ``light``: of each tile, a factor on its response.
     """
     reader = ArrayReader(folder / "maps")
     stride = int(np.ceil(np.sqrt(shape[0] * shape[1] / _SAMPLES)))

@@ -59,15 +59,10 @@ def run_noted(
     runtime: Runtime,
     label: str,
 ) -> None:
-    """Run a task that writes whole chunks, on neighbouring columns not yet noted as done.
+    """Run a task that writes whole chunks, on columns ``todo`` not yet noted in the journal.
 
-    Parameters
-    ----------
-    made : whose journal to use
-    task : given the strips to read in turn. All its results are written when it returns.
-    todo : columns
-    width : columns to read at a time, from `strip_width`
-    label : name of the task in the journal and the progress display
+    ``task``: given the strips to read in turn; all its results are written when it returns.
+    ``width``: columns to read at a time, from `strip_width`.
     """
     journal = made.journal()
     # Columns whose maps share a chunk are noted together.
