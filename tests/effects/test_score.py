@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
 from pixcal.simulation.deviations import common_precision, pair_sums, pair_variance
-from pixcal.simulation.effect import Estimate
+from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.own_effect import effect_of_file
 from pixcal.simulation.replica import Replica
 from pixcal.stages import diagnose, fit, ingest, reduce, simulate
@@ -104,6 +105,25 @@ def test_without_effects_the_frames_are_the_fits_model(acquired: Callable[..., E
         electrons = (electrons - dark) / evidence.flat
         off = (electrons - found.model)[:, found.good]
         assert np.abs(off).max() < 0.1
+
+
+@pytest.mark.parametrize("order", [0, 300])
+def test_light_of_any_order_is_added_to_that_of_the_fit(
+    order: int, acquired: Callable[..., Evidence]
+) -> None:
+    class Haze(Effect):
+        name, title, acts_at = "haze", "light of its own", Stage.LIGHT
+        domains, strengths, sources = ("space",), (), ()
+        is_null = False
+
+        def light(self, light, recording, rows, maps):  # type: ignore[no-untyped-def]
+            return replace(light, incoherent=light.incoherent + 1000.0)
+
+    Haze.order = order
+    replica = Replica(acquired())
+    of = next(iter(acquired().fringes))
+    more = replica.simulated_samples(of, [Haze()]) - replica.simulated_samples(of)
+    assert np.median(more) * acquired().gain == pytest.approx(1000, rel=0.02)
 
 
 def test_pairs_of_independent_samples_have_the_variance_that_is_said() -> None:

@@ -37,6 +37,8 @@ class OfAcquisition(ForwardModel):
     """Light and pixels of an acquisition, in place of those of a bench file."""
 
     acts_at = Stage.LIGHT
+    # It acts before all effects, because it would overwrite their changes.
+    order = -1
     domains = ()
     strengths = ()
     sources = ()

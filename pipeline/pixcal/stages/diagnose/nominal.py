@@ -66,8 +66,6 @@ class Measured(OfAcquisition):
 
     name = " measured"
     title = "as measured"
-    # It acts before all effects, because it would overwrite their changes.
-    order = -1
 
     sets: tuple[SetTruth, ...]
     lamp: FlatLight = FlatLight()
