@@ -46,10 +46,10 @@ def test_a_period_that_is_off_does_not_add_up():
 @pytest.mark.parametrize(
     "time", [np.zeros(50), np.concatenate([np.arange(25), 1e9 + np.arange(25)])]
 )
-def test_stamps_without_pace_count_frames(time):
+def test_irregular_stamps_count_frames(time):
     batches = plan_batches(time.astype(float), 10)
     assert batches.count.tolist() == [10] * 5
-    assert "pace" in batches.note
+    assert "irregular" in batches.note
 
 
 def test_every_frame_is_in_one_batch_at_most():

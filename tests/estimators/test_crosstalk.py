@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pixcal.estimators.crosstalk import support
 from pixcal.estimators.crosstalk.covariance import NORMAL, NORMALS, TERMS, Products
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels
 from pixcal.estimators.crosstalk.information import MeasuredLinks
 from pixcal.estimators.crosstalk.links import PixelClasses, class_sums, links, periods, sums_of
 from pixcal.estimators.crosstalk.pattern import visibility_pattern
-from pixcal.estimators.crosstalk.support import INDEPENDENT, Choice, Looks, choose
+from pixcal.estimators.crosstalk.support import INDEPENDENT, Choice, choose
 from pixcal.estimators.fringe_fit.modes import solve_modes
 from pixcal.estimators.maps.corrected import (
     corrected_offsets,
@@ -64,16 +65,18 @@ def test_a_partner_has_the_class_that_is_told(step):
 def test_significance_is_that_of_the_best_of_many_looks():
     """The largest of N squares of normals; a million draws against the formula's quantiles."""
 
-    def of(best, looks):
-        return Choice((), PixelClasses(1, 1, (0, 0)), (Looks(best, looks),)).significance
+    def of(best, tests):
+        return Choice(
+            (), PixelClasses(1, 1, (0, 0)), (support.TestFamily(best, tests),)
+        ).significance
 
     rng = np.random.default_rng(2)
-    looks, drawn = 1000, []
+    tests, drawn = 1000, []
     for _ in range(400):
-        drawn.append(of(float((rng.standard_normal(350) ** 2).max()), looks))
+        drawn.append(of(float((rng.standard_normal(350) ** 2).max()), tests))
     assert np.mean(drawn) == pytest.approx(0, abs=0.2)
     assert np.std(drawn) == pytest.approx(1, abs=0.15)
-    # Far out the looks matter less and less, and nothing overflows.
+    # Far out the number of tests matters less and less, and nothing overflows.
     assert of(40.0**2, 10**5) == pytest.approx(39.8, abs=0.1)
     ladder = [of(x**2, 10**5) for x in np.linspace(3, 60, 400)]
     assert np.all(np.diff(ladder) > 0)
@@ -86,7 +89,9 @@ def test_significance_is_that_of_the_better_of_two_groups_of_looks():
             (),
             PixelClasses(1, 1, (0, 0)),
             tuple(
-                Looks(float((rng.standard_normal(n) ** 2).max()), round(n / INDEPENDENT))
+                support.TestFamily(
+                    float((rng.standard_normal(n) ** 2).max()), round(n / INDEPENDENT)
+                )
                 for n in (700, 7)
             ),
         ).significance

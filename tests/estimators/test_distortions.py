@@ -117,7 +117,7 @@ def test_the_size_of_a_distortion_is_found_with_its_error(fringes: FringeEvidenc
         sizes, covariance, agreement = fit_distortions(
             [bent(fringes, distortion, truth, noise)], distortion, 2
         )
-        assert not agreement.refused
+        assert not agreement.rejected
         pulls.append((sizes - truth) / np.sqrt(np.diag(covariance)))
     assert np.abs(pulls).max() < 4
     assert 0.5 < np.std(pulls) < 1.6
@@ -133,12 +133,12 @@ def test_sets_of_which_one_denies_the_size_disagree(fringes: FringeEvidence) -> 
         slope = signal * signal / np.float32(5e4)
         return np.float32(sizes[0]) * slope
 
-    for second, refused in ((-0.02, False), (0.0, True), (-0.015, False)):
+    for second, rejected in ((-0.02, False), (0.0, True), (-0.015, False)):
         sets = [
             bent(fringes, distortion, np.array([size]), RNG.standard_normal((T, NY, NX)))
             for size in (-0.02, second)
         ]
-        assert fit_distortions(sets, distortion, 1)[2].refused == refused
+        assert fit_distortions(sets, distortion, 1)[2].rejected == rejected
 
 
 def bent(

@@ -188,13 +188,13 @@ def test_a_line_is_found_with_its_frequency_and_amplitude(frame: np.ndarray) -> 
     every = [series_of(swing + rng.standard_normal(swing.shape), frame) for _ in range(2)]
     line, cleared = cleared_of_line(every, white)
     assert line is not None
-    assert line.sure
+    assert line.significant
     assert line.hz == pytest.approx(1.7, abs=4 * line.hz_error)
     assert line.hz_error < 0.01
     assert np.all(np.abs(line.amplitude - [0.8, 0.4]) < 4 * line.amplitude_error)
     again = find_line(cleared, white)
     assert again is not None
-    assert not again.sure
+    assert not again.significant
 
 
 @pytest.mark.parametrize("phase", np.linspace(0, 3, 7))
@@ -204,7 +204,7 @@ def test_a_strong_slow_line_leaves_no_power_behind(phase: float) -> None:
     series = series_of(swing + np.random.default_rng(8).standard_normal(swing.shape))
     line, (cleared,) = cleared_of_line([series], white)
     assert line is not None
-    assert line.sure
+    assert line.significant
     # 298 values: their standard deviation is known to a twenty-fourth.
     np.testing.assert_allclose(cleared.values.std(axis=0), 1.0, atol=0.13)
 
@@ -215,7 +215,7 @@ def test_no_line_is_found_in_noise_nor_in_a_walk_of_known_power() -> None:
         noise = rng.standard_normal((T, 2)) + 2 * np.cumsum(rng.standard_normal((T, 2)), axis=0)
         line = find_line([series_of(noise)], lambda s: np.stack([power, power], axis=1))
         assert line is not None
-        assert not line.sure
+        assert not line.significant
 
 
 def test_a_run_too_short_for_a_line_has_none() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import gamma
 
-from pixcal.estimators.test_statistics.look import Look, pattern_sizes
+from pixcal.estimators.test_statistics.look import FringeSetData, pattern_sizes
 from pixcal.estimators.test_statistics.patterns import (
     highest_ordinate,
     smooth_patterns,
@@ -34,13 +34,13 @@ def read_out(amplitude: float, turns: float, seed: int) -> F32:
     return np.asarray(amplitude * np.sin(2 * np.pi * (turns * sample + start)) * GOOD, np.float32)
 
 
-def a_look(residual: F32, phi: np.ndarray) -> Look:
+def a_look(residual: F32, phi: np.ndarray) -> FringeSetData:
     given = SimpleNamespace(
         residual=residual,
         pattern_sizes=pattern_sizes(residual, GOOD),
         found=SimpleNamespace(phi=phi),
     )
-    return cast(Look, given)
+    return cast(FringeSetData, given)
 
 
 def patch(amplitude: float) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from pixcal.estimators.detector.frame_lag import (
     CLEAR,
     MAX_DECAY,
-    Uneven,
+    LagNonuniformity,
     common_lag,
     lag_of_flats,
     seen_share,
@@ -243,7 +243,7 @@ class Lag(Effect):
         if common is None:
             return None
         part = central_crop(evidence)
-        uneven = Uneven.of(part.fringes.values())
+        uneven = LagNonuniformity.of(part.fringes.values())
         sure, unalike = common.sigmas > CLEAR, uneven.sigmas > CLEAR
         rms = uneven.rms(common.keep, common.share) if unalike else 0.0
         missed = float(np.mean([common.share - seen_share(f, common.share, rms) for f in fringes]))

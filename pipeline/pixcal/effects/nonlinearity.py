@@ -165,7 +165,7 @@ class Nonlinearity(Effect):
         if evidence.fringes and found.significance > SIGNIFICANT:
             part = central_crop(evidence)
             more, agreement = _bends(part, effect.response, found.chi2)
-            refused = SETS_DISAGREE if agreement.refused else ""
+            refused = SETS_DISAGREE if agreement.rejected else ""
         errors = np.sqrt(np.diag(found.covariance))
         named = {"quadratic": float(errors[0]), "cubic": float(errors[1])}
         if more is None:

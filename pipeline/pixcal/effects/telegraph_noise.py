@@ -162,7 +162,7 @@ def _estimate(cls: type[TelegraphNoise], found: Telegraph, evidence: Evidence) -
         measured = MeasuredPixels(
             (y, y + ny),
             (x, x + nx),
-            found.faintest / found.amplitude,
+            found.smallest_jump / found.amplitude,
             tuple((y + rows).tolist()),
             tuple((x + columns).tolist()),
             tuple((own.amplitude / found.amplitude).tolist()),

@@ -33,7 +33,7 @@ SINGULAR = 1e-12  # least eigenvalue of a regular normal matrix of unit diagonal
 MAX_UNKNOWN = 0.1
 _SIGMA_OF_FWHM = 1 / math.sqrt(8 * math.log(2))
 _KNOTS = 24
-_FAINT = 1e12  # variance of a pixel that makes the star's shot noise negligible, e-²
+_READ_NOISE_LIMITED = 1e12  # variance of a pixel that makes the star's shot noise negligible, e-²
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ def gaussian_star(fwhm: float, electrons: float | None, read_noise: float) -> St
     table = spline_filter(line[:, None] * line[None, :], order=3, mode="mirror")
     psf = Psf(np.asarray(table), step)
     if electrons is None:
-        return Star(psf, half, 1.0, read_variance=_FAINT)
+        return Star(psf, half, 1.0, read_variance=_READ_NOISE_LIMITED)
     return Star(psf, half, electrons, read_variance=read_noise**2)
 
 

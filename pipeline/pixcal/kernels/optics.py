@@ -28,7 +28,7 @@ class Geometry:
 
     wavelength: float  # wavelength, pitch: laser wavelength and pixel pitch
     pitch: float
-    # centre_x, centre_y: foot of the fibres' midpoint on the detector plane, from pixel (0, 0)
+    # centre_x, centre_y: projection of the fibres' midpoint on the detector, from pixel (0, 0)
     centre_x: float
     centre_y: float
     distance: float  # from the midpoint to the detector plane
@@ -75,7 +75,7 @@ def paraxial_vector(geometry: Geometry) -> tuple[float, float]:
 
 
 def paraxial_phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> F64:
-    """Phase of straight fringes (paper, eq. 4), zero at the foot of the fibres' centre."""
+    """Phase of straight fringes (paper, eq. 4), zero at the projection of the fibres' midpoint."""
     # As `phase`, but without the tilt of the baseline, as in the paper.
     kx, ky = paraxial_vector(geometry)
     xs, ys = np.asarray(x, float), np.asarray(y, float)

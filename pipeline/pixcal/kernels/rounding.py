@@ -14,7 +14,7 @@ from scipy.special import ndtr
 from pixcal.model.arrays import F64
 
 SHEPPARD = 1 / 12  # variance that rounding adds to noise of a step or more
-UNTOLD = 0.35  # noise below which equal levels do not determine it
+UNDETERMINED_BELOW = 0.35  # noise below which equal levels do not determine it
 SMOOTH = 1.0  # noise above which mean and variance do not depend on the level, to 1e-7
 _FRACTIONS = 256
 _REACH = 9.0
@@ -64,7 +64,7 @@ def noise_before_rounding(
         return sigma, error / (2 * sigma)
     spread = _clipped_variance(means) - variance / frames - SHEPPARD
     everywhere = spread > _EVERYWHERE**2
-    least = _MIN_SIGMA if everywhere else UNTOLD
+    least = _MIN_SIGMA if everywhere else UNDETERMINED_BELOW
     places = np.zeros(_HARMONICS) if everywhere else _harmonics(means, variance / frames)
     level = np.arange(_FRACTIONS) / _FRACTIONS
 

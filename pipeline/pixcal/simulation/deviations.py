@@ -26,7 +26,7 @@ from pixcal.estimators.diagnosis.evidence import (
 )
 from pixcal.estimators.fringe_fit.tile_fit import Coding
 from pixcal.estimators.maps.structure import flattened, without_outliers
-from pixcal.estimators.test_statistics.look import Look, neighbour_sums
+from pixcal.estimators.test_statistics.look import FringeSetData, neighbour_sums
 from pixcal.kernels.robust import SIGMA_OF_MAD, robust_sigma
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
@@ -183,7 +183,7 @@ class SetDeviations(_Deviations):
     @cached_property
     def maps(self) -> Deviation:
         """Maps (3, y, x) of the pixels, of `MAPS`."""
-        maps = Look(self.found, self._evidence).maps
+        maps = FringeSetData(self.found, self._evidence).maps
         return weighed(np.stack([maps[name] for name in MAPS]))
 
     @cached_property

@@ -238,7 +238,7 @@ def fit_frames(
     fit, changes = found.fit, found.changes
     model, errors = fit.values()
     for own, line in found.lines:
-        if line is not None and line.sure:
+        if line is not None and line.significant:
             model, of_line = _with_line(model, own, line, fit.basis)
             errors |= of_line
     kinds = {w.channels is LIGHT for w in fit.basis.every}

@@ -229,8 +229,8 @@ def _variance(part: Residuals) -> tuple[F64, F64]:
     # The squares of the modes are the variance that was removed from the residuals.
     terms = np.stack([part.shot * part.one, part.one**2, part.shot**2]).reshape(3, -1)
     some = terms.reshape(3, *part.one.shape)[:, ::STRIDE].reshape(3, -1)
-    robbed = (part.modes**2).sum(axis=0).ravel()
-    right = terms @ (part.e**2).ravel() + some @ robbed
+    removed_variance = (part.modes**2).sum(axis=0).ravel()
+    right = terms @ (part.e**2).ravel() + some @ removed_variance
     return (terms @ terms.T).astype(float), right.astype(float)
 
 

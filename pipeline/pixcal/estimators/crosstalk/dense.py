@@ -29,7 +29,7 @@ WITHIN = 2  # rows and columns of the kernel on either side of its centre
 ROUNDS = 3  # iterations of the shares, each with the second order of the last ones
 MAX_SHARES = 480  # most shares measured together: time goes with the third power of their number
 NEGLIGIBLE = 1e-4  # share below which products with others are neglected
-TURNS = 60  # iterations of expectation and maximisation
+ITERATIONS = 60  # of expectation and maximisation
 # prior size of a part of a share, and of a true pattern (px), with the weight of one value
 USUAL, PATTERN = 4e-4, 1e-4
 START = (1e-2, 1e-3)  # start values of these sizes
@@ -41,7 +41,7 @@ class Dense:
 
     couplings: tuple[Coupling, ...]
     covariance: F64  # (n, n) of their shares
-    ways: tuple[str, ...]  # methods of measurement
+    methods: tuple[str, ...]  # of measurement
 
     @property
     def shares(self) -> F64:
@@ -96,13 +96,13 @@ class CouplingFrames:
             now = [replace(c, share=float(k)) for c, k in zip(every, shares, strict=True)]
             measured = self.measured(now, per_ke)
             information = measured.of_period(classes)
-            ways = {
-                way: (block_diag(*normal), information.right[way].ravel())
-                for way, normal in information.normal.items()
+            methods = {
+                method: (block_diag(*normal), information.right[method].ravel())
+                for method, normal in information.normal.items()
             }
             if measured.products is not None:
-                ways["covariance"] = _any_gain(ways["covariance"], measured.products, shares)
-            normal, right = (np.sum(part, axis=0) for part in zip(*ways.values(), strict=True))
+                methods["covariance"] = _any_gain(methods["covariance"], measured.products, shares)
+            normal, right = (np.sum(part, axis=0) for part in zip(*methods.values(), strict=True))
             maps = None if per_ke else pattern_information(self.evidence, now, classes)
             found = shrinkage.solve(normal, right, maps)
             shares = found[0]
@@ -110,7 +110,7 @@ class CouplingFrames:
         couplings = tuple(
             replace(c, share=float(k), per_ke=per_ke) for c, k in zip(every, shares, strict=True)
         )
-        return Dense(couplings, found[1], (*ways, *["maps"] * (maps is not None)))
+        return Dense(couplings, found[1], (*methods, *["maps"] * (maps is not None)))
 
 
 def frames_of(
@@ -245,7 +245,7 @@ class ShareShrinkage:
         if free:
             usual[-1], size[-1] = PATTERN, START[1]
         count = np.bincount(group)
-        for _ in range(TURNS):
+        for _ in range(ITERATIONS):
             covariance = np.linalg.inv(inner + np.diag(size[group] ** -2.0))
             value = covariance @ inner_right
             square = np.bincount(group, value**2 + np.diag(covariance))

@@ -42,8 +42,8 @@ class Information:
     def of(self, link: int) -> "Information":
         """That of one link, where arrays hold many."""
         return Information(
-            {way: m[link] for way, m in self.normal.items()},
-            {way: r[link] for way, r in self.right.items()},
+            {method: m[link] for method, m in self.normal.items()},
+            {method: r[link] for method, r in self.right.items()},
         )
 
     @property

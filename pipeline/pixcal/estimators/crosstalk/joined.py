@@ -66,7 +66,7 @@ def measure(evidence: Evidence) -> Kernel | None:
         dense, per_ke, error = _level(own, dense, found, per_ke)
         known = tuple(c for c in dense.couplings) if dense else ()
     assert dense is not None
-    return _told(dense, replace(none, per_ke=per_ke, per_ke_error=error))
+    return _significant_kernel(dense, replace(none, per_ke=per_ke, per_ke_error=error))
 
 
 def significance(evidence: Evidence) -> float | None:
@@ -111,7 +111,7 @@ def _level(
     return dense, per_ke, error
 
 
-def _told(dense: Dense, about: Kernel) -> Kernel:
+def _significant_kernel(dense: Dense, about: Kernel) -> Kernel:
     """The significant couplings; those equal in all classes as one."""
     basis, couplings = _plain(dense)
     if not couplings:
@@ -127,7 +127,7 @@ def _told(dense: Dense, about: Kernel) -> Kernel:
         about,
         couplings=tuple(replace(c, share=float(k)) for c, k in zip(couplings, shares, strict=True)),
         covariance=covariance,
-        by=dense.ways,
+        by=dense.methods,
         whole=dense.couplings,
     )
 

@@ -29,7 +29,7 @@ NOTHING = 1e-6  # weight of a share below which it is not measured
 
 
 @dataclass(frozen=True)
-class Looks:
+class TestFamily:
     """Tests made together."""
 
     best: float  # largest chi-square of one of them
@@ -59,16 +59,16 @@ class Choice:
 
     links: tuple[int, ...]  # that stand out
     classes: PixelClasses  # of the period
-    looks: tuple[Looks, ...]  # groups that have the same share of the chance
+    families: tuple[TestFamily, ...]  # each with the same share of the chance
 
     @property
     def significance(self) -> float:
-        """Sigmas of a normal variate as rare as the best of so many looks."""
-        rarest = min(self.looks, key=lambda own: own.log_any)
-        none = len(self.looks) * rarest.log_none
+        """Sigmas of a normal variate as rare as the best of so many tests."""
+        rarest = min(self.families, key=lambda own: own.log_any)
+        none = len(self.families) * rarest.log_none
         if none < -0.5:
             return float(ndtri_exp(none))
-        return float(-ndtri_exp(rarest.log_any + np.log(len(self.looks))))
+        return float(-ndtri_exp(rarest.log_any + np.log(len(self.families))))
 
 
 def choose(measured: MeasuredLinks, pattern: Callable[[PixelClasses], float]) -> Choice:
@@ -77,8 +77,8 @@ def choose(measured: MeasuredLinks, pattern: Callable[[PixelClasses], float]) ->
     ``pattern``: fall in chi-square of the maps by classes (`visibility_pattern`). Raises InputError
     if so many are far apart that it is no kernel.
     """
-    looks = len(measured.links) * sum(3 * n * m for n, m in periods(measured.shape))
-    critical = _critical(looks)
+    tests = len(measured.links) * sum(3 * n * m for n, m in periods(measured.shape))
+    critical = _critical(tests)
     totals = [i.total for _, i in measured.every_period()]
     gains = np.stack([_best_gains(*total) for total in totals])
     best = gains.max(axis=0)
@@ -95,18 +95,18 @@ def choose(measured: MeasuredLinks, pattern: Callable[[PixelClasses], float]) ->
     if far > MAX_FAR:
         raise InputError(
             f"not decided: noise is correlated at {len(there)} distances between pixels, {far} of "
-            f"them beyond {NEAR} pixels (at most {MAX_FAR} are measured), unlike a crosstalk "
-            "kernel"
+            f"them beyond {NEAR} pixels (at most {MAX_FAR} are measured); this is not a "
+            "crosstalk kernel"
         )
     none = PixelClasses(1, 1, measured.first)
     classes = _period(measured.of(there), pattern, critical) if there else none
-    anywhere = Looks(max(float(best.max()), 1e-9), looks)
-    adjacent = Looks(max(float(gains[0, close].max()), alike, 1e-9), few)
+    anywhere = TestFamily(max(float(best.max()), 1e-9), tests)
+    adjacent = TestFamily(max(float(gains[0, close].max()), alike, 1e-9), few)
     return Choice(there, classes, (anywhere, adjacent))
 
 
-def _critical(looks: int) -> float:
-    return float(ndtri(FALSE_ALARM / 2 / looks / 2) ** 2)
+def _critical(tests: int) -> float:
+    return float(ndtri(FALSE_ALARM / 2 / tests / 2) ** 2)
 
 
 def _period(

@@ -33,7 +33,7 @@ _WITH_BEFORE = 4  # pairs above which the effect of the frames before them is fi
 _WITH_OFFSET, _WITH_CUBIC = 5, 6  # fewest levels for these terms
 _TURNS = 30
 _SMALL = 1e-4
-_NOT_TOLD = 1e-2  # error of a power that is held at zero as levels are too few
+_UNCONSTRAINED_ERROR = 1e-2  # error of a power that is held at zero as levels are too few
 
 
 @dataclass(frozen=True)
@@ -229,7 +229,7 @@ def _bent(times: F64, levels: F64, error: F64, moments: tuple[float, float]) -> 
             break
     freedom = n - sum(terms)
     chi2 = float(rest @ rest) / freedom if freedom else 1.0
-    whole = _NOT_TOLD**2 * np.eye(4)
+    whole = _UNCONSTRAINED_ERROR**2 * np.eye(4)
     whole[np.ix_(terms, terms)] = covariance * max(chi2, 1.0)
     wander = float(np.sqrt(max(chi2, 1.0)) * error.mean())
     return Ladder(times, levels, sizes, whole[2:, 2:], wander, times[:0])

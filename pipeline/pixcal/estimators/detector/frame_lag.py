@@ -38,14 +38,14 @@ _NOT_EXPONENTIAL = 40.0  # chi-square from which releases are free in each frame
 
 
 @dataclass(frozen=True)
-class Uneven:
+class LagNonuniformity:
     """Scatter of the pixels' shares of the frame before: mean square and its error."""
 
     square: float
     error: float
 
     @classmethod
-    def of(cls, sets: Iterable[FringeEvidence]) -> "Uneven":
+    def of(cls, sets: Iterable[FringeEvidence]) -> "LagNonuniformity":
         """Weighted mean of all sets; 0 ± 1 without any."""
         found = [(*one, f.good.sum()) for f in sets if (one := uneven_pixels(f)) is not None]
         if not found:
@@ -234,11 +234,11 @@ class CommonLag:
 def common_lag(
     frames: Sequence[F64],
     numbers: Sequence[Indices],
-    undone: Callable[[float, float, F32], tuple[F32, F64]],
+    corrected: Callable[[float, float, F32], tuple[F32, F64]],
 ) -> CommonLag | None:
     """Lag from the contrast of frames (t, 3) against the phase step; None: no evidence.
 
-    ``numbers``: (t,) of the frames in their set. ``undone``: corrects frames for a lag of given
+    ``numbers``: (t,) of the frames in their set. ``corrected``: corrects frames for a lag of given
     share and decay; gives also the shares released later.
     """
     found = CommonLag(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -247,7 +247,7 @@ def common_lag(
         for own, which in zip(frames, numbers, strict=True):
             # Linearised about the current lag, which is removed from the frames first.
             share = float(np.clip(found.share, 0, 0.5))
-            rest, known = undone(share, found.decay_frames, own.astype(np.float32))
+            rest, known = corrected(share, found.decay_frames, own.astype(np.float32))
             told = _contrast_steps(rest.astype(float), which)
             if told is not None:
                 more = np.pad(known[:LAGS], (0, LAGS - len(known[:LAGS])))

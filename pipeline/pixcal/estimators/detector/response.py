@@ -31,7 +31,7 @@ _BESIDE = 5  # half-width of the parabola about the best falloff, fine steps
 LOOSE = 0.02  # prior 1-sigma of the departure from a response, over full scale
 # response fitted with boundaries: level (e-) at which its powers are one, and their number
 LEVEL, POWERS = 5e4, 3
-TOLD = 0.5  # largest error of the logarithm of a measured falloff
+MAX_LOG_ERROR = 0.5  # largest error of the logarithm of a measured falloff
 
 
 def fit_response(
@@ -264,7 +264,7 @@ def _best_falloff(found: F64, otherwise_px: float, of_any: float) -> Boundaries:
     bends = np.polyfit(at, found[near] - found[best], 2).T
     curved, slope, _ = bends[2]
     error = 1 / np.sqrt(-curved) if curved < 0 else np.inf
-    if error > TOLD:
+    if error > MAX_LOG_ERROR:
         given = int(np.argmin(np.abs(_FINE_PX - otherwise_px)))
         size, variance, gain, against, ratio, own = found[given].tolist()
         return Boundaries(

@@ -29,7 +29,7 @@ LENGTHS = (4.0, 2.0, 1.0, 0.5, 0.25)
 NOT_EVEN = 25.0  # chi-square from which the share depends on the level
 # start values for traps that fill up: part kept from frame to frame, and capacity over the loss
 # of full scale without such a limit
-KEEPS, ROOMS = (0.3, 0.6), (0.1, 0.2, 0.4, 0.7)
+RETENTIONS, CAPACITIES = (0.3, 0.6), (0.1, 0.2, 0.4, 0.7)
 STEPS = 12  # Gauss-Newton steps for such traps
 _UNTOLD = 1e-9  # relative error below which a parameter does not influence the frames
 
@@ -110,7 +110,7 @@ class LossFit:
         away = bands.value - (precision @ bands.value).sum() / precision.sum()
         if float(away @ precision @ away) < NOT_EVEN:
             return None, None
-        starts = [(*even, keep, room * full) for keep in KEEPS for room in ROOMS]
+        starts = [(*even, keep, capacity * full) for keep in RETENTIONS for capacity in CAPACITIES]
         few.weigh(banded, even)
         best = min(starts, key=lambda start: few.chi2(trapped, start))
         traps = few.fit(trapped, best, STEPS // 2)

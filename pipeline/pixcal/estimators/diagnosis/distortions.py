@@ -33,7 +33,8 @@ _NEGLIGIBLE = 1e-6
 _ROUNDS = 8
 _STILL = 0.1
 
-DENIED = 0.25  # share of the chi-square of separate sizes above which common ones are rejected
+# share of the chi-square of separate sizes above which common ones are rejected
+MAX_DISAGREEMENT = 0.25
 
 
 class TwoWay:
@@ -141,11 +142,11 @@ class Agreement:
     more: int  # sizes that are each set's own, less the common ones
 
     @property
-    def refused(self) -> bool:
+    def rejected(self) -> bool:
         """Whether sets contradict each other substantially, beyond chance."""
         apart = self.own - self.common
         chance = sigmas_of_chi2(apart, self.more) < SIGNIFICANT if self.more else True
-        return apart > DENIED * self.own and not chance
+        return apart > MAX_DISAGREEMENT * self.own and not chance
 
 
 def fit_distortions(

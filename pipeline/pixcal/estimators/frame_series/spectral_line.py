@@ -10,7 +10,7 @@ from pixcal.estimators.frame_series.variance_components import log_chance, sigma
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 
-FINER = 8  # frequencies examined per independent frequency of a series
+OVERSAMPLING = 8  # frequencies examined per independent frequency of a series
 SLOWEST = 4.0  # fewest periods of a line within a run; slower changes are drift
 # effective trials per independent frequency, as the maximum may lie between two
 TRIALS = 4.0
@@ -30,7 +30,7 @@ class Line:
     log_chance: float
 
     @property
-    def sure(self) -> bool:
+    def significant(self) -> bool:
         """Whether it is significant."""
         return sigmas(self.log_chance) > SIGNIFICANT
 
@@ -47,14 +47,14 @@ def find_line(
     lengths = [(np.ptp(s.frame) + 1) * s.step_s for s in every]
     top = min(0.5 / s.step_s for s in every)
     low = SLOWEST / min(lengths)
-    grid = np.arange(low, top, 1 / (FINER * max(lengths)))
-    if len(grid) < FINER:
+    grid = np.arange(low, top, 1 / (OVERSAMPLING * max(lengths)))
+    if len(grid) < OVERSAMPLING:
         return None
     powers = [_spectrum(s, level(s), channels, grid) for s in every]
     power = np.sum([p.sum(axis=1) for p, _ in powers], axis=0)
     at = int(np.argmax(power))
-    looks = TRIALS * len(grid) / FINER
-    chance = log_chance(float(power[at]), len(every) * len(channels)) + np.log(looks)
+    trials = TRIALS * len(grid) / OVERSAMPLING
+    chance = log_chance(float(power[at]), len(every) * len(channels)) + np.log(trials)
     hz, sharpness = _peak(grid, power, at)
     amplitude, error = np.zeros(2), np.zeros(2)
     for n, channel in enumerate(channels):
@@ -73,7 +73,7 @@ def cleared_of_line(
 ) -> tuple[Line | None, tuple[FrameSeries, ...]]:
     """The strongest line, as `find_line`, and the series without it if it is significant."""
     line = find_line(every, level, channels)
-    if line is None or not line.sure:
+    if line is None or not line.significant:
         return line, tuple(every)
     # Repeated with a level that the line itself does not raise.
     levels = {s.name: level(s) for s in _without_line(every, line)}
@@ -100,7 +100,7 @@ def _spectrum(s: FrameSeries, level: F64, channels: Sequence[int], grid: F64) ->
     place = s.frame - s.frame[0]
     white = np.zeros((place[-1] + 1, len(channels)))
     white[place] = basis.series(basis.of(s.values[:, list(channels)]) / np.sqrt(level))
-    size = 1 << int(np.ceil(np.log2(2 * FINER * len(white))))
+    size = 1 << int(np.ceil(np.log2(2 * OVERSAMPLING * len(white))))
     power = np.abs(np.fft.rfft(white, size, axis=0)) ** 2 / n
     own = np.arange(len(power)) / (size * s.step_s)
     at = np.arange(1, n) / (2 * n * s.step_s)

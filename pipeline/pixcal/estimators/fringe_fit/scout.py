@@ -42,11 +42,11 @@ FEW = 4
 MIN_FRAMES = 6  # three unknowns per pixel, and as many again to test the fit
 # departure from the visibility of a tile's pixels, over the usual one, above which a pixel is
 # excluded; some 8 standard deviations
-ODD_VISIBILITY = 12.0
+OUTLIER_VISIBILITY = 12.0
 MANY = 3.0  # ratio of mean light to that of most pixels, or inverse, above which one is excluded
 # largest median distance of the pixels' phases from smooth ones; random phases have 1.57
 FOLLOWS_RAD = 0.8
-TURNS, TURNS_MOVING = 3, 8  # most iterations of pixels from frames, frames from pixels
+ITERATIONS, ITERATIONS_MOVING = 3, 8  # most iterations of pixels from frames, frames from pixels
 # Change of the frames by an iteration, over their errors, at which it ends. Each iteration halves
 # it, so that the remainder is below this share of the frames' noise, which is small itself.
 SETTLED = 0.02
@@ -90,11 +90,11 @@ class Scout:
         n_frames = codes[0].shape[0]
         if n_frames < MIN_FRAMES:
             raise InputError(f"{n_frames} frames: at least {MIN_FRAMES} are needed; take more")
-        self._drop_odd_levels(codes)
+        self._drop_outliers(codes)
         self._require_pixels()
         g = self._subspace(codes)
         frames = FrameParameters(g, np.zeros((n_frames, 2)), self.reference)
-        frames = self._settled(codes, frames, TURNS)
+        frames = self._settled(codes, frames, ITERATIONS)
         self._count_fringes()
         chi2 = self._chi2(codes, frames)
         significance = self._motion_significance(codes, frames) / np.median(chi2)
@@ -102,7 +102,7 @@ class Scout:
         # Six standard deviations above the value of frames without motion.
         self.moving = significance > 1 + 6 / np.sqrt(n_frames)
         if self.moving:
-            frames = self._settled(codes, frames, TURNS_MOVING)
+            frames = self._settled(codes, frames, ITERATIONS_MOVING)
             chi2 = self._chi2(codes, frames)
         self.noise = usual_chi2(chi2, n_frames - 3)
         self.excess_scatter = excess_scatter(chi2, n_frames - 3)
@@ -165,7 +165,7 @@ class Scout:
             electrons = np.where(lost, electrons.max(axis=0), electrons)
         return np.asarray(electrons, np.float32)
 
-    def _drop_odd_levels(self, codes: Sequence[U16]) -> None:
+    def _drop_outliers(self, codes: Sequence[U16]) -> None:
         """Exclude pixels whose mean light is far from the median, which would dominate the fit."""
 
         def drop(n: int) -> None:
@@ -346,7 +346,7 @@ def _like_most(theta: F64, good: Mask) -> Mask:
     visibility = np.hypot(theta[1], theta[2]) / np.where(good, theta[0], 1.0)
     away = np.abs(visibility - np.median(visibility[good])) if good.any() else visibility
     usual = np.median(away[good]) if good.any() else 0.0
-    return np.asarray(good & (away < ODD_VISIBILITY * usual + 1e-9))
+    return np.asarray(good & (away < OUTLIER_VISIBILITY * usual + 1e-9))
 
 
 @lru_cache(maxsize=64)

@@ -49,7 +49,7 @@ def plan_batches(time_s: F64, frames: int | None = None) -> FrameBatches:
         slots = np.concatenate([[0], np.cumsum(np.maximum(1, np.rint(steps / period)))])
     else:
         slots, period = np.arange(n, dtype=float), period if period > 0 else 1.0
-        note = "time stamps do not follow a regular pace: batches count frames, not seconds"
+        note = "irregular time stamps: batches are counted in frames, not seconds"
     n_batches = int((slots[-1] + 1) // length) if n else 0
     edges = np.searchsorted(slots, np.arange(n_batches + 1) * length)
     ranges = tuple((int(a), int(b)) for a, b in pairwise(edges))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.test_statistics.look import Look
+from pixcal.estimators.test_statistics.look import FringeSetData
 from pixcal.model.arrays import F64
 
 # replaces the name of a set where a curve is of the detector or of several sets
@@ -54,7 +54,7 @@ class Statistic:
     of_set: bool  # uses one fringe set; else all of the evidence,
     of_all: bool  # or all fringe sets together
     floor: float  # least standard deviation by chance, as simulations may all be equal
-    # from a `Look` (of a set), those of all sets, or `Evidence`; None where data are missing
+    # from the `FringeSetData` of a set or of all sets, or `Evidence`; None where data are missing
     measure: Callable[[Any], Curve | None]
 
 
@@ -134,11 +134,11 @@ def known_statistics() -> Mapping[str, Statistic]:
 def measure(evidence: Evidence) -> dict[Key, Curve]:
     """Every statistic for which an acquisition has the frames."""
     found: dict[Key, Curve] = {}
-    looks = {name: Look(fringes, evidence) for name, fringes in evidence.fringes.items()}
-    every: tuple[tuple[str, Any], ...] = ((DETECTOR, tuple(looks.values())),)
+    sets = {name: FringeSetData(fringes, evidence) for name, fringes in evidence.fringes.items()}
+    every: tuple[tuple[str, Any], ...] = ((DETECTOR, tuple(sets.values())),)
     for name, one in known_statistics().items():
         whole = every if one.of_all else ((DETECTOR, evidence),)
-        for of, what in looks.items() if one.of_set else whole:
+        for of, what in sets.items() if one.of_set else whole:
             curve = one.measure(what)
             if curve is not None and len(curve.value) and np.isfinite(curve.value).all():
                 found[name, of] = curve

@@ -7,7 +7,7 @@ import numpy as np
 from pixcal.estimators.detector.flat_ladder import MIN_STEPS, ladder, straight_line
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics import Curve, statistic
-from pixcal.estimators.test_statistics.look import CODES, Look
+from pixcal.estimators.test_statistics.look import CODES, FringeSetData
 from pixcal.model.arrays import F64
 
 of_intensity = partial(statistic, "intensity")
@@ -17,14 +17,14 @@ CLASSES = (4, 16, 64)
 
 
 @of_intensity("harmonics of the fringes", "amplitude / α", x="harmonic (cosine, sine)")
-def harmonics(look: Look) -> Curve:
+def harmonics(data: FringeSetData) -> Curve:
     """Two to four times the phase in the residuals, over the fringe amplitude."""
-    found, good = look.found, look.good
+    found, good = data.found, data.good
     alpha = float(np.median(np.hypot(found.theta[1], found.theta[2])[good]))
-    phi, psi = found.phi, look.psi[good]
+    phi, psi = found.phi, data.psi[good]
     orders = (2, 3, 4)
     turns = np.stack([f(n * phi) for n in orders for f in (np.cos, np.sin)]).astype(np.float32)
-    moments = (turns @ look.electrons)[:, good.ravel()]
+    moments = (turns @ data.electrons)[:, good.ravel()]
     places, values = [], []
     for at, n in enumerate(orders):
         # The signal goes with sin(phi + psi).
@@ -36,9 +36,9 @@ def harmonics(look: Look) -> Curve:
 
 
 @of_intensity("mean residual against signal", "mean residual", unit="e-", x="bin of level")
-def residual_by_level(look: Look) -> Curve:
+def residual_by_level(data: FringeSetData) -> Curve:
     """Mean residual in bins of the level."""
-    return Curve.numbered(look.by_level[0])
+    return Curve.numbered(data.by_level[0])
 
 
 @of_intensity_power(
@@ -101,9 +101,9 @@ def flat_ladder(evidence: Evidence) -> Curve | None:
 
 
 @of_intensity("frequency of each bit in the samples", "frequency − ½", x="bit")
-def bits(look: Look) -> Curve | None:
+def bits(data: FringeSetData) -> Curve | None:
     """How much more often than every second time each of the lowest bits is set."""
-    count = look.remainders
+    count = data.remainders
     if count is None:
         return None
     bit = np.arange(CODES.bit_length() - 1)
@@ -112,9 +112,9 @@ def bits(look: Look) -> Curve | None:
 
 
 @of_intensity_power("uniformity of ADC codes", "relative scatter", x="codes a class")
-def code_classes(look: Look) -> Curve | None:
+def code_classes(data: FringeSetData) -> Curve | None:
     """Scatter of how often codes come up, by their remainders on division by powers of two."""
-    count = look.remainders
+    count = data.remainders
     if count is None:
         return None
     value = [float(np.var(count.reshape(-1, n).sum(axis=0) * n / count.sum())) for n in CLASSES]

@@ -32,7 +32,7 @@ OUTLIERS = (5.0, 7.0, 10.0)  # standard deviations beyond which residuals are co
 
 
 @dataclass(frozen=True)
-class Look:
+class FringeSetData:
     """A fringe set of the evidence, and quantities that several statistics need."""
 
     found: FringeEvidence

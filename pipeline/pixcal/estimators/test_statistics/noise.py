@@ -14,7 +14,7 @@ from pixcal.estimators.test_statistics.look import (
     ADJACENT,
     OUTLIERS,
     STEPS,
-    Look,
+    FringeSetData,
     by_cell,
     neighbour_sums_by_level,
 )
@@ -34,45 +34,45 @@ STILL = 1e-12  # ADU²: variance of pixels that do not change, whose square floa
 
 
 @of_noise_power("residual variance against signal", "noise / expected noise", x="bin of level")
-def variance_by_level(look: Look) -> Curve:
+def variance_by_level(data: FringeSetData) -> Curve:
     """Mean square of residuals over their noise, in bins of the level."""
-    return Curve.numbered(look.by_level[1])
+    return Curve.numbered(data.by_level[1])
 
 
 @of_noise_power("residual noise", "rms residual", unit="e-")
-def residual_noise(look: Look) -> Curve:
+def residual_noise(data: FringeSetData) -> Curve:
     """Mean square of the residuals."""
-    squares = np.einsum("tp,tp->p", look.electrons, look.electrons) / len(look.electrons)
-    return Curve.numbered([float(squares[look.good.ravel()].mean())])
+    squares = np.einsum("tp,tp->p", data.electrons, data.electrons) / len(data.electrons)
+    return Curve.numbered([float(squares[data.good.ravel()].mean())])
 
 
 @of_noise_power("residual variance by position", "noise / expected noise", x="cell of 4 × 4")
-def variance_by_place(look: Look) -> Curve:
+def variance_by_place(data: FringeSetData) -> Curve:
     """Mean square of residuals over their noise, in cells of the window, row by row."""
-    return Curve.numbered(by_cell(look.moments[0], look.good))
+    return Curve.numbered(by_cell(data.moments[0], data.good))
 
 
 @of_noise_power(
     "residual variance against time", "noise / expected noise", x="eighth of the frames"
 )
-def variance_by_time(look: Look) -> Curve:
+def variance_by_time(data: FringeSetData) -> Curve:
     """Mean square of residuals over their noise, in eighths of the frames."""
-    squares = np.einsum("tyx,tyx->t", look.residual, look.residual) / look.good.sum()
+    squares = np.einsum("tyx,tyx->t", data.residual, data.residual) / data.good.sum()
     value = [float(part.mean()) for part in np.array_split(squares, 8)]
     return Curve(np.arange(1.0, 9.0), np.array(value))
 
 
 @of_noise("correlation of adjacent pixels", "correlation", x="neighbour")
-def neighbours(look: Look) -> Curve:
+def neighbours(data: FringeSetData) -> Curve:
     """Correlation of the residuals of adjacent pixels: separate, as most crosstalk is there."""
-    sums, count = look.neighbours
+    sums, count = data.neighbours
     return Curve.numbered(_mean_product(sums, count)[:ADJACENT])
 
 
 @of_noise("correlation of pixels further apart", "correlation", x="far neighbour")
-def far_neighbours(look: Look) -> Curve:
+def far_neighbours(data: FringeSetData) -> Curve:
     """Correlation of the residuals of pixels two to four rows or columns apart."""
-    sums, count = look.neighbours
+    sums, count = data.neighbours
     every = np.arange(float(len(STEPS)))
     return Curve(every[ADJACENT:], _mean_product(sums, count)[ADJACENT:])
 
@@ -80,10 +80,10 @@ def far_neighbours(look: Look) -> Curve:
 @of_noise(
     "correlation of neighbours by row, modulo 4", "correlation", x="row of four, down then right"
 )
-def neighbours_by_row(look: Look) -> Curve:
+def neighbours_by_row(data: FringeSetData) -> Curve:
     """Correlation with the pixel below and to the right, for each row of four."""
-    sums, count = (of[[STEPS.index((1, 0)), STEPS.index((0, 1))]] for of in look.neighbours)
-    row = (np.arange(look.good.shape[0]) + look.found.origin[0]) % 4
+    sums, count = (of[[STEPS.index((1, 0)), STEPS.index((0, 1))]] for of in data.neighbours)
+    row = (np.arange(data.good.shape[0]) + data.found.origin[0]) % 4
     value = np.stack(
         [_mean_product(sums[:, row == n], count[:, row == n]) for n in range(4)], axis=1
     )
@@ -91,10 +91,10 @@ def neighbours_by_row(look: Look) -> Curve:
 
 
 @of_noise("correlation of neighbours, bright minus dark", "correlation", x="neighbour")
-def neighbours_by_level(look: Look) -> Curve:
+def neighbours_by_level(data: FringeSetData) -> Curve:
     """Covariance over shot noise in bright samples less that in dark ones."""
     (bright, dark), count = neighbour_sums_by_level(
-        look.residual, look.found.model, look.good, STEPS[:ADJACENT], look.thinned
+        data.residual, data.found.model, data.good, STEPS[:ADJACENT], data.thinned
     )
     return Curve.numbered(2 * _mean_product(bright - dark, count))
 
@@ -117,9 +117,9 @@ def _line_power(rest: F32, good: Mask) -> F64:
 
 
 @of_noise_power("row and column noise", "noise / white noise", x="rows, columns")
-def lines(look: Look) -> Curve:
+def lines(data: FringeSetData) -> Curve:
     """Of the fringe frames' residuals."""
-    return Curve.numbered(_line_power(look.residual, look.good))
+    return Curve.numbered(_line_power(data.residual, data.good))
 
 
 def _calm(frames: F32, good: Mask) -> F32:
@@ -133,10 +133,10 @@ def _calm(frames: F32, good: Mask) -> F32:
 
 
 @of_noise("outliers", "outliers", x="sigma, low then high", unit="2 √number", floor=1.0)
-def outliers(look: Look) -> Curve:
+def outliers(data: FringeSetData) -> Curve:
     """Residuals of good pixels beyond 5, 7 and 10 sigma: twice the root of their number."""
     limits = np.array(OUTLIERS)
-    return Curve(np.concatenate([-limits, limits]), 2 * np.sqrt(look.outliers.ravel()))
+    return Curve(np.concatenate([-limits, limits]), 2 * np.sqrt(data.outliers.ravel()))
 
 
 @of_noise(
@@ -163,15 +163,15 @@ def dark_outliers(evidence: Evidence) -> Curve | None:
 
 
 @of_noise_power("noise distribution of the pixels", "noise / expected noise", x="quantile")
-def pixel_noise(look: Look) -> Curve:
+def pixel_noise(data: FringeSetData) -> Curve:
     """Quantiles over the pixels of the mean square of their residuals."""
-    return Curve(np.array(QUANTILES), np.quantile(look.moments[0][look.good], QUANTILES))
+    return Curve(np.array(QUANTILES), np.quantile(data.moments[0][data.good], QUANTILES))
 
 
 @of_noise("kurtosis of the pixels' residuals", "kurtosis", x="quantile")
-def pixel_peakedness(look: Look) -> Curve:
+def pixel_peakedness(data: FringeSetData) -> Curve:
     """Quantiles over the pixels of the kurtosis of their residuals."""
-    second, fourth = (moment[look.good] for moment in look.moments)
+    second, fourth = (moment[data.good] for moment in data.moments)
     return Curve(np.array(QUANTILES), np.quantile(fourth / second**2, QUANTILES))
 
 

@@ -10,7 +10,7 @@ from scipy.fft import rfft2
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics import Curve, family, statistic
 from pixcal.estimators.test_statistics.detector_frames import differences, repeated
-from pixcal.estimators.test_statistics.look import Look, pattern_sizes
+from pixcal.estimators.test_statistics.look import FringeSetData, pattern_sizes
 from pixcal.estimators.test_statistics.time import DISTINCT
 from pixcal.kernels.significance import sigmas_of_largest
 from pixcal.model.arrays import F32, F64, Mask
@@ -64,9 +64,9 @@ def strongest(sizes: F64) -> float:
     x="cycles a pixel",
     floor=FLOOR,
 )
-def tone(look: Look) -> Curve:
+def tone(data: FringeSetData) -> Curve:
     """Of the residuals."""
-    return tone_sigmas(look.residual[:: look.thinned], look.good)
+    return tone_sigmas(data.residual[:: data.thinned], data.good)
 
 
 @family(
@@ -87,9 +87,9 @@ def tones(kind: str, evidence: Evidence) -> Curve | None:
 
 
 @statistic("time", "smooth patterns that vary over the frames", "strongest / noise of one frame")
-def smooth_patterns(look: Look) -> Curve:
+def smooth_patterns(data: FringeSetData) -> Curve:
     """Root mean square of the strongest pattern in the residuals."""
-    sizes = look.pattern_sizes
+    sizes = data.pattern_sizes
     return Curve.numbered([strongest(sizes) / np.sqrt(len(sizes))])
 
 
@@ -111,9 +111,9 @@ def smooth_patterns_of(kind: str, evidence: Evidence) -> Curve | None:
 
 
 @statistic("time", "smooth patterns that follow the phase", "strongest", unit="σ")
-def smooth_patterns_by_phase(look: Look) -> Curve | None:
+def smooth_patterns_by_phase(data: FringeSetData) -> Curve | None:
     """Size of the strongest pattern that follows two and three times the frame's phase."""
-    phi = look.found.phi
+    phi = data.found.phi
     # The pixels' fit absorbs patterns that follow the phase itself.
     taken = np.linalg.qr(np.stack([np.ones_like(phi), np.cos(phi), np.sin(phi)], axis=1))[0]
     turns = np.stack([f(n * phi) for n in (2, 3) for f in (np.cos, np.sin)], axis=1)
@@ -121,7 +121,7 @@ def smooth_patterns_by_phase(look: Look) -> Curve | None:
     shapes = shapes[:, size > DISTINCT * np.sqrt(len(phi))]
     if not shapes.size:
         return None
-    sizes = shapes.T @ look.pattern_sizes
+    sizes = shapes.T @ data.pattern_sizes
     return Curve.numbered([strongest(sizes)])
 
 

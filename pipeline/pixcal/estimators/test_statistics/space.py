@@ -17,7 +17,7 @@ from pixcal.estimators.maps.structure import (
     repeats,
 )
 from pixcal.estimators.test_statistics import Curve, family, statistic
-from pixcal.estimators.test_statistics.look import Look, by_cell
+from pixcal.estimators.test_statistics.look import FringeSetData, by_cell
 from pixcal.model.arrays import F64, Mask
 
 of_space = partial(statistic, "space")
@@ -32,11 +32,11 @@ SAME = 0.98  # cosine of the angle below which two sets measure along the same a
     x="contrast, light of each pair",
     together=True,
 )
-def alike(looks: Sequence[Look]) -> Curve:
+def alike(sets: Sequence[FringeSetData]) -> Curve:
     """Correlation of the maps of each pair of sets."""
     values = [
         _correlation(one.flat_maps[name], other.flat_maps[name])
-        for one, other in combinations(looks, 2)
+        for one, other in combinations(sets, 2)
         for name in ("contrast", "light")
     ]
     return Curve.numbered(values)
@@ -50,10 +50,10 @@ def _correlation(one: F64, other: F64) -> float:
 @of_space_power(
     "difference of offsets between sets", "rms difference", unit="px", x="pair", together=True
 )
-def apart(looks: Sequence[Look]) -> Curve:
+def apart(sets: Sequence[FringeSetData]) -> Curve:
     """Mean square of the difference of the offsets along one axis, by two baselines."""
     values = []
-    for one, other in combinations(looks, 2):
+    for one, other in combinations(sets, 2):
         a, b = np.array(one.found.k), np.array(other.found.k)
         cosine = float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
         if abs(cosine) > SAME:
@@ -83,10 +83,10 @@ MAP_LINES = tuple((f"{m[0]}_{lines}", *m, lines) for m in MAPS for lines in AXES
     "{0}_repeat", MAP_LINES, "space", "{1}: periodic pattern of {5}", "{2}", unit="{3}",
     x="period, {5}",
 )  # fmt: skip
-def repeats_of_lines(of: str, look: Look) -> Curve:
+def repeats_of_lines(of: str, data: FringeSetData) -> Curve:
     """Size of patterns that repeat over rows or columns."""
     name, lines = of.split("_")
-    size = np.abs(repeats(look.maps_beside_fringes[name], AXES[lines]))
+    size = np.abs(repeats(data.maps_beside_fringes[name], AXES[lines]))
     return Curve(np.array(PERIODS, float), size)
 
 
@@ -94,10 +94,10 @@ def repeats_of_lines(of: str, look: Look) -> Curve:
     "{0}", MAP_LINES, "space", "{1}: profile of {5}", "{2}, rms", unit="{3}", x="cycles a pixel",
     power=True,
 )  # fmt: skip
-def profiles_of_lines(of: str, look: Look) -> Curve:
+def profiles_of_lines(of: str, data: FringeSetData) -> Curve:
     """Power of the means of rows or columns."""
     name, lines = of.split("_")
-    along = profile(look.maps_beside_fringes[name], AXES[lines])
+    along = profile(data.maps_beside_fringes[name], AXES[lines])
     power = np.abs(np.fft.rfft(along)[1:]) ** 2 * 2 / len(along) ** 2
     return _binned(np.arange(1, len(power) + 1) / len(along), power)
 
@@ -106,9 +106,9 @@ def profiles_of_lines(of: str, look: Look) -> Curve:
     "{0}_fringes", MAPS, "space", "{0}: residual fringes, first and second harmonic", "{1}",
     unit="{2}", x="harmonic (cosine, sine)", floor=IRRELEVANT,
 )  # fmt: skip
-def residual_fringes(name: str, look: Look) -> Curve:
+def residual_fringes(name: str, data: FringeSetData) -> Curve:
     """Amplitudes of the fringes left in a map."""
-    sizes = fit_terms(look.flat_maps[name], look.fringe_terms)
+    sizes = fit_terms(data.flat_maps[name], data.fringe_terms)
     return Curve(np.array([1.0, 1.25, 2.0, 2.25]), sizes)
 
 
@@ -117,11 +117,11 @@ def residual_fringes(name: str, look: Look) -> Curve:
     "{0}_bending", MAPS, "space", "{0}: {3}", "coefficient", unit="σ", x="Legendre term",
     floor=FLOOR,
 )  # fmt: skip
-def low_orders(name: str, look: Look) -> Curve:
+def low_orders(name: str, data: FringeSetData) -> Curve:
     """Legendre terms, over their size by chance in an equally red map."""
-    values = look.maps[name]
+    values = data.maps[name]
     terms = legendre(values.shape, 4 if name == "contrast" else 3)
-    field = look.stitched if name == "offset" else np.zeros(values.shape, np.intp)
+    field = data.stitched if name == "offset" else np.zeros(values.shape, np.intp)
     fit = FieldFit.of(values, terms[1:], field)
     error = np.sqrt(fit.variance * redness(fit.rest) * np.diag(fit.covariance))
     # Two Gaussian beams cause curvature of the contrast in any direction, but no higher terms.
@@ -144,9 +144,9 @@ def _power_beside_lines(values: F64) -> tuple[F64, F64, F64, Mask]:
     "{0}_scales", MAPS, "space", "{0}: power by spatial frequency", "{1}, rms", unit="{2}",
     x="cycles a pixel", power=True,
 )  # fmt: skip
-def scales(name: str, look: Look) -> Curve:
+def scales(name: str, data: FringeSetData) -> Curve:
     """Power in bins of spatial frequency."""
-    values = look.maps_beside_fringes[name]
+    values = data.maps_beside_fringes[name]
     power, fy, fx, apart = _power_beside_lines(values)
     power = power / values.size**2
     return _binned(np.hypot(fy, fx)[apart], power[apart] * values.size)
@@ -156,9 +156,9 @@ def scales(name: str, look: Look) -> Curve:
     "{0}_peak", MAPS, "space", "{0}: strongest isolated spatial frequency", "{1}, rms", unit="{2}",
     x="cycles a pixel", power=True,
 )  # fmt: skip
-def peak(name: str, look: Look) -> Curve:
+def peak(name: str, data: FringeSetData) -> Curve:
     """Highest power of a single frequency."""
-    values = look.maps_beside_fringes[name]
+    values = data.maps_beside_fringes[name]
     power, fy, fx, apart = _power_beside_lines(values)
     at = np.unravel_index(int(np.argmax(np.where(apart, power, 0))), power.shape)
     highest = float(power[at]) / values.size**2 * 4
@@ -169,9 +169,9 @@ def peak(name: str, look: Look) -> Curve:
     "{0}_by_place", MAPS, "space", "{0}: power by position", "{1}, rms", unit="{2}",
     x="cell of 4 × 4", power=True,
 )  # fmt: skip
-def by_place(name: str, look: Look) -> Curve:
+def by_place(name: str, data: FringeSetData) -> Curve:
     """Mean square in cells of the window."""
-    squares = look.maps_beside_fringes[name] ** 2
+    squares = data.maps_beside_fringes[name] ** 2
     return Curve.numbered(by_cell(squares, np.isfinite(squares)))
 
 

@@ -9,7 +9,7 @@ from scipy.fft import dct
 from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker, level_before, light_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics import Curve, family, statistic
-from pixcal.estimators.test_statistics.look import Look
+from pixcal.estimators.test_statistics.look import FringeSetData
 from pixcal.kernels.frame_order import follows
 from pixcal.kernels.sample_sums import frame_means
 from pixcal.model.arrays import F64
@@ -50,18 +50,18 @@ def power_of(series: F64) -> Curve:
 
 
 @of_time("signal carried over from other frames", "share of the signal", x="frames before")
-def frames_before(look: Look) -> Curve:
+def frames_before(data: FringeSetData) -> Curve:
     """Share of another frame's fringes in the residuals, after what the pixels' own fits absorb."""
-    g, theta = look.found.g, look.theta
-    noise = np.sqrt(look.variance)[:, None]
+    g, theta = data.found.g, data.theta
+    noise = np.sqrt(data.variance)[:, None]
     basis = np.linalg.qr(g)[0]
-    along = noise * (look.residual.reshape(len(g), -1) @ theta.T)
+    along = noise * (data.residual.reshape(len(g), -1) @ theta.T)
     square = (theta @ theta.T).astype(float)
     values = []
     for lag in LAGS:
         other = np.roll(g, lag, axis=0)
         other -= basis @ (basis.T @ other)
-        other[~follows(look.found.frame, lag)] = 0
+        other[~follows(data.found.frame, lag)] = 0
         size = np.einsum("ti,ij,tj->", other, square, other)
         values.append(float(np.vdot(other, along) / size))
     return Curve(np.array(LAGS, float), np.array(values))
@@ -72,26 +72,26 @@ def frames_before(look: Look) -> Curve:
     "slope of the contrast",
     x="frames before",
 )
-def contrast_by_step(look: Look) -> Curve:
+def contrast_by_step(data: FringeSetData) -> Curve:
     """Slope of the contrast against the cosine of the step."""
-    contrast, phi = look.frames["contrast"], look.found.phi
+    contrast, phi = data.frames["contrast"], data.found.phi
     slow = np.stack([np.ones(len(phi)), np.linspace(-1, 1, len(phi))], axis=1)
     values = []
     for lag in LAGS[:3]:
-        own = np.flatnonzero(follows(look.found.frame, lag))
+        own = np.flatnonzero(follows(data.found.frame, lag))
         terms = np.column_stack([slow[own], np.cos(phi[own] - phi[own - lag])])
         values.append(float(np.linalg.lstsq(terms, contrast[own], rcond=DISTINCT)[0][-1]))
     return Curve(np.array(LAGS[:3], float), np.array(values))
 
 
 @of_time("contrast and intensity against phase", "relative amplitude", x="term")
-def frames_by_phase(look: Look) -> Curve:
+def frames_by_phase(data: FringeSetData) -> Curve:
     """Amplitudes of contrast and intensity at one, two and three times the frame's phase."""
-    phi = look.found.phi
+    phi = data.found.phi
     turns = [f(n * phi) for n in (1, 2, 3) for f in (np.cos, np.sin)]
     terms = np.stack([np.ones(len(phi)), *turns], axis=1)
     values = [
-        np.linalg.lstsq(terms, look.frames[name], rcond=DISTINCT)[0][1:]
+        np.linalg.lstsq(terms, data.frames[name], rcond=DISTINCT)[0][1:]
         for name in ("contrast", "intensity")
     ]
     value = np.concatenate(values)
@@ -104,20 +104,20 @@ def frames_by_phase(look: Look) -> Curve:
     unit="px",
     x="batches averaged",
 )
-def allan_of_batches(look: Look) -> Curve | None:
+def allan_of_batches(data: FringeSetData) -> Curve | None:
     """Allan variance of the pixels' offsets, over lengths of one, two and four batches."""
-    found = look.found
+    found = data.found
     size = len(found.g) // BATCHES
     if size < 8:
         return None
     k = float(np.hypot(*found.k))
-    good = look.good.ravel()
-    _, of_sine, of_cosine = look.theta[:, good].astype(float)
+    good = data.good.ravel()
+    _, of_sine, of_cosine = data.theta[:, good].astype(float)
     shifts = []
     for n in range(BATCHES):
         own = slice(n * size, (n + 1) * size)
         inverse = np.linalg.pinv(found.g[own])[1:].astype(np.float32)
-        c, s = (inverse @ look.electrons[own])[:, good]
+        c, s = (inverse @ data.electrons[own])[:, good]
         # theta = (iota, alpha sin psi, alpha cos psi): a turn of psi moves along (cos, -sin).
         shifts.append((c * of_cosine - s * of_sine) / (of_sine**2 + of_cosine**2) / k)
     values = np.stack(shifts)
@@ -128,7 +128,11 @@ def allan_of_batches(look: Look) -> Curve | None:
     return Curve(np.array([1.0, 2.0, 4.0]), np.array(out))
 
 
-@of_time("first flat of each level against the next ones", "relative intensity", sets=False)
+@of_time(
+    "first flat of each exposure time relative to the following ones",
+    "relative intensity",
+    sets=False,
+)
 def first_flats(evidence: Evidence) -> Curve | None:
     """Relative change: mean over the levels, and slope against the rise from the frame before."""
     # Lamp flicker changes each level independently. Lag changes the first frame by a share of the
@@ -153,9 +157,9 @@ def first_flats(evidence: Evidence) -> Curve | None:
     x="cycles a frame",
     power=True,
 )
-def series_of_frames(name: str, look: Look) -> Curve:
+def series_of_frames(name: str, data: FringeSetData) -> Curve:
     """Mean squares of a parameter of the frames."""
-    return power_of(look.frames[name])
+    return power_of(data.frames[name])
 
 
 @family(

@@ -10,7 +10,7 @@ from pixcal.estimators.detector.amplifiers import relative_gain
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.maps.structure import flattened, smooth_surface
-from pixcal.estimators.test_statistics.look import Look
+from pixcal.estimators.test_statistics.look import FringeSetData
 from pixcal.estimators.test_statistics.noise import jumping
 from pixcal.kernels.processes import ramp_step
 from pixcal.kernels.robust import median_and_sigma, robust_sigma
@@ -292,4 +292,4 @@ def _gain(evidence: Sequence[Evidence], flat: F64, good: Mask, with_flats: bool)
 
 def _noise_ratios(one: Evidence) -> list[F64]:
     """Mean squared residual (y, x) over shot and read variance, of each fringe set."""
-    return [Look(fringes, one).moments[0] for fringes in one.fringes.values()]
+    return [FringeSetData(fringes, one).moments[0] for fringes in one.fringes.values()]

@@ -11,7 +11,7 @@ from pixcal.estimators.detector.emva import Measure, full_level, saturation, tra
 from pixcal.estimators.detector.missing_codes import missing_codes, step_noise
 from pixcal.kernels.gain_fit import LADDER, GainFit, fit_gain
 from pixcal.kernels.photon_transfer import add_neighbours
-from pixcal.kernels.rounding import SHEPPARD, UNTOLD
+from pixcal.kernels.rounding import SHEPPARD, UNDETERMINED_BELOW
 from pixcal.model.acquisition import Detector
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
@@ -103,7 +103,7 @@ class Summary:
             return gain * self.before_rounding[0]
         if self.read_noise is None:
             return self.declared.read_noise_e
-        return min(self.declared.read_noise_e, gain * UNTOLD * self.step)
+        return min(self.declared.read_noise_e, gain * UNDETERMINED_BELOW * self.step)
 
 
 def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:

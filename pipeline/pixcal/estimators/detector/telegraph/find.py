@@ -66,9 +66,9 @@ class Telegraph(Population):
     upper: float  # share of the time in the upper level
     switching_error: float
     signs: Signs  # that noisy pixels jump
-    # own, faintest: levels of single pixels, from fringes; smallest jump measured, e-
+    # own, smallest_jump: levels of single pixels, from fringes; smallest jump measured, e-
     own: OwnLevels | None = None
-    faintest: float = 0.0
+    smallest_jump: float = 0.0
 
 
 def find_telegraph(
@@ -86,7 +86,7 @@ def find_telegraph(
     told = signs(parts)
     longest, upper, known = max(parts, key=lambda m: m.frames), 0.5, None
     single: OwnLevels | None = None
-    faintest = 0.0
+    smallest_jump = 0.0
     if told.significance > SIGNIFICANT and told.noisy:
         own = max(series, key=lambda s: len(s.noise))
         upper = _upper(lit, own, longest, told)
@@ -97,8 +97,8 @@ def find_telegraph(
             upper = _upper(lit, own, longest, told)
         known = find_stays(lit(_chosen(longest)), longest, upper)
         clear = NOISY * float(np.sqrt(2 / longest.dof)) / (upper * (1 - upper))
-        faintest = longest.sigma * clear**0.5
-        single = _single(lit, own, longest, noisy, faintest)
+        smallest_jump = longest.sigma * clear**0.5
+        single = _single(lit, own, longest, noisy, smallest_jump)
     parts = thinned(parts)
     if known is not None:
         found = _Found(find_population(parts, known[0]), *known, 0.0)
@@ -113,7 +113,7 @@ def find_telegraph(
         switching_error=found.error,
         signs=told,
         own=single,
-        faintest=faintest,
+        smallest_jump=smallest_jump,
     )
 
 
@@ -153,9 +153,9 @@ def _single(
     own: Series,
     seen: Moments,
     noisy: Indices | None,
-    faintest: float,
+    smallest_jump: float,
 ) -> OwnLevels | None:
-    """Levels of each pixel that jumps by ``faintest`` or more; None without fringes."""
+    """Levels of each pixel that jumps by ``smallest_jump`` or more; None without fringes."""
     pixels = _chosen(seen) if noisy is None else np.union1d(_chosen(seen), noisy)
     bright = lit(pixels) if len(pixels) <= MOST_OWN else ()
     if not bright:
@@ -164,7 +164,7 @@ def _single(
     darker = own.sigma**-2 > DARKER * float(np.mean(bright[0].weight))
     dark = [_in_the_dark(own, pixels)] if darker else []
     found = own_levels([*dark, *bright], seen.sigma)
-    far = found.amplitude >= faintest
+    far = found.amplitude >= smallest_jump
     return OwnLevels(found.pixel[far], found.amplitude[far], found.upper[far])
 
 

@@ -14,7 +14,7 @@ from pixcal.estimators.fringe_fit.models import FringeShape, Start
 from pixcal.kernels.optics import PARAMETERS, Geometry, fringe_vector, phase, phase_jacobian
 from pixcal.model.arrays import F64
 
-# the foot of the fibres' centre: the laboratory places it to less than 2 cm (paper, 5.2)
+# the projection of the fibres' midpoint: the laboratory places it to less than 2 cm (paper, 5.2)
 PRIOR_CENTRE_MM = 20.0
 PRIOR_DISTANCE = 0.025  # the distance, as a share: 10 mm of 400 mm
 PRIOR_BASELINE = 0.05  # length and direction of the baseline, as a share of its length
