@@ -84,68 +84,25 @@ def _median_of_columns(rows: Any, out: Any) -> None:
         out[x] = 0.5 * (rows[(m - 1) // 2, x] + rows[m // 2, x]) if m > 0 else np.nan
 
 
-@inner()
-def _deviation_of_sorted(rows: Any, median: Any, least: Any, out: Any) -> None:
-    """Median of the absolute deviations of columns that `_median_of_columns` sorted.
-
-    Deviations rise from the median on to either side. So the smaller ones of the first on one side
-    and the last on the other, and so on, are the lower half of them all (Batcher's bitonic merge).
-    """
-    n, columns = rows.shape
-    half = n // 2
-    for x in range(columns):
-        least[x], out[x] = np.inf, 0
-    for i in range(half):
-        left, right = rows[half - 1 - i], rows[n - 1 - i]
-        for x in range(columns):
-            a, b = abs(left[x] - median[x]), abs(right[x] - median[x])
-            low, high = (a, b) if a < b else (b, a)
-            out[x] = max(out[x], low)
-            least[x] = min(least[x], high)
-    for x in range(columns):
-        if rows[n - 1, x] == np.inf:
-            out[x] = _deviation_of_some(rows[:, x], median[x])
-        elif n == 2 * half:
-            out[x] = 0.5 * (out[x] + least[x])
-
-
-@inner()
-def _deviation_of_some(column: Any, median: float) -> float:
-    # Of the values before the first infinite one; NaN without any.
-    count = 0
-    while count < column.size and column[count] < np.inf:
-        count += 1
-    low, high = (count - 1) // 2, (count - 1) // 2 + 1
-    last = before = np.nan
-    for _ in range(count // 2 + 1 if count else 0):
-        before = last
-        if high == count or (low >= 0 and median - column[low] <= column[high] - median):
-            last = abs(column[low] - median)
-            low -= 1
-        else:
-            last = abs(column[high] - median)
-            high += 1
-    return last if count % 2 else 0.5 * (before + last)
-
-
 @kernel()
 def _median_and_deviation(frames: Any, rows: Any, median: Any, deviation: Any) -> None:
-    # The last of the rows (t + 1, x), which are scratch, is not of a frame.
-    sorted_rows, least = rows[: frames.shape[0]], rows[frames.shape[0]]
+    # Loops: assigning the slices takes seconds to compile. The rows (t, x) are scratch.
     for y in range(frames.shape[1]):
-        # A loop: assigning the slice takes seconds to compile.
         for t in range(frames.shape[0]):
             for x in range(frames.shape[2]):
                 rows[t, x] = frames[t, y, x]
-        _median_of_columns(sorted_rows, median[y])
-        _deviation_of_sorted(sorted_rows, median[y], least, deviation[y])
+        _median_of_columns(rows, median[y])
+        for t in range(frames.shape[0]):
+            for x in range(frames.shape[2]):
+                rows[t, x] = abs(frames[t, y, x] - median[y, x])
+        _median_of_columns(rows, deviation[y])
 
 
 def median_and_deviation(frames: F32) -> tuple[F32, F32]:
     """Median (..., x) of frames (t, ..., x), NaN apart, and of the absolute deviations from it."""
     count, columns = len(frames), frames.shape[-1]
     median, deviation = np.empty((2, frames[0].size // columns, columns), np.float32)
-    rows = np.empty((count + 1, columns), np.float32)
+    rows = np.empty((count, columns), np.float32)
     _median_and_deviation(frames.reshape(count, -1, columns), rows, median, deviation)
     return median.reshape(frames.shape[1:]), deviation.reshape(frames.shape[1:])
 
