@@ -154,7 +154,7 @@ def test_pairs_of_flats_tell_of_charge_that_stays_behind(
         adu = stack.adu - evidence.bias
         if stack.kind == "flat":
             adu *= 1 + 0.001 * rng.standard_normal((2, 1, 1))
-            before = level_before(stack, evidence) / (2.3 * adu.mean()) if carried else 0.0
+            before = level_before(evidence, stack) / (2.3 * adu.mean()) if carried else 0.0
             adu[0] *= 1 - share * (1 - before)
         stacks.append(replace(stack, adu=(adu + evidence.bias).astype(np.float32)))
     found = Lag.estimate(replace(evidence, stacks=tuple(stacks)))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
-from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack, once
 from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.sample_sums import frame_means
 from pixcal.kernels.significance import SIGNIFICANT
@@ -53,12 +53,9 @@ class Ladder:
         return float(self.levels.max())
 
 
+@once
 def light_of(evidence: Evidence, stack: Stack) -> F64:
     """Mean (t,) of the good pixels in each frame without bias and dark signal, e-."""
-    return evidence.once("light", *stack.key, make=lambda: _light_of(evidence, stack))
-
-
-def _light_of(evidence: Evidence, stack: Stack) -> F64:
     good = evidence.good
     dark = evidence.gain * evidence.bias[good].mean()
     if np.isfinite(stack.exptime_s):
@@ -66,13 +63,9 @@ def _light_of(evidence: Evidence, stack: Stack) -> F64:
     return np.asarray(frame_means(stack.adu, good) * evidence.gain - dark)
 
 
-def level_before(stack: Stack, evidence: Evidence) -> float:
+@once
+def level_before(evidence: Evidence, stack: Stack) -> float:
     """Level (e-) of the frame before a series; zero where time stamps do not identify it."""
-    own = "level before", *stack.key
-    return evidence.once(*own, make=lambda: _level_before(stack, evidence))
-
-
-def _level_before(stack: Stack, evidence: Evidence) -> float:
     start = stack.start_s + stack.time_s[0]
     earlier = [
         (float(times[times < start].max()), n)
@@ -129,7 +122,7 @@ def flicker(evidence: Evidence) -> tuple[float, float]:
         if len(light) > 1 and light.mean() > 0:
             own = np.diff(light) / light.mean() - rise
             firsts.append(float(own[0]))
-            before.append(level_before(stack, evidence) / float(light.mean()))
+            before.append(level_before(evidence, stack) / float(light.mean()))
             steps += own[1:].tolist()
     pairs = np.array(firsts) - (np.median(firsts) if firsts else 0.0)
     if len(firsts) > _WITH_BEFORE and np.ptp(before) > 0:
@@ -153,12 +146,9 @@ def straight_line(times: F64, levels: F64, at: F64) -> F64:
     return np.asarray(np.stack([at, np.ones_like(at)][:terms], axis=1) @ found)
 
 
+@once
 def ladder(evidence: Evidence) -> Ladder | None:
     """The ladder of an acquisition; None with too few levels, or a lamp that was changed."""
-    return evidence.once("ladder", make=lambda: _ladder(evidence))
-
-
-def _ladder(evidence: Evidence) -> Ladder | None:
     stacks = [s for s in evidence.ladder if s.exptime_s > 0]
     light = [light_of(evidence, s) for s in stacks]
     times = np.array([s.exptime_s for s in stacks])

@@ -324,7 +324,7 @@ def lag_of_flats(evidence: Evidence) -> LagOfFlats | None:
     level, step, error = np.array([f for _, f in found]).T
     if np.ptp(level) < 10 * error.min():
         return None
-    before = np.array([level_before(s, evidence) for s, _ in found])
+    before = np.array([level_before(evidence, s) for s, _ in found])
     flat = np.array([s.kind == "flat" for s, _ in found])
     known = 1.0 if before.any() else 0.0
     lamp = warming(evidence)

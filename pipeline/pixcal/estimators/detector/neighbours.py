@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pixcal.estimators.diagnosis.distortions import Freedom, TwoWay
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, once
 from pixcal.kernels import kernel
 from pixcal.kernels.boundaries import REACH, boundary_pushes, shared_noise
 from pixcal.kernels.line_means import without_line_means
@@ -58,17 +58,13 @@ class SharedCharge:
     covariance: F64
 
 
+@once
 def shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
     """Size of the brighter-fatter effect from the covariance of neighbours.
 
     ``shifts``: `pixcal.kernels.boundaries.boundary_shifts`, of size one. None without fringe
     frames and flats.
     """
-    given = shifts.shape, shifts.tobytes()
-    return evidence.once("shared_charge", *given, make=lambda: _shared_charge(evidence, shifts))
-
-
-def _shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
     n = 2 * len(DIRECTIONS) + 2
     normal, right = np.zeros((n, n)), np.zeros(n)
     for noise in _noises(evidence):

@@ -18,7 +18,7 @@ from pixcal.estimators.diagnosis.distortions import (
     distortion_sums,
     fit_distortions,
 )
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, once
 from pixcal.kernels.boundaries import REACH, boundary_shifts, moved_charge
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F32, F64
@@ -144,7 +144,7 @@ def boundaries_alone(
     ``otherwise_px``: falloff (of `FALLOFFS_PX`) where harmonics do not constrain it. ``by_axis``:
     shifts of boundaries between rows and between columns may differ.
     """
-    sums = _sums_by_axis(evidence)
+    sums = _boundary_sums(evidence)
     if len(sums) < 2 or not by_axis:
         sums = [(sum(n for n, _ in sums), sum(r for _, r in sums))]  # type: ignore[list-item]
     fine = _of_fine_falloffs()
@@ -169,6 +169,7 @@ def _of_fine_falloffs() -> F64:
     return shares
 
 
+@once
 def _boundary_sums(evidence: Evidence) -> list[tuple[F64, F64]]:
     """Sums of `distortion_sums` for powers and falloffs, of fringes across columns and rows."""
     every = [UNIT * boundary_shifts(falloff) for falloff in FALLOFFS_PX]
@@ -211,7 +212,7 @@ def boundaries_beside(
 
     ``known``: mean shift per electron (px) and its variance, from the noise of neighbours.
     """
-    sums = _sums_by_axis(evidence)
+    sums = _boundary_sums(evidence)
     normal, right = _joint(sums, POWERS + FALLOFFS_PX.index(falloff_px))
     mean = np.zeros(len(right))
     mean[POWERS:] = 1 / len(sums)
@@ -223,10 +224,6 @@ def boundaries_beside(
     gain = float(right @ inverse @ right - right[:POWERS] @ only @ right[:POWERS])
     size, variance = float(mean @ inverse @ right), float(mean @ inverse @ mean)
     return Beside(UNIT * size, UNIT**2 * variance, max(gain, 0.0), len(sums))
-
-
-def _sums_by_axis(evidence: Evidence) -> list[tuple[F64, F64]]:
-    return evidence.once("boundaries", make=lambda: _boundary_sums(evidence))
 
 
 def _joint(sums: Sequence[tuple[F64, F64]], at: int) -> tuple[F64, F64]:

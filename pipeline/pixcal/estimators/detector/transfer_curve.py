@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack, once
 from pixcal.kernels.line_means import without_line_means
 from pixcal.kernels.residual_sums import residual_sums
 from pixcal.model.arrays import F64, Mask
@@ -42,6 +42,7 @@ class TransferCurve:
     errors: F64
 
 
+@once
 def transfer_curve(evidence: Evidence, *, whole: bool = False) -> TransferCurve | None:
     """Photon transfer of each level of flats.
 
@@ -51,10 +52,6 @@ def transfer_curve(evidence: Evidence, *, whole: bool = False) -> TransferCurve 
     ``whole``. This makes the slope more precise, but several insignificant covariances may
     together exceed the error.
     """
-    return evidence.once("transfer curve", whole, make=lambda: _transfer_curve(evidence, whole))
-
-
-def _transfer_curve(evidence: Evidence, whole: bool) -> TransferCurve | None:
     if not evidence.has_level:
         return None
     counted = None if whole else _shared_steps(evidence)
@@ -64,7 +61,7 @@ def _transfer_curve(evidence: Evidence, whole: bool) -> TransferCurve | None:
     exact = None if known is None else _EXACT
     points = []
     for stack in filter(_is_enough, evidence.ladder):
-        sums = _of_stack(stack, evidence)
+        sums = _of_stack(evidence, stack)
         share = None if sums is None else shot_share([sums, *darks], counted, exact)
         level = float((stack.adu.mean(axis=0) - evidence.bias)[evidence.good].mean())
         if share is not None and level > 0:
@@ -150,7 +147,7 @@ def _without_light(evidence: Evidence) -> list[F64]:
 
 
 def _of_stacks(stacks: Iterable[Stack], evidence: Evidence) -> list[F64]:
-    every = (_of_stack(stack, evidence) for stack in filter(_is_enough, stacks))
+    every = (_of_stack(evidence, stack) for stack in filter(_is_enough, stacks))
     return [sums for sums in every if sums is not None]
 
 
@@ -158,12 +155,8 @@ def _is_enough(stack: Stack) -> bool:
     return len(stack.adu) >= 2
 
 
-def _of_stack(stack: Stack, evidence: Evidence) -> F64 | None:
-    own = "photon transfer of a stack", *stack.key
-    return evidence.once(*own, make=lambda: _products_of(stack, evidence))
-
-
-def _products_of(stack: Stack, evidence: Evidence) -> F64 | None:
+@once
+def _of_stack(evidence: Evidence, stack: Stack) -> F64 | None:
     good = evidence.good & (stack.adu < evidence.saturation_adu).all(axis=0)
     pixels = np.count_nonzero(good)
     if pixels < MIN_PIXELS:

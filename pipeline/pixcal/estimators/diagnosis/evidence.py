@@ -2,8 +2,8 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any, TypeVar, cast
+from functools import cached_property, wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 T = TypeVar("T")
+P = ParamSpec("P")
 FreeFrames = tuple[F64, F64]  # parameters (t, 5) of independent frames, and covariance
 
 STRIPE = 4  # rows of a stripe of `FringeEvidence.halves`: few neighbours lie in different halves
@@ -233,6 +234,26 @@ class Evidence:
         return tuple(
             sorted((s for s in self.stacks if s.kind == kind), key=lambda s: (s.exptime_s, s.step))
         )
+
+
+def once(make: Callable[Concatenate[Evidence, P], T]) -> Callable[Concatenate[Evidence, P], T]:
+    """Decorate a function of an evidence, whose results are to be kept in it (`Evidence.once`).
+
+    Further arguments: hashable ones, stacks of the evidence, and arrays.
+    """
+    name = f"{make.__module__}.{make.__qualname__}"
+
+    def key(given: Any) -> Any:
+        if isinstance(given, np.ndarray):
+            return given.shape, given.tobytes()
+        return given.key if isinstance(given, Stack) else given
+
+    @wraps(make)
+    def kept(evidence: Evidence, /, *given: P.args, **named: P.kwargs) -> T:
+        keys = map(key, (*given, *named.items()))
+        return evidence.once(name, *keys, make=lambda: make(evidence, *given, **named))
+
+    return kept
 
 
 def stripes(shape: tuple[int, ...]) -> Mask:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence, once
 from pixcal.estimators.frame_series.series import MEDIAN, FrameSeries, mode_variance, motion_series
 from pixcal.estimators.frame_series.spectral_line import Line, cleared_of_line
 from pixcal.kernels.robust import robust_sigma
@@ -48,12 +48,9 @@ class Motion:
     crossed: bool  # whether there are fringes of different directions
 
 
+@once
 def motion_of(evidence: Evidence) -> Motion | None:
     """Motion of the fringes in all sets with enough frames; None without any."""
-    return evidence.once("motion of the fringes", make=lambda: _motion_of(evidence))
-
-
-def _motion_of(evidence: Evidence) -> Motion | None:
     found = [s for s in map(motion_series, evidence.fringes.values()) if s is not None]
     if not found:
         return None

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, stripes
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, once, stripes
 from pixcal.estimators.frame_series.series import FrameSeries, assemble, light_series, mode_variance
 from pixcal.estimators.frame_series.spectral_line import Line, cleared_of_line
 from pixcal.estimators.frame_series.variance_components import Modes
@@ -125,12 +125,9 @@ def separate_powers(evidence: Evidence) -> float:
     return float(np.sqrt(of_contrast / max(len(evidence.fringes), 1)))
 
 
+@once
 def light_of(evidence: Evidence) -> FrameLight | None:
     """Light of all sets with enough frames; None without any."""
-    return evidence.once("light of the frames", make=lambda: _light_of(evidence))
-
-
-def _light_of(evidence: Evidence) -> FrameLight | None:
     found = {f.name: light_series(f) for f in evidence.fringes.values()}
     sets = [s.cleaned() for s in found.values() if s is not None]
     if not sets:

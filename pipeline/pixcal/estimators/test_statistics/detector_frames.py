@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack, once
 from pixcal.estimators.test_statistics import Curve, family, statistic
 from pixcal.estimators.test_statistics.look import ADJACENT, STEPS, neighbour_sums
 from pixcal.kernels.line_means import without_line_means
@@ -23,12 +23,9 @@ WILD = 8.0
 BANDS = 4  # of the spectrum, from the size of the window to two pixels
 
 
+@once
 def differences(evidence: Evidence, stack: Stack) -> F32:
     """Differences (t, y, x) of frames 0 and 1, 2 and 3, ..., over their noise; outliers zero."""
-    return evidence.once("differences", *stack.key, make=lambda: _differences(evidence, stack))
-
-
-def _differences(evidence: Evidence, stack: Stack) -> F32:
     light = stack.adu - evidence.bias.astype(np.float32)
     good = evidence.good
     if stack.kind == "flat":
@@ -48,11 +45,12 @@ def _differences(evidence: Evidence, stack: Stack) -> F32:
 def _without_gradient(steps: F32, evidence: Evidence) -> F32:
     """Differences (t, y, x) of flats without changes of the light's gradient."""
     # The gradient of the sky rotates from frame to frame; light is no part of the detector.
-    basis = evidence.once("gradient of the light", make=lambda: _gradient(evidence))
+    basis = _gradient(evidence)
     flat = steps.reshape(len(steps), -1)
     return np.asarray((flat - flat @ basis @ basis.T).reshape(steps.shape))
 
 
+@once
 def _gradient(evidence: Evidence) -> F32:
     """Light and its gradient, orthonormal (pixel, 3)."""
     ny, nx = evidence.good.shape
@@ -72,15 +70,12 @@ def repeated(evidence: Evidence, kind: str) -> tuple[Stack, ...]:
 
 def _correlation(evidence: Evidence, stacks: Sequence[Stack]) -> F64:
     """Correlation (step,) of pixels by rows and columns; lines have their own statistic."""
-
-    def sums(stack: Stack) -> F64:
-        own = "neighbours", *stack.key
-        return evidence.once(*own, make=lambda: _neighbour_sums(evidence, stack))
-
-    total, pairs, square, count = sum(map(sums, stacks), np.zeros((4, len(STEPS))))
+    sums = (_neighbour_sums(evidence, stack) for stack in stacks)
+    total, pairs, square, count = sum(sums, np.zeros((4, len(STEPS))))
     return np.asarray(total / np.maximum(pairs, 1) / (square / np.maximum(count, 1)))
 
 
+@once
 def _neighbour_sums(evidence: Evidence, stack: Stack) -> F64:
     """Sums (4, step): of products with neighbours, their number; of squares, and theirs."""
     good = evidence.good

@@ -142,7 +142,7 @@ def first_flats(evidence: Evidence) -> Curve | None:
     if flicker(evidence)[1] < FLICKER_KNOWN or min(light.mean() for light in every) <= 0:
         return None
     steps = np.array([float(light[0] / light[1:].mean()) - 1 for light in every])
-    before = np.array([level_before(s, evidence) for s in stacks])
+    before = np.array([level_before(evidence, s) for s in stacks])
     lacking = 1 - before / [light.mean() for light in every]
     return Curve.numbered([steps.mean(), steps @ lacking / (lacking @ lacking)])
 
