@@ -11,7 +11,6 @@ from pixcal.kernels.photon_transfer import (
     LAGS,
     N_BINS,
     SHARED,
-    WithNeighbours,
     add_neighbours,
     bin_pairs,
     pair_statistics,
@@ -59,11 +58,11 @@ def measure_shared(
     dark = pairs(np.zeros_like(scenes[0]))
     variance = dark[:, 2].sum() / dark[:, 0].sum()
     lit = np.asarray(sum(pairs(scene) for scene in scenes))
-    shared = add_neighbours(lit, dark) if neighbours else WithNeighbours(lit[:, :3])
+    sums, lags, common = add_neighbours(lit, dark) if neighbours else (lit[:, :3], {}, 0.0)
     error = variance * np.sqrt(2 / dark[:, 0].sum())
-    fitted = fit_gain(shared.sums, (variance, error), np.inf, common=shared.error)
+    fitted = fit_gain(sums, (variance, error), np.inf, common=common)
     assert fitted is not None
-    return fitted, shared.lags
+    return fitted, lags
 
 
 def flats(shape: tuple[int, int], levels: tuple[float, ...]) -> list[F64]:
@@ -143,8 +142,8 @@ def test_noise_shared_below_notice_is_in_the_gain_or_in_its_error(
         return bin_pairs(pair_statistics(first, second, gain=1.5, read_noise=3.0, quantum=1.0))
 
     for _ in range(12):
-        shared = add_neighbours(pairs(3e4) + pairs(3e4), pairs(0.0))
-        fitted = fit_gain(shared.sums, (READ_ADU**2, 0.1), np.inf, common=shared.error)
+        sums, _, common = add_neighbours(pairs(3e4) + pairs(3e4), pairs(0.0))
+        fitted = fit_gain(sums, (READ_ADU**2, 0.1), np.inf, common=common)
         assert fitted is not None
         off.append(fitted.gain / GAIN - 1)
         pulls.append((fitted.gain - GAIN) / fitted.error)
@@ -166,9 +165,9 @@ def test_a_lamp_that_flickers_by_rows_is_no_charge_that_neighbours_share() -> No
         )
 
     lit = np.asarray(sum(pairs(level) for level in (1e4, 2e4, 4e4)))
-    found = add_neighbours(lit, pairs(0.0))
-    assert list(found.lags) == [(0, 0)]
-    assert (found.sums == lit[:, :3]).all()
+    sums, lags, _ = add_neighbours(lit, pairs(0.0))
+    assert list(lags) == [(0, 0)]
+    assert (sums == lit[:, :3]).all()
 
 
 @pytest.mark.parametrize("rows", [0.0, 3.0])

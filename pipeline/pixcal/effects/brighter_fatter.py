@@ -115,13 +115,11 @@ class BrighterFatter(Effect):
         significance = float(size / np.sqrt(variance))
         why = "covariance of neighbours that rises with the square of the level"
         if evidence.fringes:
-            free = boundaries_beside(evidence, falloff)
-            if abs(free.shift - size) < _DISAGREE * np.sqrt(variance + free.variance):
-                both = boundaries_beside(evidence, falloff, (size, variance))
-                size, variance = both.shift, both.variance
-                # Chi-square has a degree of freedom for each axis.
-                beyond = max(both.gain - both.axes + 1, 0.0)
-                significance = float(np.copysign(np.sqrt(beyond), size))
+            shift, of_shift, _ = boundaries_beside(evidence, falloff)
+            if abs(shift - size) < _DISAGREE * np.sqrt(variance + of_shift):
+                known = size, variance
+                size, variance, gain = boundaries_beside(evidence, falloff, known)
+                significance = float(np.copysign(np.sqrt(max(gain, 0.0)), size))
                 why += ", and a second harmonic of the fringes that depends on their direction"
         along_y = 1.0
         if not evidence.fringes:

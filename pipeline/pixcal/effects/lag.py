@@ -227,13 +227,14 @@ class Lag(Effect):
             found = lag_of_flats(evidence)
             if found is None:
                 return None
-            before = "charge of the frame before" if found.carried else "a clear"
-            if not found.carried and all(len(s.adu) < _TELL_LAMP for s in evidence.ladder):
+            share, error, carried = found
+            before = "charge of the frame before" if carried else "a clear"
+            if not carried and all(len(s.adu) < _TELL_LAMP for s in evidence.ladder):
                 before += "; a lamp that warms up does the same to pairs: take three flats a level"
             return Estimate(
-                cls(float(np.clip(found.share, 0, 0.5)), 0.0, 0.0, carried=found.carried),
-                {"share": found.error},
-                found.share / found.error,
+                cls(float(np.clip(share, 0, 0.5)), 0.0, 0.0, carried=carried),
+                {"share": error},
+                share / error,
                 f"the first flat of each level is fainter, as after {before}",
             )
         fringes = tuple(evidence.fringes.values())

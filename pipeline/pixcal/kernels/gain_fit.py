@@ -80,7 +80,7 @@ def fit_gain(
 
     Parameters
     ----------
-    sums : (N_BINS, 3) of `photon_transfer.WithNeighbours`
+    sums : (N_BINS, 3) of `photon_transfer.add_neighbours`
     read_variance : variance at level zero and its error, ADU²
     highest : highest level to use, ADU
     level_error : common error of all levels, ADU, as the bias drifts

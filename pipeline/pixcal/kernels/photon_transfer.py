@@ -13,7 +13,6 @@ brighter-fatter. The missing noise is in the covariances of neighbours, which ar
 """
 
 import math
-from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
@@ -94,18 +93,17 @@ def _add_blocks(
                 out[block, 3 + lag] = np.float32(0.5) * product / pairs + variance / n
 
 
-@kernel()
-def _ratios(first: F32, second: F32, per_level: float, read_variance: float, out: F32) -> None:
-    # Differences over their expected noise, by the pixel's place in its block and by block.
-    slope, floor = np.float32(per_level), np.float32(read_variance)
-    half, zero = np.float32(0.5), np.float32(0)
-    columns = -(-first.shape[1] // BLOCK)
-    for y in range(first.shape[0]):
-        for x in range(first.shape[1]):
-            a, b = first[y, x], second[y, x]
-            noise = np.sqrt(max(half * (a + b), zero) * slope + floor)
-            at, block = y % BLOCK * BLOCK + x % BLOCK, y // BLOCK * columns + x // BLOCK
-            out[at, block] = (a - b) / noise
+def _ratios(first: F32, second: F32, per_level: float, read_variance: float) -> F32:
+    """Differences over their expected noise (place in a block, block); NaN beyond the frame."""
+    level = np.maximum(np.float32(0.5) * (first + second), np.float32(0))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = (first - second) / np.sqrt(
+            level * np.float32(per_level) + np.float32(read_variance)
+        )
+    beyond = [(0, -n % BLOCK) for n in ratio.shape]
+    padded = np.pad(ratio, beyond, constant_values=np.nan)
+    blocks = padded.reshape(padded.shape[0] // BLOCK, BLOCK, -1, BLOCK).transpose(1, 3, 0, 2)
+    return np.ascontiguousarray(blocks.reshape(BLOCK * BLOCK, -1))
 
 
 def pair_statistics(
@@ -125,15 +123,12 @@ def pair_statistics(
         level changes within a block
     quantum : step of the samples, ADU
     """
-    rows, columns = (-(-n // BLOCK) for n in first.shape)
-    blocks = rows * columns
     pair = np.ascontiguousarray(first, np.float32), np.ascontiguousarray(second, np.float32)
-    ratios = np.full((BLOCK * BLOCK, blocks), np.nan, np.float32)
-    _ratios(*pair, 1 / gain, read_noise**2, ratios)
+    ratios = _ratios(*pair, 1 / gain, read_noise**2)
     few = np.isfinite(ratios).sum(axis=0) < _MIN_PIXELS
     centre, spread = median_and_deviation(ratios)
     centre[few] = np.nan
-    out = np.zeros((blocks, COLUMNS))
+    out = np.zeros((len(few), COLUMNS))
     spread *= np.float32(SIGMA_OF_MAD)
     scratch = np.empty((2, (BLOCK + REACH) * (BLOCK + REACH + 1)), np.float32)
     _add_blocks(*pair, 1 / gain, read_noise**2, quantum, centre, spread, LAGS, *scratch, out)
@@ -153,79 +148,60 @@ def bin_pairs(blocks: F64) -> F64:
     return np.stack(list(sums), axis=1).astype(float)
 
 
-@dataclass(frozen=True)
-class WithNeighbours:
-    """Noise of pixels, covariances of neighbours included."""
-
-    sums: F64  # (N_BINS, 3) degrees of freedom, level and variance, as of `bin_pairs`
-    lags: dict[tuple[int, int], float] = field(default_factory=dict)  # (y, x), and significance
-    # relative error of the shot noise, and so of the gain, common to all levels: neighbours may
-    # share more or less than was added
-    error: float = 0.0
+# Prior of the covariances of neighbours over the shot noise: normal numbers that fall off with a
+# power of the distance. All of a kernel have one size in common, and each differs from it by `_OWN`
+# times as much. The size is zero by this chance, or any from the smallest (or from the error, if
+# that is less) to the largest.
+_NOTHING, _SMALLEST, _LARGEST, _OWN = 0.3, 2e-3, 0.1, 0.3
+_POWERS = (2.0, 3.0, 6.0)  # of charge that pushes (2, 3), of capacitance
 
 
-@dataclass(frozen=True)
-class SharedNoise:
-    """Prior of the covariances of neighbours over the shot noise.
+def _shared_noise(shares: F64, error: float) -> tuple[F64, float]:
+    """Weight of each of the shares in the noise that all share, and its variance.
 
-    Normal numbers that fall off with a power of the distance. Their size is ``nothing``, by that
-    chance, or any from the ``smallest``, or from the error if that is less, to the ``largest``.
-    All of a kernel have one size in common; each differs from it by ``own`` times as much.
+    ``shares``: covariances (12,) at `LAGS` over the shot noise, each with this error. The average
+    over sizes and powers, each with the weight of its evidence, as of the gain (`gain_fit`).
     """
-
-    nothing: float = 0.3
-    smallest: float = 2e-3
-    largest: float = 0.1
-    powers: tuple[float, ...] = (2.0, 3.0, 6.0)  # of charge that pushes (2, 3), of capacitance
-    own: float = 0.3
-
-    def total(self, shares: F64, error: float) -> tuple[F64, float]:
-        """Weight of each of the shares in the noise that all share, and its variance.
-
-        ``shares``: covariances (12,) at `LAGS` over the shot noise, each with this error. The
-        average over sizes and powers, each with the weight of its evidence, as of the gain
-        (`gain_fit`).
-        """
-        count = len(LAGS)
-        # The mean subtracted from a block is of shared noise, and so larger.
-        seen, twice = np.eye(count) - 2 / BLOCK**2, 2 * (1 + 1 / BLOCK**2)
-        logs, weights, variances = [0.0], [np.zeros(count)], [0.0]
-        sizes = np.geomspace(min(error, self.smallest), self.largest, _SIZES)
-        for power, size in product(self.powers, sizes):
-            falling = size * np.hypot(*LAGS.T) ** -power
-            before = np.outer(falling, falling) + np.diag((self.own * falling) ** 2)
-            spread = seen @ before @ seen.T / error**2 + np.eye(count)
-            learnt = before @ seen.T @ np.linalg.inv(spread) / error**2
-            unlikely = shares @ (np.linalg.solve(spread, shares) - shares) / error**2
-            logs.append(-(unlikely + np.linalg.slogdet(spread)[1]) / 2)
-            weights.append(twice * learnt.sum(axis=0))
-            variances.append(twice**2 * float((before - learnt @ seen @ before).sum()))
-        some = (1 - self.nothing) / (len(logs) - 1)
-        chance = np.exp(np.array(logs) - max(logs)) * [self.nothing, *[some] * (len(logs) - 1)]
-        chance /= chance.sum()
-        weight = chance @ np.array(weights)
-        apart = (np.array(weights) - weight) @ shares
-        return weight, float(chance @ (np.array(variances) + apart**2))
+    count = len(LAGS)
+    # The mean subtracted from a block is of shared noise, and so larger.
+    seen, twice = np.eye(count) - 2 / BLOCK**2, 2 * (1 + 1 / BLOCK**2)
+    logs, weights, variances = [0.0], [np.zeros(count)], [0.0]
+    sizes = np.geomspace(min(error, _SMALLEST), _LARGEST, _SIZES)
+    for power, size in product(_POWERS, sizes):
+        falling = size * np.hypot(*LAGS.T) ** -power
+        before = np.outer(falling, falling) + np.diag((_OWN * falling) ** 2)
+        spread = seen @ before @ seen.T / error**2 + np.eye(count)
+        learnt = before @ seen.T @ np.linalg.inv(spread) / error**2
+        unlikely = shares @ (np.linalg.solve(spread, shares) - shares) / error**2
+        logs.append(-(unlikely + np.linalg.slogdet(spread)[1]) / 2)
+        weights.append(twice * learnt.sum(axis=0))
+        variances.append(twice**2 * float((before - learnt @ seen @ before).sum()))
+    some = (1 - _NOTHING) / (len(logs) - 1)
+    chance = np.exp(np.array(logs) - max(logs)) * [_NOTHING, *[some] * (len(logs) - 1)]
+    chance /= chance.sum()
+    weight = chance @ np.array(weights)
+    apart = (np.array(weights) - weight) @ shares
+    return weight, float(chance @ (np.array(variances) + apart**2))
 
 
-SHARED_NOISE = SharedNoise()
-
-
-def add_neighbours(lit: F64, dark: F64, expected: SharedNoise = SHARED_NOISE) -> WithNeighbours:
+def add_neighbours(lit: F64, dark: F64) -> tuple[F64, dict[tuple[int, int], float], float]:
     """Noise of pixels with the covariances of neighbours added.
 
     Covariances beyond those without light are added to the variance of the pixel itself, twice for
     the two neighbours. Each is too noisy alone: all lags together give their posterior weights. The
-    noise of the added covariances is in the degrees of freedom. Lags that count for more than half
-    come with their significance: one below `SHARED` may be due to chance. The lag
-    is (0, 0) alone where all pixels share noise. ``lit`` and ``dark`` are from `bin_pairs`, of
-    flats and of frames without light.
+    noise of the added covariances is in the degrees of freedom.
+
+    ``lit`` and ``dark`` are from `bin_pairs`, of flats and of frames without light. Returns sums
+    (N_BINS, 3) of degrees of freedom, level and variance; the lags (y, x) that count for more than
+    half with their significance, which may be due to chance below `SHARED`, or (0, 0) alone where
+    all pixels share noise; and the relative error of the shot noise, and so of the gain, common to
+    all levels, as neighbours may share more or less than was added.
     """
     sums = lit[:, :3].copy()
     used = np.flatnonzero((lit[:, 0] > 0) & (lit[:, 1] > 0))
     without = dark.sum(axis=0)
     if not len(used) or not without[0] > 0:
-        return WithNeighbours(sums)
+        return sums, {}, 0.0
     none = without / without[0]
     dof = lit[used, 0]
     level, variance = (lit[used, 1:3] / dof[:, None]).T
@@ -237,11 +213,11 @@ def add_neighbours(lit: F64, dark: F64, expected: SharedNoise = SHARED_NOISE) ->
     )
     shared, shot = weight @ beyond, float(weight @ (variance - none[2]))
     if shared.min() > _EVERYWHERE * shared.max() and shared.min() > SHARED * error:
-        return WithNeighbours(sums, {(0, 0): float(shared.min() / error)})
+        return sums, {(0, 0): float(shared.min() / error)}, 0.0
     if not shot > 0:
-        return WithNeighbours(sums)
+        return sums, {}, 0.0
     noise = error / shot
-    counted, unknown = expected.total(shared / shot, noise / _PAIRED)
+    counted, unknown = _shared_noise(shared / shot, noise / _PAIRED)
     of_added = float((counted**2).sum())
     sums[used, 2] += dof * (beyond @ counted)
     sums[used] /= 1 + of_added / 2
@@ -251,4 +227,4 @@ def add_neighbours(lit: F64, dark: F64, expected: SharedNoise = SHARED_NOISE) ->
         for (y, x), e, times in zip(LAGS.tolist(), errors, counted, strict=True)
         if times > 1
     }
-    return WithNeighbours(sums, lags, math.sqrt(max(unknown - of_added * noise**2, 0.0)))
+    return sums, lags, math.sqrt(max(unknown - of_added * noise**2, 0.0))

@@ -110,21 +110,11 @@ def without_trend(values: F64, good: Mask) -> F64:
     return relative - trend
 
 
-@dataclass(frozen=True)
-class Spectrogram:
-    """Spectrum of a map along its rows or its columns."""
+def spectrogram(a: F64, b: F64, *, axis: int) -> tuple[F64, F64, float]:
+    """Spectrum of the mean of two averages (y, x), as for `nonuniformity`, along an axis (1: rows).
 
-    frequency: F64  # (n,) cycles per pixel, zero left out
-    # (n,) root of the mean power of all rows (columns); white noise of rms s gives s everywhere
-    amplitude: F64
-    noise: float  # the same of the noise in the map
-
-
-def spectrogram(a: F64, b: F64, *, axis: int) -> Spectrogram:
-    """Spectrum of the mean of two averages along an axis (1: along the rows), and its noise.
-
-    ``a, b``: (y, x) as for `nonuniformity`. ``axis``: {0, 1} along which the Fourier transform is
-    taken.
+    Returns the frequencies (n,), cycles per pixel without zero; the roots (n,) of the mean power of
+    all rows or columns, which white noise of rms s makes s everywhere; the same of the map's noise.
     """
     n = a.shape[axis]
     scale = 1 / math.sqrt(n)
@@ -132,7 +122,7 @@ def spectrogram(a: F64, b: F64, *, axis: int) -> Spectrogram:
     noise = np.abs(np.fft.rfft((a - b) / 2, axis=axis) * scale) ** 2
     mean = power.mean(axis=1 - axis)[1:]
     frequency: F64 = np.fft.rfftfreq(n)[1:].astype(float)
-    return Spectrogram(frequency, np.sqrt(mean), math.sqrt(noise.mean()))
+    return frequency, np.sqrt(mean), math.sqrt(noise.mean())
 
 
 def transfer_points(sums: F64, most: int = 60) -> F64:

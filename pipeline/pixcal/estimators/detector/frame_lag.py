@@ -303,20 +303,12 @@ def _freely(found: CommonLag, information: F64, right: F64) -> CommonLag:
     return replace(found, share=total, share_error=error, later=tuple(map(float, kept / total)))
 
 
-@dataclass(frozen=True)
-class LagOfFlats:
-    """Lag from the first frames of flats."""
-
-    share: float  # that stays behind
-    error: float
-    carried: float  # 1 if the frame before a series adds its charge, 0 after a clear
-
-
-def lag_of_flats(evidence: Evidence) -> LagOfFlats | None:
-    """Share by which the first frame of each series of flats is fainter than the rest, or None.
+def lag_of_flats(evidence: Evidence) -> tuple[float, float, float] | None:
+    """Share by which the first frame of each series of flats is fainter than the rest, its error.
 
     It lacks a share of its own level, and gains one of the frame before unless the detector was
-    cleared: the levels decide which.
+    cleared: the levels decide which. The third number is 1 if that charge was added, 0 after a
+    clear. None if the flats do not constrain it.
     """
     found = [(s, f) for s in evidence.stacks if (f := _first_frame(s, evidence)) is not None]
     if len(found) <= 2:
@@ -334,7 +326,7 @@ def lag_of_flats(evidence: Evidence) -> LagOfFlats | None:
     carried, (share, of_share, _) = min(
         zip((0.0, known), fits, strict=True), key=lambda one: one[1][2]
     )
-    return LagOfFlats(share, of_share, carried)
+    return share, of_share, carried
 
 
 def _fit_steps(

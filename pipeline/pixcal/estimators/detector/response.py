@@ -194,23 +194,14 @@ def _boundary_sums(evidence: Evidence) -> list[tuple[F64, F64]]:
     ]
 
 
-@dataclass(frozen=True)
-class Beside:
-    """Moving boundaries fitted together with a nonlinear response."""
-
-    # shift, variance: per electron, px; mean of boundaries between columns and between rows
-    shift: float
-    variance: float
-    gain: float  # chi-square that they explain beyond the response
-    axes: int  # number of axes with a shift of their own: one or two
-
-
 def boundaries_beside(
     evidence: Evidence, falloff_px: float, known: tuple[float, float] | None = None
-) -> Beside:
+) -> tuple[float, float, float]:
     """Boundaries of a falloff (of `FALLOFFS_PX`), fitted with a free response.
 
-    ``known``: mean shift per electron (px) and its variance, from the noise of neighbours.
+    ``known``: mean shift per electron (px) and its variance, from the noise of neighbours. Returns
+    both of the mean of boundaries between columns and between rows, and the chi-square that they
+    explain beyond the response, less one for a second axis, which has a shift of its own.
     """
     sums = _boundary_sums(evidence)
     normal, right = _joint(sums, POWERS + FALLOFFS_PX.index(falloff_px))
@@ -223,7 +214,7 @@ def boundaries_beside(
     inverse, only = inverse_normal(normal), inverse_normal(normal[:POWERS, :POWERS])
     gain = float(right @ inverse @ right - right[:POWERS] @ only @ right[:POWERS])
     size, variance = float(mean @ inverse @ right), float(mean @ inverse @ mean)
-    return Beside(UNIT * size, UNIT**2 * variance, max(gain, 0.0), len(sums))
+    return UNIT * size, UNIT**2 * variance, max(gain, 0.0) - len(sums) + 1
 
 
 def _joint(sums: Sequence[tuple[F64, F64]], at: int) -> tuple[F64, F64]:

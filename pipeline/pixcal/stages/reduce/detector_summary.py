@@ -112,7 +112,7 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     levels, usable, nearly = _exposure_steps(tables, job)
     sums = pair_sums(folder, job)
     # Full pixels saturate the flats even if the converter does not saturate.
-    points = transfer_points(add_neighbours(sums[1], sums[0]).sums)
+    points = transfer_points(add_neighbours(sums[1], sums[0])[0])
     well = saturation(points)
     rate = dark_rate(folder, job)
     times = np.array([group.exptime for group in job.flat])
@@ -206,25 +206,25 @@ def _gain(
     # Noise below half a code is rounded up or down depending on its level.
     smooth = lit[:, 2:3] > _SMOOTH * job.quantum**2 * lit[:, :1]
     lit = np.where(smooth, lit, 0.0) if smooth.any() else lit
-    shared = add_neighbours(lit, dark)
+    shared, lags, common = add_neighbours(lit, dark)
     fitted = fit_gain(
-        shared.sums,
+        shared,
         (variance, 2 * noise * error),
         highest,
         level_error=wander,
         uneven=uneven,
-        common=shared.error,
+        common=common,
         straight=len(job.flat) < LADDER,
         without_dark=job.without_dark,
     )
     if fitted is None or not fitted.error < _GAIN_ERROR * fitted.gain:
         return None
-    everywhere = (0, 0) in shared.lags
+    everywhere = (0, 0) in lags
     at_zero, of_zero = fitted.read_variance
     return replace(
         fitted,
         read_variance=(at_zero + lost, of_zero),
-        neighbours={} if everywhere else shared.lags,
+        neighbours={} if everywhere else lags,
         uneven=everywhere,
     )
 

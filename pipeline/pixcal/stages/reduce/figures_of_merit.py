@@ -210,9 +210,8 @@ def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: 
     mean = np.where(good, halves.mean(axis=0), np.nan)
     curves[name] = {"unit": unit}
     for axis, along in ((1, "rows"), (0, "columns")):
-        seen = spectrogram(*pair, axis=axis)
-        curves[name][along] = _listed((seen.frequency, seen.amplitude), ("frequency", "amplitude"))
-        curves[name][along]["noise"] = seen.noise
+        *spectrum, noise = spectrogram(*pair, axis=axis)
+        curves[name][along] = _listed(spectrum, ("frequency", "amplitude")) | {"noise": noise}
         count = good.sum(axis=axis)
         filled = count > 0
         means = np.nansum(mean, axis=axis)[filled] / count[filled]
