@@ -226,7 +226,7 @@ def _polynomial(evidence: Evidence) -> _Polynomial | None:
         part = central_crop(evidence)
         noise = shared_charge(part, shifts)
         known = None if noise is None else (noise.size, noise.variance)
-        sizes, covariance = fit_response(part, level, 2, shifts, known)
+        sizes, covariance = fit_response(part, level, shifts, known)
         why = "second and third harmonic of the fringes in the residuals"
     elif levels is not None and by_levels:
         sizes, covariance = levels

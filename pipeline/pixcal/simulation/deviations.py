@@ -18,13 +18,10 @@ from scipy.ndimage import median_filter
 
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import (
-    NO_SAMPLE,
     Evidence,
     FringeEvidence,
     Stack,
-    free_frames,
 )
-from pixcal.estimators.fringe_fit.tile_fit import Coding
 from pixcal.estimators.maps.structure import flattened, without_outliers
 from pixcal.estimators.test_statistics.look import FringeSetData, neighbour_sums
 from pixcal.kernels.robust import SIGMA_OF_MAD, robust_sigma
@@ -248,16 +245,7 @@ class SetDeviations(_Deviations):
             # Residual change after the fit of the pixels.
             beside = found.model.copy()
             beside[:, good] += changed - found.g.astype(np.float32) @ share
-            (free, _), *_ = free_frames(
-                beside,
-                Coding(1.0, 0.0, NO_SAMPLE),
-                found.g,
-                found.dk,
-                found.theta,
-                found.read_variance,
-                found.shot_factor,
-                good,
-            )
+            (free, _), *_ = found.free_of(beside)
             own = np.hstack([found.g, found.dk])
             change["frames"] = self._series(free) - self._series(own)
         if "maps" in names:

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.kernels.crosstalk import Coupling
 from pixcal.model.arrays import F32, F64, Indices
 
 Place = tuple[int, int]
@@ -45,11 +44,6 @@ class PixelClasses:
         row, column = (y + self.first[0]) % self.rows, (x + self.first[1]) % self.columns
         return np.asarray(row * self.columns + column)
 
-    def shifted(self, number: int, by: Place) -> int:
-        """Class of the pixel ``by`` rows and columns from one of class ``number``."""
-        row, column = divmod(number, self.columns)
-        return (row + by[0]) % self.rows * self.columns + (column + by[1]) % self.columns
-
     def divisors(self) -> list["PixelClasses"]:
         """Classes of all periods that divide this one, the shortest first."""
         found = [
@@ -64,11 +58,6 @@ class PixelClasses:
         """Own class of each class of a finer period, which this one divides."""
         row, column = np.divmod(np.arange(finer.count), finer.columns)
         return np.asarray(row % self.rows * self.columns + column % self.columns)
-
-    def coupling(self, number: int, step: Place, share: float) -> Coupling:
-        """Coupling of the pixels of a class with those a step away."""
-        row, column = divmod(number, self.columns)
-        return Coupling(*step, share, self.rows, row, self.columns, column)
 
 
 def periods(shape: Place) -> list[Place]:

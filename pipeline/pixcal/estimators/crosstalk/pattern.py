@@ -205,25 +205,6 @@ def without(values: F64, modes: F64) -> F64:
     return np.asarray(values - (values @ modes.T) @ modes)
 
 
-def _slope_at(
-    k: tuple[float, float], couplings: Sequence[Coupling], good: Mask, first: tuple[int, int]
-) -> C128:
-    shape = (good.shape[0], good.shape[1])
-    light = 1 - outflow(couplings, shape, first)
-    fringe = light.astype(complex)
-    turns = [np.exp(-1j * (k[0] * c.dx + k[1] * c.dy)) for c in couplings]
-    for c, turn in zip(couplings, turns, strict=True):
-        there = c.places(shape, first)[1]
-        light[there] += c.share
-        fringe[there] += c.share * turn
-    slope = np.zeros((len(couplings), *shape), np.complex128)
-    for own, c, turn in zip(slope, couplings, turns, strict=True):
-        here, there = c.places(shape, first)
-        own[there] += turn / fringe[there] - 1 / light[there]
-        own[here] -= 1 / fringe[here] - 1 / light[here]
-    return np.asarray(slope[:, good])
-
-
 def response_slopes(
     k: tuple[float, float], couplings: Sequence[Coupling], classes: PixelClasses
 ) -> C128:
@@ -231,6 +212,17 @@ def response_slopes(
     reach = max(max(abs(c.dy), abs(c.dx)) for c in couplings)
     rows, columns = (period * -(-reach // period) for period in (classes.rows, classes.columns))
     shape = (2 * rows + classes.rows, 2 * columns + classes.columns)
-    inside = np.zeros(shape, bool)
-    inside[rows : rows + classes.rows, columns : columns + classes.columns] = True
-    return _slope_at(k, couplings, inside, (0, 0))
+    light = 1 - outflow(couplings, shape, (0, 0))
+    fringe = light.astype(complex)
+    turns = [np.exp(-1j * (k[0] * c.dx + k[1] * c.dy)) for c in couplings]
+    for c, turn in zip(couplings, turns, strict=True):
+        there = c.places(shape, (0, 0))[1]
+        light[there] += c.share
+        fringe[there] += c.share * turn
+    slope = np.zeros((len(couplings), *shape), np.complex128)
+    for own, c, turn in zip(slope, couplings, turns, strict=True):
+        here, there = c.places(shape, (0, 0))
+        own[there] += turn / fringe[there] - 1 / light[there]
+        own[here] -= 1 / fringe[here] - 1 / light[here]
+    inside = slope[:, rows : rows + classes.rows, columns : columns + classes.columns]
+    return np.asarray(inside.reshape(len(slope), -1))

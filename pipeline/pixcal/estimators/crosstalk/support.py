@@ -177,6 +177,8 @@ def _greedy(normal: F64, right: F64, directions: F64) -> tuple[F64, float]:
 
 def coupling_of(classes: PixelClasses, number: int, back: int, step: Place) -> Coupling:
     """What a class gives over a step, or gets back; without its share."""
-    if not back:
-        return classes.coupling(number, step, 0.0)
-    return classes.coupling(classes.shifted(number, step), (-step[0], -step[1]), 0.0)
+    (dy, dx), (row, column) = step, divmod(number, classes.columns)
+    if back:
+        # From the partner, which is of another class.
+        row, column, dy, dx = (row + dy) % classes.rows, (column + dx) % classes.columns, -dy, -dx
+    return Coupling(dy, dx, 0.0, classes.rows, row, classes.columns, column)

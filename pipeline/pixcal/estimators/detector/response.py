@@ -35,32 +35,27 @@ MAX_LOG_ERROR = 0.5  # largest error of the logarithm of a measured falloff
 
 
 def fit_response(
-    evidence: Evidence,
-    level_e: float,
-    powers: int,
-    shifts: F64,
-    known_shift: tuple[float, float] | None = None,
+    evidence: Evidence, level_e: float, shifts: F64, known: tuple[float, float] | None = None
 ) -> tuple[F64, F64]:
-    """Coefficients c_1, c_2, ... and the shift per electron (px); their covariance.
+    """Coefficients c_1, c_2 and the shift per electron (px); their covariance.
 
-    level_e, powers : terms of the relative response 1 + c_1 u + c_2 u² + ..., u = 1 at this level
-    shifts : `pixcal.kernels.boundaries.boundary_shifts`, of size one
-    known_shift : the shift and its variance from the noise of neighbours
+    The relative response is 1 + c_1 u + c_2 u², u = 1 at ``level_e``. ``shifts``:
+    `pixcal.kernels.boundaries.boundary_shifts`, of size one. ``known``: the shift and its variance
+    from the noise of neighbours.
     """
     prior = None
-    if known_shift is not None:
-        value, information = np.zeros(powers + 1), np.zeros(powers + 1)
-        value[-1], information[-1] = known_shift[0] / UNIT, UNIT**2 / known_shift[1]
+    if known is not None:
+        value, information = np.zeros((2, 3))
+        value[-1], information[-1] = known[0] / UNIT, UNIT**2 / known[1]
         prior = value, information
     sizes, covariance, _ = fit_distortions(
         tuple(evidence.fringes.values()),
         _signal_of(evidence, level_e, [UNIT * shifts]),
-        powers + 1,
+        3,
         margin=REACH,
         prior=prior,
     )
-    scale = np.ones(powers + 1)
-    scale[-1] = UNIT
+    scale = np.array([1.0, 1.0, UNIT])
     return sizes * scale, covariance * np.outer(scale, scale)
 
 

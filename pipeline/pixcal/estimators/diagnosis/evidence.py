@@ -99,17 +99,12 @@ class FringeEvidence:
         They are stored in a new evidence, and recomputed for a subset of its frames or pixels.
         """
         codes = np.where(np.isnan(self.electrons), np.float32(NO_SAMPLE), self.electrons)
-        _, *halves = free_frames(
-            codes,
-            Coding(1.0, 0.0, NO_SAMPLE),
-            self.g,
-            self.dk,
-            self.theta,
-            self.read_variance,
-            self.shot_factor,
-            self.good,
-        )
-        return halves[0], halves[1]
+        return self.free_of(codes)[1:]
+
+    def free_of(self, samples: F32) -> tuple[FreeFrames, FreeFrames, FreeFrames]:
+        """`free_frames` of samples (t, y, x), e-, `NO_SAMPLE` without weight."""
+        pixels = self.theta, self.read_variance, self.shot_factor, self.good
+        return free_frames(samples, Coding(1.0, 0.0, NO_SAMPLE), self.g, self.dk, *pixels)
 
 
 Level = tuple[float, int]

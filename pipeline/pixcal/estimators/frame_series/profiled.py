@@ -1,8 +1,7 @@
 """Maximum-likelihood value of a nonlinear parameter of series."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -13,12 +12,8 @@ FARTHEST = 3.0  # largest error of the logarithm of a measured parameter
 HALVINGS = 4  # of the distance to the values on either side
 
 
-class ProfiledFit(Protocol):
-    """Components for a value of the parameter, from a start."""
-
-    def __call__(self, value: float, start: Components | None, steps: int = ...) -> Components:
-        """Sizes after some steps of the fit."""
-        ...
+# components for a value of the parameter, from a start or None, after a number of steps if given
+ProfiledFit = Callable[..., Components]
 
 
 @dataclass(frozen=True)

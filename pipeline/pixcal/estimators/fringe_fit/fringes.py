@@ -187,9 +187,7 @@ class SmoothPhasor:
     k: tuple[float, float]  # fringe vector (kx, ky), the mean over the tile, rad/px
 
 
-def smooth_phasor(
-    phasor: C128, good: Mask, k: tuple[float, float], degree: int = 3
-) -> SmoothPhasor:
+def smooth_phasor(phasor: C128, good: Mask, k: tuple[float, float]) -> SmoothPhasor:
     """Smooth version of a noisy phasor map alpha exp(i psi) / iota (y, x), from its good pixels.
 
     A complex polynomial times the wave of the corrected fringe vector k (rad/px), no outliers.
@@ -205,8 +203,7 @@ def smooth_phasor(
     # Real and imaginary part are two right-hand sides of the same real fit.
     parts = np.ascontiguousarray(turned).view(float).reshape(-1, 2)
     use = good.ravel()
-    while degree > 0 and min(shape) < 4 * (degree + 1):
-        degree -= 1
+    degree = min(3, max(0, min(shape) // 4 - 1))
     # A few thousand pixels suffice. A step coprime to the number of columns covers all columns.
     step = max(1, len(parts) // MOST_PIXELS)
     while gcd(step, shape[1]) > 1:

@@ -197,10 +197,6 @@ class TileSums:
         right = rest[:, N_LOCAL**2 :].reshape(n, N_LOCAL, -1)
         return cls(planes, normal, right, square, pixels)
 
-    def with_planes(self, planes: Sequence[TilePlane]) -> "TileSums":
-        """The same sums with planes that differ by multiples of 2π."""
-        return TileSums(list(planes), self.normal, self.right, self.square, self.pixels)
-
 
 def local_modes(carrier: Carrier, plane: TilePlane, shape: tuple[int, ...]) -> F64:
     """The modes (mode, y * x) of a tile."""

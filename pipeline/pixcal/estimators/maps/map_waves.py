@@ -7,7 +7,7 @@ A weak third beam multiplies the mean light by ``1 + Re(s e)`` and the fringe's 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import ndtri_exp
@@ -185,16 +185,13 @@ def _strongest(maps: Maps, allowed: Mapping[str, Mask], in_flats: bool) -> Waves
 
 def _less(maps: Maps, waves: Sequence[WaveFit]) -> Maps:
     """Maps minus given waves."""
-    remaining: dict[str, list[_Map]] = {}
-    for name, own in maps.items():
-        remaining[name] = []
-        for m in own:
-            data = m.data
-            for w in waves:
-                if w.set == name:
-                    six = [p for v in (w.static, w.forward, w.backward) for p in (v.real, v.imag)]
-                    data = data - np.tensordot(six, m.signals(np.array(w.q)), 1)
-            remaining[name].append(_Map(m.kind, data, m.free, m.good, m.row))
+    remaining = dict(maps)
+    for w in waves:
+        six = [p for v in (w.static, w.forward, w.backward) for p in (v.real, v.imag)]
+        remaining[w.set] = [
+            replace(m, data=m.data - np.tensordot(six, m.signals(np.array(w.q)), 1))
+            for m in remaining[w.set]
+        ]
     return remaining
 
 

@@ -17,7 +17,7 @@ from pixcal.estimators.test_statistics.expectation import (
     statistic_named,
     straight_significance,
 )
-from pixcal.estimators.test_statistics.gap import ALLOWED, Gap
+from pixcal.estimators.test_statistics.gap import ALLOWED, Gap, gap_of
 from pixcal.model.arrays import F64
 
 _HIGHEST = 200.0  # largest logarithm of a power
@@ -91,11 +91,5 @@ def gap_of_sizes(before: EffectSizes, after: EffectSizes, where: Set[Key], new: 
     """Remaining gap: curves ``where`` weighted by their size, ``new`` ones in full."""
     # A statistic that identified a cause may itself deviate by no more than its scatter.
     weights = {key: max(abs(before.size[key]), 1.0) for key in sorted(where)}
-    whole = sum(weights.values())
     left = {key: min(after.beyond[key] / max(before.beyond[key], 1e-12), _LEFT) for key in weights}
-    total = sum(weights[key] * left[key] for key in left)
-    for key in sorted(new - where):
-        own = abs(after.size[key])
-        total += own
-        left[key] = own / max(whole, 1e-12)
-    return Gap(total / whole if whole else 0.0, weights, left)
+    return gap_of(weights, left, {key: abs(after.size[key]) for key in sorted(new - where)})

@@ -130,15 +130,22 @@ def remaining(
 ) -> Gap:
     """Remaining gap: curves ``where`` weighted by squared significance, new ones in full."""
     weights = {k: sigmas_of(before[k].log_chance) ** 2 for k in where}
-    whole = sum(weights.values())
     left = {
         k: float(np.clip(after[k].excess / max(before[k].excess, 1e-12), 0, 2))
         for k in where
         if k in after
     }
+    new = {k: sigmas_of(after[k].log_chance) ** 2 for k in flagged(after) - where}
+    return gap_of(weights, left, new)
+
+
+def gap_of(
+    weights: Mapping[Key, float], left: Mapping[Key, float], new: Mapping[Key, float]
+) -> Gap:
+    """Remaining gap of curves with weights, of which a share is ``left``, and of ``new`` ones."""
+    whole = sum(weights.values())
     total = sum(weights[k] * left[k] for k in left)
-    for key in flagged(after) - where:
-        own = sigmas_of(after[key].log_chance) ** 2
+    for own in new.values():
         total += own
-        left[key] = own / max(whole, 1e-12)
-    return Gap(total / whole if whole else 0.0, weights, left)
+    every = {**left, **{k: own / max(whole, 1e-12) for k, own in new.items()}}
+    return Gap(total / whole if whole else 0.0, weights, every)

@@ -1,7 +1,7 @@
 """One fringe set: the shape of its fringes, from the sums of the sweep over each tile."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -115,7 +115,7 @@ def fit_set(
             f"fringe set {name!r}: no pixel can be fitted; its fringes are too faint for "
             f"{source.n_frames} frames, or the mask leaves no pixel"
         )
-    tiles = tiles.with_planes(unwrap(tiles.planes, source.grid))
+    tiles = replace(tiles, planes=list(unwrap(tiles.planes, source.grid)))
     start = _start(source, facts, tiles.planes, acquisition, name)
     fitted, evidence = _choose(model, tiles, start)
     shape = fitted.basis.shape.moved(fitted.coefficients[: len(fitted.basis.shape.names), 0])

@@ -7,6 +7,7 @@ their sums over pixels, weighted by the variance, have known mean and scatter.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtri, lambertw
@@ -59,17 +60,9 @@ class Moments:
     def of(self, pixels: Indices) -> "Moments":
         """Of some pixels (ascending) alone."""
         own = np.isin(self.pixel, pixels)
-        names = (
-            "pixel",
-            "count",
-            "variance",
-            "above",
-            "below",
-            "kurtosis",
-            "products",
-            "stands_for",
-        )
-        return replace(self, **{name: getattr(self, name)[..., own] for name in names})
+        arrays = ((name, v) for name, v in vars(self).items() if isinstance(v, np.ndarray))
+        some: dict[str, Any] = {name: values[..., own] for name, values in arrays}
+        return replace(self, **some)
 
     @property
     def dof(self) -> float:
