@@ -132,8 +132,6 @@ def frame_sums(
 ) -> None:
     """Add scattered pixels to the weighted sums of every frame, for g and the fringe vector.
 
-    Parameters
-    ----------
     codes : (t, p) float32 stored samples of p pixels; another type would be compiled again
     g, dk : (t, 3), (t, 2) float32, current frame parameters, which define the residuals
     y, x : (p,) pixel coordinates relative to the point where ``g`` holds, px
@@ -361,8 +359,6 @@ def sweep_batches(
     sums are: normal 00, 01, 02, 11, 12, 22; right-hand 0 to 2 (of the residual from the start
     model), its weighted square; number of samples.
 
-    Parameters
-    ----------
     codes : (t, y, x) unsigned int stored samples; ``fill`` has no weight
     scale, offset : electrons of a code
     g : (t, 3) float32 frame parameters at the tile's centre

@@ -62,8 +62,6 @@ def moved_charge(charge: F32, shifts: F64, along_y: float = 1.0) -> F32:
 
     Within `REACH` of the first and last row it is right only if these are edges of the window.
 
-    Parameters
-    ----------
     charge : (y, x) or (t, y, x) e-, as if boundaries stayed. Beyond the edges it goes on as it is
         at them; through the edges nothing moves.
     shifts : from `boundary_shifts`, times the shift by an electron (px)
@@ -110,13 +108,9 @@ def shared_noise(
 
     To first order in the shift, for any scene; zero where either lies within `REACH` of the edges.
 
-    Parameters
-    ----------
-    charge : (t, y, x) mean charge, e-
-    pushes : from `boundary_pushes`
-    shifts : as in `moved_charge`
-    step : rows and columns
-    axes : factors of the shifts of boundaries between columns and between rows
+    ``charge``: (t, y, x) mean charge, e-; ``pushes``: from `boundary_pushes`; ``shifts``: as in
+    `moved_charge`; ``step``: rows and columns; ``axes``: factors of the shifts of boundaries
+    between columns and between rows.
     """
     out = np.zeros_like(charge)
     dy, dx = step

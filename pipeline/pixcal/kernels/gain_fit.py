@@ -78,8 +78,6 @@ def fit_gain(
     The weights come from the curve itself: measured variances that are low by chance would weigh
     more. None when nothing is above the read noise.
 
-    Parameters
-    ----------
     sums : (N_BINS, 3) of `photon_transfer.add_neighbours`
     read_variance : variance at level zero and its error, ADU²
     highest : highest level to use, ADU

@@ -115,8 +115,6 @@ def pair_statistics(
     outliers, corrected for the clipping, and covariance (ADU²) of pixels apart by each of `LAGS`.
     All zero for blocks of fewer than 32 pixels.
 
-    Parameters
-    ----------
     first, second : (y, x) frames of the same scene, made equally bright, ADU above bias and dark;
         NaN is not used
     gain, read_noise : rough guess, e-/ADU and ADU, only to separate outliers from noise where the

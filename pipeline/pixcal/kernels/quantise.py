@@ -100,8 +100,6 @@ def encode(
 
     Returns the sum of the codes that have weight.
 
-    Parameters
-    ----------
     raw : (t, y, at least x0 + x) samples, ADU; the tile's columns begin at ``x0`` (a copy of them
         would double the time)
     slope, start, dark : (y, x) float32 from `coefficients`

@@ -27,8 +27,6 @@ def residual_sums(
     of the product of their variances, so that every product has the same weight. The sums are: the
     number, the normal matrix (11, 12, 22), the right-hand side (1, 2), the squared products.
 
-    Parameters
-    ----------
     rest, model : (t, y, x) residuals (NaN without weight) and their model, e-
     shot_factor, read : (y, x) variance of a sample: ``shot_factor * model + read``, e-²
     good : (y, x) bool

@@ -165,8 +165,6 @@ class Combined:
 class Combination:
     """Streaming robust mean and variance of frames.
 
-    Parameters
-    ----------
     clip : limit, sigmas
     lamp : whether the common part of a frame is a factor (a lamp's power); else an offset
     quantum : step of the samples, added to the limits, so that noise below it does not close them

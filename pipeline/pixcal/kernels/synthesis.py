@@ -102,8 +102,6 @@ def illuminate(
 ) -> None:
     """Mean electrons from the light: ``B iota + A alpha sin(psi + phi)`` (physics note, section 1).
 
-    Parameters
-    ----------
     iota, alpha_sin, alpha_cos : (y, x) float32 mean; alpha times sin psi and cos psi, e-
     level, amplitude : B and A of the frame
     column_turn, row_turn : (2, x), (2, y) float32, cos and sin of the frame's phase: phi and the

@@ -19,14 +19,10 @@ _RANGE = 4.0
 
 @kernel()
 def add_tracks(charge: F32, tracks: F64, sigma: float, first_row: int) -> None:
-    """Add the charge of tracks to a frame (y, x), e-; charge outside it is lost.
+    """Add the charge of tracks to that of a frame (y, x), e-, in place; outside it is lost.
 
-    Parameters
-    ----------
-    charge : (y, x) e-, changed in place
-    tracks : (n, 5) row and column of a track's start, its length along each (px), its charge (e-)
-    sigma : width of the blur, px
-    first_row : row of the frame's first row, in the coordinates of the tracks
+    ``tracks``: (n, 5) row and column of a track's start, its length along each (px), its charge
+    (e-). ``sigma``: width of the blur, px. ``first_row``: of the frame, in the tracks' coordinates.
     """
     reach = math.ceil(_RANGE * sigma)
     along_y, along_x = np.empty(2 * reach + 2), np.empty(2 * reach + 2)
@@ -64,8 +60,6 @@ def draw_tracks(
 ) -> F64:
     """Tracks (count, 5), as in `add_tracks`, of an isotropic flux of particles from a half space.
 
-    Parameters
-    ----------
     area_px, margin_px : rows and columns where tracks begin, and the margin around them
     depth_px : of the sensitive layer
     electrons_per_px : most probable charge per pixel width of track length

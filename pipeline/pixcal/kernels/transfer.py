@@ -8,13 +8,9 @@ from pixcal.model.arrays import F32
 def left_behind(charge: F32, share: F32, begins: F32, weights: F32, normal: F32) -> F32:
     """Electrons that stay in each pixel: a binomial variate, approximated by a normal one.
 
-    Parameters
-    ----------
-    charge : (y, x) e-
-    share : (y, x) mean probability for an electron
-    begins, weights : (band,) lower ends of bands of the charge (e-), and the probability in each
-        over the mean one
-    normal : (y, x) standard normals; zero for the mean
+    Of a ``charge`` (y, x), e-; ``share``: (y, x) mean probability for an electron. ``begins,
+    weights``: (band,) lower ends of bands of the charge (e-), and the probability in each over the
+    mean one. ``normal``: (y, x) standard normals; zero for the mean.
     """
     ends = (*begins[1:], np.float32(np.inf))
     mean = np.zeros_like(charge)

@@ -28,20 +28,11 @@ _HOT, _NOISY = 6.0, 10.0
 def without_cut_off(
     found: Combined, frames: int, step: float, lowest: float = 0.0
 ) -> tuple[Combined, float]:
-    """Frames without light, corrected for clipping at their lowest code.
+    """Frames without light, corrected for clipping at their ``lowest`` code (ADU).
 
-    Parameters
-    ----------
-    found : of some pixels, ADU
-    step : of the samples (ADU)
-    lowest : code at which they are clipped (ADU)
-
-    Returns
-    -------
-    found : Combined
-        With corrected means and variances, where most pixels' noise is clipped.
-    factor : float
-        Variance of a sample over that of the samples as they are.
+    ``found``: of some pixels, ADU; ``step``: of the samples, ADU. Returns them with corrected means
+    and variances where most pixels' noise is clipped, and the variance of a sample over that of the
+    samples as they are.
     """
     if lowest:
         above_lowest = replace(found, mean=found.mean - lowest)

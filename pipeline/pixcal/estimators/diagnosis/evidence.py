@@ -274,11 +274,8 @@ def free_frames(
     From all good pixels, and from each half of them by stripes of rows: the bench is common to both
     halves; the noise of samples, and of whole rows, is not.
 
-    Parameters
-    ----------
-    codes : (t, y, x) samples as they are stored, or in electrons
-    g, dk : (t, 3), (t, 2) start, at the middle of the part
-    theta, read_variance, shot_factor, good : as in `FringeEvidence`
+    ``codes``: (t, y, x) samples as they are stored, or in electrons. ``g, dk``: (t, 3), (t, 2)
+    start, at the middle of the part. The maps are as in `FringeEvidence`.
     """
     y, x = np.broadcast_arrays(*grid((good.shape[0], good.shape[1])))
     start, turned = g.astype(np.float32), dk.astype(np.float32)
