@@ -75,11 +75,11 @@ class Star:
             slopes = jacobian.reshape(len(left), 4, -1)
             weighted = slopes * (weight * good[left]).reshape(len(left), 1, -1)
             rest = (data[left] - mean).reshape(len(left), -1, 1)
-            step, told = _solved(weighted @ slopes.swapaxes(1, 2), (weighted @ rest)[:, :, 0])
+            step, regular = _solved(weighted @ slopes.swapaxes(1, 2), (weighted @ rest)[:, :, 0])
             length = np.hypot(step[:, 0], step[:, 1])
             # Steps of at most half a pixel, beyond which the PSF is not linear.
             own = own + np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None] * step
-            inside = told & (np.hypot(own[:, 0], own[:, 1]) < self.side / 2)
+            inside = regular & (np.hypot(own[:, 0], own[:, 1]) < self.side / 2)
             done = inside & (length < PRECISION)
             theta[left], found[left[done]] = own, own[done]
             left = left[inside & ~done]
@@ -139,10 +139,10 @@ def _solved(normal: F64, right: F64) -> tuple[F64, Mask]:
     """Solutions (n, m) of normal equations, zero if singular; mask of the regular ones."""
     scale = root_diagonal(normal)
     unit = normal / (scale[:, :, None] * scale[:, None, :])
-    told = np.linalg.eigvalsh(unit)[:, 0] > SINGULAR
-    unit[~told] = np.eye(unit.shape[1])
+    regular = np.linalg.eigvalsh(unit)[:, 0] > SINGULAR
+    unit[~regular] = np.eye(unit.shape[1])
     step = np.linalg.solve(unit, (right / scale)[:, :, None])[:, :, 0] / scale
-    return np.where(told[:, None], step, 0.0), told
+    return np.where(regular[:, None], step, 0.0), regular
 
 
 def gaussian_star(fwhm: float, electrons: float | None, read_noise: float) -> Star:

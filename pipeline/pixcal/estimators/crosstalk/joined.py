@@ -98,7 +98,7 @@ def _level(
     error = np.inf
     for _ in range(LEVEL_STEPS):
         there = np.abs(dense.shares) > THERE * np.sqrt(np.diag(dense.covariance))
-        known = [c for c, sure in zip(dense.couplings, there, strict=True) if sure]
+        known = [c for c, significant in zip(dense.couplings, there, strict=True) if significant]
         more, error = frames.measured(dense.couplings, per_ke).level_dependence(known)
         falls = per_ke + more < -CERTAIN * error
         if abs(more) < 0.1 * error or (not falls and per_ke == 0):

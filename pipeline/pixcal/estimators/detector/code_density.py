@@ -311,8 +311,8 @@ class CodeWidths:
         for share in _SPLITS:
             split = int(share * len(square))
             typical = float(np.median(square[split:]))
-            told = self.variance[:split] < typical / _CLEAR
-            like = square[:split][told] > typical / 4
+            constrained = self.variance[:split] < typical / _CLEAR
+            like = square[:split][constrained] > typical / 4
             clear = typical > _CLEAR * np.median(self.variance[split:])
             if clear and len(like) >= FEWEST_CODES and like.mean() < _EVEN:
                 return True

@@ -155,8 +155,8 @@ def _squares_of_shares(
 
 def _mean_square(right: F64, information: F64) -> tuple[float, float]:
     """Mean square of shares less that of their noise, and its error, from normal equations (n,)."""
-    told = information > 1e-3 * np.median(information)
-    share, variance = right[told] / information[told], 1 / information[told]
+    constrained = information > 1e-3 * np.median(information)
+    share, variance = right[constrained] / information[constrained], 1 / information[constrained]
     square = share**2 - variance
     trust = 1 / (variance**2 + np.median(variance) ** 2)
     # Particles leave outliers in a few pixels.
@@ -248,10 +248,10 @@ def common_lag(
             # Linearised about the current lag, which is removed from the frames first.
             share = float(np.clip(found.share, 0, 0.5))
             rest, known = corrected(share, found.decay_frames, own.astype(np.float32))
-            told = _contrast_steps(rest.astype(float), which)
-            if told is not None:
+            fitted = _contrast_steps(rest.astype(float), which)
+            if fitted is not None:
                 more = np.pad(known[:LAGS], (0, LAGS - len(known[:LAGS])))
-                steps.append((more + told[0], told[1]))
+                steps.append((more + fitted[0], fitted[1]))
         if not steps:
             return None
         information = np.sum([n for _, n in steps], axis=0)

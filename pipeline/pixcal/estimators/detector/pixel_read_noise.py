@@ -44,15 +44,15 @@ class PixelNoise:
             rest = frames - frames.mean(axis=0)
             rest -= np.median(rest[:, good], axis=1)[:, None, None]
             squares += np.einsum("tyx,tyx->yx", rest, rest, dtype=float)
-        told = good
+        measured = good
         if noisy is not None:
             loud = 1 + OUTLIER * np.sqrt(2 / freedom)
-            told = good | (noisy & (squares > loud * np.median(squares[good])))
-        seen = np.log(np.maximum(squares / freedom, 1e-12)[told])
+            measured = good | (noisy & (squares > loud * np.median(squares[good])))
+        seen = np.log(np.maximum(squares / freedom, 1e-12)[measured])
         half = freedom / 2
         # Bias and variance of the logarithm of a variance of normal samples.
         bias, error = float(digamma(half) - np.log(half)), float(polygamma(1, half))
-        own = good[told]
+        own = good[measured]
         seen -= float(np.median(seen[own]))
         spread = robust_sigma(seen[own]) ** 2
         step = max(np.sqrt(error) / FINENESS, float(np.ptp(seen)) / (MOST - 3))
@@ -69,7 +69,7 @@ class PixelNoise:
         ordinary = own & (np.abs(seen) <= OUTLIER * np.sqrt(max(spread, error)))
         mean = float(np.mean((posterior @ np.exp(log))[bins[ordinary]]))
         binned = np.full(good.shape, -1)
-        binned[told] = bins
+        binned[measured] = bins
         return cls(binned, np.cumsum(posterior, axis=1), log - np.log(mean), rounding)
 
     def drawn(self, rng: np.random.Generator) -> F32:

@@ -99,7 +99,7 @@ def shot_share(
     """Level-dependent noise over that expected, with its error; None without samples.
 
     ``counted``: which of `STEPS` to add to the first, all by default. ``known``: relative error of
-    the variance of the read noise, where frames without light do not tell it.
+    the variance of the read noise, where frames without light do not determine it.
     """
     total = sum(sums, np.zeros((len(STEPS), 7)))
     if not total[0, 0]:
@@ -130,7 +130,7 @@ def sums_of_stacks(evidence: Evidence) -> list[F64]:
 
 
 def read_known(evidence: Evidence) -> float | None:
-    """Relative error of the variance of the read noise; None if frames without light tell it."""
+    """Relative error of the variance of the read noise; None if frames without light give it."""
     if not evidence.without_dark and evidence.lowest_adu is None:
         return None
     error = 2 * evidence.read_noise_error / evidence.read_noise

@@ -284,21 +284,9 @@ def free_frames(
         used, n = np.flatnonzero(good), len(g)
         packed, right = np.zeros((n, 15)), np.zeros((n, 5))
         samples = np.take(codes.reshape(n, -1), used, axis=1).astype(np.float32, copy=False)
-        frame_sums(
-            samples,
-            coding.scale,
-            coding.offset,
-            coding.fill,
-            start,
-            turned,
-            y[good].astype(np.float32),
-            x[good].astype(np.float32),
-            np.ascontiguousarray(theta[:, good], np.float32),
-            read_variance[good].astype(np.float32),
-            shot_factor[good].astype(np.float32),
-            packed,
-            right,
-        )
+        maps = (y, x, theta, read_variance, shot_factor)
+        pixels = (np.ascontiguousarray(one[..., good], np.float32) for one in maps)
+        frame_sums(samples, *coding, start, turned, *pixels, packed, right)
         return packed, right
 
     def solved(packed: F64, right: F64) -> FreeFrames:

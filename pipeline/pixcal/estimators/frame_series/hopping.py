@@ -99,7 +99,7 @@ def find_hopping(
         return sum(s.weighed(size, rate * np.exp(step)).likelihood for s in every)
 
     step = STEP * min(s.noise for s in every) / size
-    # The posterior of a rate, without prior, has one hop more: few hops do not tell it well.
+    # The posterior of a rate, without prior, has one hop more: few hops do not constrain it well.
     relative = _error(of_rate, STEP)
     rate_error = rate * float(np.hypot(relative, relative**2))
     ramps, errors = np.array([s.ramp(size) for s in every]).T

@@ -83,18 +83,18 @@ def find_telegraph(
     parts = [m for s in series if (m := moments_of(s)) is not None]
     if not parts:
         return None
-    told = signs(parts)
+    jump_signs = signs(parts)
     longest, upper, known = max(parts, key=lambda m: m.frames), 0.5, None
     single: OwnLevels | None = None
     smallest_jump = 0.0
-    if told.significance > SIGNIFICANT and told.noisy:
+    if jump_signs.significance > SIGNIFICANT and jump_signs.noisy:
         own = max(series, key=lambda s: len(s.noise))
-        upper = _upper(lit, own, longest, told)
+        upper = _upper(lit, own, longest, jump_signs)
         if upper != 0.5:
             # Apparent hits are the rarer level.
             parts = [m for s in series if (m := moments_of(s, hits=True)) is not None]
             longest = max(parts, key=lambda m: m.frames)
-            upper = _upper(lit, own, longest, told)
+            upper = _upper(lit, own, longest, jump_signs)
         known = find_stays(lit(_chosen(longest)), longest, upper)
         clear = NOISY * float(np.sqrt(2 / longest.dof)) / (upper * (1 - upper))
         smallest_jump = longest.sigma * clear**0.5
@@ -111,7 +111,7 @@ def find_telegraph(
         switching_decades=stays.decades,
         upper=stays.upper,
         switching_error=found.error,
-        signs=told,
+        signs=jump_signs,
         own=single,
         smallest_jump=smallest_jump,
     )
@@ -128,12 +128,12 @@ def _chosen(m: Moments) -> Indices:
 
 
 def _upper(
-    lit: Callable[[Indices], Sequence[LitSeries]], own: Series, seen: Moments, told: Signs
+    lit: Callable[[Indices], Sequence[LitSeries]], own: Series, seen: Moments, jump_signs: Signs
 ) -> float:
     """Share of the time in the upper level: from fringes, else from frames without light."""
     pixels = _chosen(seen)
     upper = find_upper(lit(pixels), seen.sigma)
-    if upper != 0.5 or abs(told.one_sided) < SIGNIFICANT:
+    if upper != 0.5 or abs(jump_signs.one_sided) < SIGNIFICANT:
         return upper
     # Pixels were selected in these frames, which biases the share of a rare level high.
     return find_upper([_in_the_dark(own, pixels)], seen.sigma)
