@@ -121,10 +121,11 @@ def shared_noise(
 
 
 def _slopes(shifts: F64, dy: int, dx: int, axes: tuple[float, float]) -> F32:
-    """Charge that a pixel gains through each of its boundaries by the charge of another.
+    """Derivative of the charge a pixel gains through its boundaries by the charge of another.
 
-    Through those to the right, to the left, below and above: of each the factor of the two pixels'
-    charge beside it, and that of its own shift, which the neighbour across it widens the flux of.
+    Two factors (2, 4) for the boundaries to the right, to the left, below and above: of the charge
+    on both sides, as the other pixel moves the boundary; and of the boundary's shift, as the other
+    pixel, if it is the neighbour across, changes that charge.
     """
 
     def slope(y: int, x: int, axis: int) -> float:

@@ -101,7 +101,7 @@ def _steps(
     couplings: tuple[Coupling, ...], shape: tuple[int, int], first: tuple[int, int],
     kind: np.dtype[Any],
 ) -> tuple[_Step, ...]:  # fmt: skip
-    """Couplings in the order of their distances; on small arrays those of one are one part."""
+    """Couplings in the order of their distances; one part per distance on small arrays."""
     alike: dict[tuple[int, int, float], list[Coupling]] = {}
     for c in couplings:
         if c.share != 0:

@@ -124,7 +124,7 @@ class _Paths:
         self.opd = 2 * (self.b * self.q).sum(axis=0) / self.sum
 
     def quotient(self, numerator: F64, paths: F64) -> F64:
-        """Derivative of the OPD from those of its numerator and of the sum of the paths."""
+        """Derivative of the OPD from the derivatives of numerator and sum of the paths."""
         return np.asarray((numerator - self.opd * paths) / self.sum)
 
 

@@ -259,7 +259,7 @@ class Combination:
 
 
 def lit(signal: NDArray[Any]) -> Mask:
-    """Lit pixels of a tile; those of an overscan are not."""
+    """Lit pixels of a tile, without an overscan."""
     some = _some(signal[None])[0]
     finite = some[np.isfinite(some)]
     rank = int(_BRIGHT * finite.size)
@@ -286,7 +286,7 @@ def robust_sigma(values: NDArray[Any]) -> float:
 
 
 def median(values: NDArray[Any]) -> float:
-    """Median of finite values (n,), which are put in another order; as numpy's, in less time."""
+    """Median of finite values (n,), as numpy's but faster; reorders them."""
     low, high = (len(values) - 1) // 2, len(values) // 2
     values.partition(high)
     lower = values[high] if low == high else values[:high].max()

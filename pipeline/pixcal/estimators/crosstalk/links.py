@@ -55,7 +55,7 @@ class PixelClasses:
         return sorted(found, key=lambda classes: classes.count)
 
     def groups_of(self, finer: "PixelClasses") -> Indices:
-        """Own class of each class of a finer period, which this one divides."""
+        """Class of this period to which each class of a multiple of it belongs."""
         row, column = np.divmod(np.arange(finer.count), finer.columns)
         return np.asarray(row % self.rows * self.columns + column % self.columns)
 

@@ -136,7 +136,7 @@ def _highest(power: Callable[[float], float], start: float, width: float) -> flo
 
 
 def _agreement(codes: I64, there: Mask, step: float) -> float:
-    """Share of the gaps that a step predicts, less that of occupied codes it excludes."""
+    """Share of the gaps that a step predicts, minus the share of occupied codes it excludes."""
     multiple = np.rint(codes / step)
     distance = np.abs(codes - multiple * step)
     # A multiple half-way between two codes is rounded up or down: exactly one of the two occurs.

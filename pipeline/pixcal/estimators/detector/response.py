@@ -155,7 +155,7 @@ def _of_any_shape(sums: Sequence[tuple[F64, F64]]) -> float:
 
 
 def _of_fine_falloffs() -> F64:
-    """Powers and shifts of `_FINE_PX` as sums (to, from) of powers and those of `FALLOFFS_PX`."""
+    """Matrix (to, from): powers and shifts of `_FINE_PX` from those of `FALLOFFS_PX`."""
     coarse, fine = (
         np.stack([boundary_shifts(falloff).ravel() for falloff in falloffs], axis=1)
         for falloffs in (FALLOFFS_PX, _FINE_PX.tolist())
@@ -226,7 +226,7 @@ def _joint(sums: Sequence[tuple[F64, F64]], at: int) -> tuple[F64, F64]:
 def _alone(
     sums: Sequence[tuple[F64, F64]], at: int
 ) -> tuple[float, float, float, float, float, float]:
-    """Shift, variance, chi-square explained, that of an added response; ratio of axes, error."""
+    """Shift, variance, chi-square explained, and that by an added response; axis ratio, error."""
     information = np.array([normal[at, at] for normal, _ in sums])
     rights = np.array([right[at] for _, right in sums])
     sizes = rights / information

@@ -155,7 +155,7 @@ def find_hops(series: FrameSeries) -> tuple[Hop, ...]:
 
 
 def _is_step(values: F64, at: int, width: int, size: float) -> bool:
-    """Whether a change persists when a slope is fitted too; that of a slow drift does not."""
+    """Whether a change persists when a slope is fitted too, unlike a slow drift."""
     frame = np.arange(-width, width, dtype=float)
     design = np.stack([np.ones(2 * width), frame, frame >= 0], axis=1)
     steps = np.convolve(values, np.linalg.pinv(design)[2, ::-1], "valid")
@@ -183,7 +183,7 @@ def _measured(along: F64, found: dict[int, float]) -> tuple[Hop, ...]:
 
 
 def _differences(values: F64, width: int) -> tuple[F64, float]:
-    """Mean of the next frames less that of the last ones, less its median; and its scatter."""
+    """Mean of the next frames minus that of the last ones, about its median; and its scatter."""
     sums = np.concatenate([[0.0], np.cumsum(values)])
     means = (sums[width:] - sums[:-width]) / width
     change = means[width:] - means[:-width]

@@ -97,7 +97,7 @@ def _repeats(rest: F32, good: Mask, axis: int) -> F64:
     "correlation of neighbours in flats, bright minus dim", "correlation", x="neighbour", sets=False
 )
 def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
-    """Of the brighter half of the levels less that of the others."""
+    """Correlation in the brighter half of the levels minus that in the other half."""
     stacks = repeated(evidence, "flat")
     if len(stacks) < 2:
         return None
@@ -119,7 +119,7 @@ def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
     sets=False,
 )
 def bias_change(evidence: Evidence) -> Curve | None:
-    """Power of the change from the first half of the frames to the second, over that of noise."""
+    """Power of the change from the first to the second half of the frames, over the noise's."""
     stacks = [s for s in repeated(evidence, "bias") if len(s.adu) >= 4]
     if not stacks:
         return None

@@ -142,7 +142,7 @@ def remaining(
 def gap_of(
     weights: Mapping[Key, float], left: Mapping[Key, float], new: Mapping[Key, float]
 ) -> Gap:
-    """Remaining gap of curves with weights, of which a share is ``left``, and of ``new`` ones."""
+    """Remaining gap: shares ``left`` of weighted curves, and the weights of ``new`` curves."""
     whole = sum(weights.values())
     total = sum(weights[k] * left[k] for k in left)
     for own in new.values():

@@ -267,7 +267,7 @@ def own_levels(series: Sequence[LitSeries], noise: float) -> OwnLevels:
 
 
 def _two_levels(series: LitSeries, amplitudes: F64) -> F32:
-    """Logarithms (share, amplitude, n) of the likelihoods over that of one level."""
+    """Logarithms (share, amplitude, n) of the likelihoods of two levels relative to one."""
     charge, weight = series.charge.astype(np.float32), series.weight.astype(np.float32)
     found = np.empty((len(OWN_SHARES), len(amplitudes), charge.shape[1]), np.float32)
     for of_share, upper in zip(found, OWN_SHARES.astype(np.float32), strict=True):
@@ -280,7 +280,7 @@ def _two_levels(series: LitSeries, amplitudes: F64) -> F32:
 
 
 def _by_share(series: LitSeries, amplitudes: F64) -> F64:
-    """Logarithms (share, n) of the likelihoods of some pixels, over that of quiet ones."""
+    """Logarithms (share, n) of the likelihoods of some pixels, relative to quiet ones."""
     each = -(-series.charge.shape[1] // MOST_PIXELS)
     charge, weight = series.charge[:, ::each], series.weight[:, ::each]
     return np.stack([_log_likelihoods(charge, weight, p, amplitudes) for p in SHARES])
@@ -300,7 +300,7 @@ def _mixed(jumps: F64) -> tuple[float, float, float]:
 
 
 def _log_likelihoods(charge: F64, weight: F64, upper: float, amplitudes: F64) -> F64:
-    """Of pixels (t, n), each of which has any of the amplitudes, over that of none."""
+    """Logarithms (n,) for pixels (t, n) that have any of the amplitudes, relative to no jumps."""
     total = np.empty((len(amplitudes), charge.shape[1]))
     for own, amplitude in zip(total, amplitudes, strict=True):
         levels = -upper * amplitude, (1 - upper) * amplitude
