@@ -80,7 +80,7 @@ def _check(out: Path, sealed: Path, config: MakeConfig) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"--out {out}: not empty; choose another directory")
     if sealed.exists():
-        raise InputError(f"--sealed {sealed}: is there already; choose another file")
+        raise InputError(f"--sealed {sealed}: already exists; choose another file")
     if sealed.resolve().is_relative_to(out.resolve()):
         raise InputError(f"--sealed {sealed}: inside {out}; keep the truth apart from the cases")
 

@@ -42,7 +42,7 @@ class Drawn:
     """An effect in a case."""
 
     effect: str
-    way: str
+    variant: str
     strength: float
     # strength over the threshold, which is unknown for the second bench
     times: float | None
@@ -184,8 +184,8 @@ def _any(variants: Sequence[Variant], rng: np.random.Generator) -> Variant:
     return variants[int(rng.integers(len(variants)))]
 
 
-def _drawn(way: Variant, size: str, least: float, rng: np.random.Generator) -> Drawn:
+def _drawn(variant: Variant, size: str, least: float, rng: np.random.Generator) -> Drawn:
     times = float(np.exp(rng.uniform(np.log(least), np.log(STRONGEST))))
-    strength = times * way.threshold(size)
-    made = way.make(strength, rng)
-    return Drawn(way.effect, way.strength, strength, times, made)
+    strength = times * variant.threshold(size)
+    made = variant.make(strength, rng)
+    return Drawn(variant.effect, variant.strength, strength, times, made)

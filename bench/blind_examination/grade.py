@@ -33,7 +33,7 @@ class Grade:
     case: str
     part: int
     truth: tuple[str, ...]  # effects in the case
-    way: str  # their laws and strengths
+    variant: str  # their laws and strengths
     times: float | None  # strength of the weakest over its threshold
     left_out: str
     verdict: str  # of the diagnosis; `failed` without one
@@ -82,9 +82,9 @@ def grade(case: str, truth: Truth, diagnosis: Diagnosis | None, error: str = "")
     error : str
         Reason of the failure.
     """
-    way = ", ".join(f"{d.effect}: {d.way} {d.strength:.3g}" for d in truth.drawn)
+    variant = ", ".join(f"{d.effect}: {d.variant} {d.strength:.3g}" for d in truth.drawn)
     times = min((d.times for d in truth.drawn if d.times is not None), default=None)
-    about = (case, truth.part, truth.names, way, times, truth.left_out)
+    about = (case, truth.part, truth.names, variant, times, truth.left_out)
     if diagnosis is None:
         marks = dict.fromkeys(QUESTIONS[truth.part], False)
         return Grade(*about, "failed", (), marks, error or "not diagnosed")

@@ -22,7 +22,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.errors import DamagedError, InputError, PixcalError, PlanError
 from pixcal.storage.manifest import read_json, write_json
 
-SCHEMA = "pixcal/blind-score/3"
+SCHEMA = "pixcal/blind-score/4"
 PRODUCT = "score.json"
 TABLE = "score.md"
 _TIMED = ("diagnosis", "maps")
@@ -70,7 +70,7 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
         "size": first.manifest.size,
         "made": sum(len(one.manifest.cases) for one in marked),
         "missing": missing,
-        "sittings": _summary_of_runs(
+        "runs": _summary_of_runs(
             [one.folder / RUNS / g.case for one in marked for g in one.grades]
         ),
         "notes": list(dict.fromkeys(n for one in marked for n in one.opened.examination.notes)),
@@ -90,7 +90,7 @@ def _require_alike(folders: Sequence[Path]) -> None:
         if manifest.size != manifests[0].size:
             raise InputError(
                 f"--also {folder}: of size {manifest.size}, {folders[0]} of {manifests[0].size}; "
-                "score them apart"
+                "score them separately"
             )
     if len({manifest.commitment for manifest in manifests}) < len(manifests):
         raise InputError("--also: an examination is given twice; name each once")
@@ -150,7 +150,7 @@ def _understood(file: Path) -> Iterator[None]:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         damaged = DamagedError(f"{file}: damaged ({reason:.200})", file)
         case = next(up for up in file.parents if up.parent.name == RUNS)
-        damaged.advice = f"remove {case} and say 'pixcal blind run {case.parents[1]}'"
+        damaged.advice = f"remove {case} and run 'pixcal blind run {case.parents[1]}'"
         raise damaged from error
 
 

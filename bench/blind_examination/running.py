@@ -28,7 +28,7 @@ PRODUCTS = "products"
 DIAGNOSIS = Path(PRODUCTS) / "diagnosis.json"
 FAILED = "failed.json"
 # for a finished case: version of the code, duration, and reason if there are no maps
-DONE = "sat.json"
+DONE = "done.json"
 BEGUN = "begun.json"  # for a case in progress: version of the code
 MIN_BYTES = 1 << 30  # of a case on a cluster, whose workers have their own limits
 # artefacts that are removed once a case is diagnosed

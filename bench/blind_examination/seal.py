@@ -17,7 +17,7 @@ from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
 from pixcal.storage.manifest import read_json, write_json
 
-SCHEMA = "pixcal/blind-truth/2"
+SCHEMA = "pixcal/blind-truth/3"
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ def catalogue() -> tuple[tuple[str, ...], tuple[SecondLaw, ...], tuple[str, ...]
     """
     if missing():
         raise InputError(
-            f"the second bench needs {', '.join(missing())}; {INSTALL}, or say --bench own"
+            f"the second bench needs {', '.join(missing())}; {INSTALL}, or use --bench own"
         )
     listing = json.loads(_asked("--list", "--json"))
     laws = [SecondLaw(**facts) for facts in listing["laws"]]

@@ -19,7 +19,7 @@ class Variant:
     effect: str
     strength: str  # meaning of its strength, in words
     # small, standard: threshold, the strength detected on half of the frames with about four
-    # sigmas, on the middle bench of each size
+    # sigmas, on the typical bench of each size
     small: float
     standard: float
     # parameters of the effect, from a strength and random numbers for all others
@@ -123,7 +123,8 @@ VARIANTS = (
     Variant("fringe_jitter", "vibration, rad/px", 4.7e-6, 1.1e-6, _vibration),
     Variant("gain_error", "relative", 0.024, 0.0085, lambda s, rng: {"relative": _either(s, rng)}),
     Variant("ghost_fringes", "share", 2.7e-4, 1.3e-4, _ghost),
-    Variant("hyperbolic_fringes", "foot, mm", 12, 1.1, lambda s, rng: {"foot_mm": _around(s, rng)}),
+    Variant("hyperbolic_fringes", "fibre-pair offset, mm", 12, 1.1,
+        lambda s, rng: {"foot_mm": _around(s, rng)}),
     Variant("intensity_noise", "white, relative", 8e-5, 4.7e-5, _only("rms", ("line",))),
     Variant("intensity_noise", "slow, relative", 9e-5, 3.1e-5,
         lambda s, rng: {"rms": s, "line": 0.0, "correlation_s": _between(0.3, 5, rng)}),
@@ -142,7 +143,7 @@ VARIANTS = (
     Variant("rolling_shutter", "line time, us", 0.053, 0.0073, lambda s, rng: {"line_time_us": s}),
     Variant("row_noise", "rows, e-", 0.75, 0.3, _only("row_rms", _ROWS)),
     Variant("row_noise", "columns, e-", 0.7, 0.32, _only("column_rms", _ROWS)),
-    Variant("row_noise", "rows in turn, e-", 0.29, 0.12, _only("interlace_rms", _ROWS)),
+    Variant("row_noise", "alternate rows, e-", 0.29, 0.12, _only("interlace_rms", _ROWS)),
     Variant("straylight", "bump, of the light", 1.5e-3, 7e-4, _bump),
     Variant("telegraph_noise", "amplitude, e-", 19, 10,
         lambda s, rng: {"amplitude_e": s, "share": float(rng.uniform(0.01, 0.05)),
@@ -157,7 +158,7 @@ VARIANTS = (
 
 def variants_of() -> Mapping[str, tuple[Variant, ...]]:
     """Variants by the name of the effect."""
-    names = dict.fromkeys(way.effect for way in VARIANTS)
+    names = dict.fromkeys(variant.effect for variant in VARIANTS)
     return {name: tuple(w for w in VARIANTS if w.effect == name) for name in names}
 
 

@@ -50,14 +50,14 @@ def _about(score: Plain) -> str:
         text += f"; **{len(score['missing'])} of {score['made']} are not diagnosed yet**"
     if score["purpose"] == "development":
         text += " — **development seed: not an examination**"
-    sittings = score["sittings"]
-    if len(sittings["codes"]) > 1:
-        text += f" — **diagnosed by {len(sittings['codes'])} versions of the program**"
-    seconds = sittings["median_seconds"]
+    runs = score["runs"]
+    if len(runs["codes"]) > 1:
+        text += f" — **diagnosed by {len(runs['codes'])} versions of the program**"
+    seconds = runs["median_seconds"]
     if seconds["diagnosis"] is not None:
         text += f". A case took {seconds['diagnosis']:.0f} s, its maps {seconds['maps']:.1f} s more"
-    if sittings["without_maps"]:
-        text += f"; {sittings['without_maps']} have no maps, for they could not be fitted"
+    if runs["without_maps"]:
+        text += f"; {runs['without_maps']} have no maps: the fit failed"
     return text + "."
 
 
@@ -165,7 +165,7 @@ def _failures(wrong: Sequence[Plain]) -> str:
         (
             case["case"],
             PARTS[case["part"]],
-            case["way"] or "nothing",
+            case["variant"] or "nothing",
             "" if case["times"] is None else f"{case['times']:.1f}",
             ", ".join(_claimed(one) for one in case["claims"]) or case["verdict"],
             # The verdict is in the answer already.

@@ -33,7 +33,7 @@ def _exams() -> tuple[Path, Path]:
             run = exam / "runs" / f"case-{number:04d}"
             (run / "products").mkdir(parents=True)
             (run / "products" / "diagnosis.json").write_text(json.dumps(DIAGNOSIS))
-            (run / "sat.json").write_text(DONE)
+            (run / "done.json").write_text(DONE)
         made.append(folder / f"{seed}")
     return made[0], made[1]
 
@@ -104,7 +104,7 @@ def _exam(case: Case) -> Answer:
     elif what == "diagnosis":
         _spoil_json(case, run / "products" / "diagnosis.json")
     elif what == "sat":
-        _spoil_json(case, run / "sat.json")
+        _spoil_json(case, run / "done.json")
     elif what == "case":
         shutil.rmtree(case.pick(exam / "runs", run, exam / run.name))
     else:

@@ -25,8 +25,8 @@ def centroids(run: Path, table: Path, config: Centroids) -> None:
     good = np.isfinite(corrected.place[:, 0])
     click.echo(f"{config.out}: {int(good.sum())} of {len(good)} centroids corrected")
     if good.any():
-        left = np.sqrt((corrected.error[good] ** 2).mean(axis=0))
-        click.echo(f"  errors of the maps leave {left[0]:.2g} px in x, {left[1]:.2g} px in y")
+        added = np.sqrt((corrected.error[good] ** 2).mean(axis=0))
+        click.echo(f"  map errors add {added[0]:.2g} px rms in x, {added[1]:.2g} px in y")
     if not good.all():
         click.echo("  note: the others are off the detector or too close to masked pixels: NaN")
 

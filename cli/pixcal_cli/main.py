@@ -164,6 +164,6 @@ def main() -> None:
     try:
         sys.stdout.flush()
     except OSError:
-        # Nobody reads any more: keep the interpreter from saying so as it closes stdout.
+        # stdout is closed: keep the interpreter from complaining as it flushes it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(code)

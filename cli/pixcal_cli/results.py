@@ -216,15 +216,15 @@ def show_diagnosis(run: Path) -> None:
         "difference/scatter": lambda e: times(e["size"]),
         "significance σ": lambda e: f"{e['significance']:.1f}",
     }
-    told = [e for e in gap["where"] if e["significance"] > 0]
+    differing = [e for e in gap["where"] if e["significance"] > 0]
     rows = [
         (f"{e['domain']}: {e['title']}", *(cell(e) for cell in columns.values()))
-        for e in told[:MAX_ROWS]
+        for e in differing[:MAX_ROWS]
     ]
     if rows:
         show_table(("statistic", *columns), rows)
-        if len(told) > MAX_ROWS:
-            click.echo(f"  and {len(told) - MAX_ROWS} more in diagnosis.json")
+        if len(differing) > MAX_ROWS:
+            click.echo(f"  and {len(differing) - MAX_ROWS} more in diagnosis.json")
     if diagnosis["more_would_tell"]:
         click.echo(f"  recommended frames: {'; '.join(diagnosis['more_would_tell'])}")
 

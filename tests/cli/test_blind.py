@@ -22,8 +22,8 @@ def test_an_examination_from_beginning_to_end(
     diagnosis: dict[str, Any] = {"verdict": "no gap", "causes": [], "candidates": []}
     diagnosis["gap"] = {"after": 1.0, "where": []}
     (products / "diagnosis.json").write_text(json.dumps(diagnosis))
-    sat = {"code": "a", "seconds": {"diagnosis": 1.0, "maps": 0.0}, "no_maps": "not diagnosed"}
-    (products.parent / "sat.json").write_text(json.dumps(sat))
+    done = {"code": "a", "seconds": {"diagnosis": 1.0, "maps": 0.0}, "no_maps": "not diagnosed"}
+    (products.parent / "done.json").write_text(json.dumps(done))
     assert invoke(["blind", "run", str(exam), "--limit", "3", "--quiet"]) == 0
     assert capsys.readouterr().out.startswith("cases diagnosed: 0;")
     page = tmp_path / "page.md"

@@ -22,7 +22,7 @@ def busy(seconds: float) -> int:
 
 
 def test_work_within_its_bound_is_left_alone() -> None:
-    with Bound(5.0, ALL).kept():
+    with Bound(5.0, ALL).enforced():
         assert busy(0.05)
     # Nor is what follows, of which nothing is watched any more.
     assert busy(0.5)
@@ -30,7 +30,7 @@ def test_work_within_its_bound_is_left_alone() -> None:
 
 def test_work_that_goes_on_for_long_is_ended() -> None:
     begin = time.thread_time()
-    with pytest.raises(Exceeded), Bound(0.1, ALL).kept():
+    with pytest.raises(Exceeded), Bound(0.1, ALL).enforced():
         busy(20.0)
     assert time.thread_time() - begin < 5.0
     assert busy(0.3)
@@ -40,7 +40,7 @@ def test_waiting_is_no_work() -> None:
     """Nor is what other threads do: a busy machine changes no answer."""
     other = threading.Thread(target=busy, args=(0.6,))
     other.start()
-    with Bound(0.3, ALL).kept():
+    with Bound(0.3, ALL).enforced():
         time.sleep(0.6)
     other.join()
 
@@ -48,7 +48,7 @@ def test_waiting_is_no_work() -> None:
 def test_compiling_is_no_work() -> None:
     """A kernel within a kernel counts once; work after it counts."""
     begin = time.thread_time()
-    with Bound(0.4, ALL).kept(), event.trigger_event("numba:compile"):
+    with Bound(0.4, ALL).enforced(), event.trigger_event("numba:compile"):
         busy(0.5)
         with event.trigger_event("numba:compile"):
             busy(0.5)
@@ -59,7 +59,7 @@ def test_compiling_is_no_work() -> None:
             busy(0.5)
         busy(20.0)
 
-    with pytest.raises(Exceeded), Bound(0.4, ALL).kept():
+    with pytest.raises(Exceeded), Bound(0.4, ALL).enforced():
         go_on()
     assert time.thread_time() - begin < 5.0
 
@@ -72,7 +72,7 @@ def test_work_that_fills_the_memory_is_ended() -> None:
             held.append(np.ones(32 << 20, np.uint8))
             busy(0.1)
 
-    with pytest.raises(Exceeded), Bound(60.0, 600 << 20).kept():
+    with pytest.raises(Exceeded), Bound(60.0, 600 << 20).enforced():
         fill()
     assert len(held) < 40
 
@@ -80,11 +80,11 @@ def test_work_that_fills_the_memory_is_ended() -> None:
 def test_memory_that_the_process_held_before_is_not_counted() -> None:
     """A notebook with a large array open gets the answers of the command line."""
     before = np.ones(600 << 20, np.uint8)
-    beside = Runtime().beside
-    assert beside > 300 << 20
-    with Bound(5.0, 500 << 20, beside).kept():
+    excluded = Runtime().excluded_bytes
+    assert excluded > 300 << 20
+    with Bound(5.0, 500 << 20, excluded).enforced():
         busy(0.5)
-    with pytest.raises(Exceeded), Bound(5.0, 500 << 20).kept():
+    with pytest.raises(Exceeded), Bound(5.0, 500 << 20).enforced():
         busy(3.0)
     assert before.all()
 
@@ -97,5 +97,5 @@ def test_others_who_try_several_ways_do_not_go_on() -> None:
             except Exception:
                 continue
 
-    with pytest.raises(Exceeded), Bound(0.1, ALL).kept():
+    with pytest.raises(Exceeded), Bound(0.1, ALL).enforced():
         stubborn()

@@ -21,8 +21,8 @@ from distributed import Client, LocalCluster, Security
 
 from pixcal.engine import cluster as engine_cluster
 from pixcal.engine.cluster import AHEAD, MIN_AHEAD, workers_of
-from pixcal.engine.parcel import versions
 from pixcal.engine.plan import DASK_WORKER_BYTES, USABLE, make_plan
+from pixcal.engine.remote_task import versions
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.errors import ClusterError, DamagedError, InputError, PlanError
 

@@ -45,7 +45,7 @@ FORBIDDEN = {
     "http.server",
     "allow_pickle",
 }
-PICKLES = {"pipeline/pixcal/engine/parcel.py", "pipeline/pixcal/engine/cluster.py"}
+PICKLES = {"pipeline/pixcal/engine/remote_task.py", "pipeline/pixcal/engine/cluster.py"}
 """Tasks on their way to Dask's workers, made by this process; nothing else is ever unpickled."""
 STARTS = {"bench/blind_examination/second.py"}
 """The second bench, as a program of its own; what it is told are names of effects and numbers."""

@@ -314,7 +314,7 @@ def test_what_stands_in_the_way_is_refused(exam: tuple[Path, Path], tmp_path: Pa
     config = blind.MakeConfig(1, 3, "tiny")
     with pytest.raises(InputError, match="not empty"):
         blind.make(folder, tmp_path / "truth.json", config, SYNC)
-    with pytest.raises(InputError, match="there already"):
+    with pytest.raises(InputError, match="already exists"):
         blind.make(tmp_path / "new", sealed, config, SYNC)
     with pytest.raises(InputError, match="apart"):
         blind.make(tmp_path / "new", tmp_path / "new" / "truth.json", config, SYNC)
@@ -355,7 +355,7 @@ def test_cases_are_diagnosed_once_and_without_what_is_left_out(
     told = (folder / "score.json").read_text() + (folder / "score.md").read_text()
     assert found["seed"] is None
     assert "quadratic" not in told
-    assert len(found["sittings"]["codes"]) == 1
+    assert len(found["runs"]["codes"]) == 1
     assert blind.run(folder, blind.RunConfig(), SYNC) == (2, 1)
     assert asked == ["lag", "ipc", "nonlinearity"]
     found = blind.score(folder, sealed, blind.ScoreConfig(), SYNC)
@@ -366,7 +366,7 @@ def test_cases_are_diagnosed_once_and_without_what_is_left_out(
     # What was begun by other code is not gone on with.
     begun = folder / "runs" / "case-0003"
     write_json(begun / "begun.json", {"code": "other"})
-    (begun / "sat.json").unlink()
+    (begun / "done.json").unlink()
     (begun / "left").touch()
     assert blind.run(folder, blind.RunConfig(), SYNC) == (1, 0)
     assert not (begun / "left").exists()
@@ -537,7 +537,7 @@ def test_a_score_counts_and_is_shown(tmp_path: Path) -> None:
         "notes": [],
         "made": 10,
         "missing": ["case-0007", "case-0008"],
-        "sittings": {
+        "runs": {
             "codes": ["a", "b"],
             "median_seconds": {"diagnosis": 60.2, "maps": 1.9},
             "without_maps": 0,
@@ -642,7 +642,7 @@ def test_strong_effects_are_found_and_nothing_is_claimed(tmp_path: Path) -> None
                 assert count["right"] == count["of"], question
     asked = [q["of"] for part in found["parts"].values() for q in part["questions"].values()]
     assert sum(asked) > 10
-    assert found["sittings"]["without_maps"] == 0
+    assert found["runs"]["without_maps"] == 0
     biased = found["maps"]["biased"]
     assert biased["maps"] == 2
     assert biased["before"] > 3

@@ -130,8 +130,8 @@ def _stacks(
         raise InputError("frames: empty; give the frames of a fringe set by its name")
     if bias is not None:
         given.append(("bias/0", "bias", bias, 0.0))
-    for kind, ladder in (("dark", darks), ("flat", flats)):
-        for number, (exposure, stack) in enumerate(ladder.items()):
+    for kind, steps in (("dark", darks), ("flat", flats)):
+        for number, (exposure, stack) in enumerate(steps.items()):
             if not exposure >= 0:
                 raise InputError(f"{kind}s[{exposure!r}]: not an exposure time in seconds")
             given.append((f"{kind}/{number}", f"{kind}s[{exposure!r}]", stack, exposure))

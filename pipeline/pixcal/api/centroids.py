@@ -35,7 +35,7 @@ def correct_centroids(
     -------
     x, y, error_x, error_y : (n,) float64
         Corrected places, and what the errors of the maps leave in them, px, 1 sigma; NaN off the
-        detector, and where masked pixels hold more than a tenth of what is known of the place.
+        detector, and where masked pixels carry more than 10 % of the position information.
 
     Raises
     ------

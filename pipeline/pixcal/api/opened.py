@@ -41,7 +41,7 @@ class Picture:
     png: bytes = field(repr=False)
 
     def _repr_png_(self) -> bytes:
-        # The name by which IPython asks.
+        # IPython calls this method.
         return self.png
 
     def save(self, path: StrPath) -> Path:

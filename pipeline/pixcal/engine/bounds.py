@@ -12,7 +12,7 @@ from pathlib import Path
 
 from numba.core import event
 
-LOOK_S = 0.2  # interval between checks of the usage
+CHECK_INTERVAL_S = 0.2  # interval between checks of the usage
 OWN = 256 << 20  # bytes of a process that has only loaded pixcal
 
 
@@ -56,10 +56,10 @@ class Bound:
     # nor first use matter
     seconds: float
     memory: int = sys.maxsize  # bytes of this process
-    beside: int = 0  # bytes held for other work, which do not count
+    excluded_bytes: int = 0  # bytes held for other work, which do not count
 
     @contextmanager
-    def kept(self) -> Iterator[None]:
+    def enforced(self) -> Iterator[None]:
         """Context that ends its work by `Exceeded` above the limits."""
         # It acts between two steps of the interpreter: a compiled kernel runs to its end.
         thread, done, lock = threading.get_ident(), threading.Event(), threading.Lock()
@@ -72,8 +72,8 @@ class Bound:
         last = used() + self.seconds
 
         def watch() -> None:
-            while not done.wait(LOOK_S):
-                if used() > last or _beyond(self.memory + self.beside):
+            while not done.wait(CHECK_INTERVAL_S):
+                if used() > last or _beyond(self.memory + self.excluded_bytes):
                     with lock:
                         if not done.is_set():
                             raised = ctypes.pythonapi.PyThreadState_SetAsyncExc
@@ -89,7 +89,7 @@ class Bound:
                 done.set()
             watcher.join()
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """The limits in words."""
         memory = "" if self.memory == sys.maxsize else f" and {self.memory >> 20} MiB of memory"
         return f"{self.seconds:g} s of processor time{memory}"

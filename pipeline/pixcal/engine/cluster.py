@@ -24,13 +24,13 @@ from uuid import uuid4
 from distributed import Client, Future, KilledWorker, Security, as_completed
 from distributed.comm import CommClosedError
 
-from pixcal.engine.parcel import Job, RemoteTask, abandon, pack, versions
+from pixcal.engine.remote_task import Job, RemoteTask, abandon, pack, versions
 from pixcal.model.errors import ClusterError, InputError
 
 AHEAD = 4  # tasks submitted per thread, because the end of a task is reported with a delay
 # least number of submitted tasks, so that an adaptive cluster grows by demand
 MIN_AHEAD = 32
-LOOK_S = 5.0  # interval between checks of the number of threads
+CHECK_INTERVAL_S = 5.0  # interval between checks of the number of threads
 # files that mark a run directory in use (`pixcal.storage.lock`)
 HELD = (".lock", ".partial")
 
@@ -81,9 +81,9 @@ def run_on_cluster(
     packed = pack(function)
     with (
         _connect(address, quiet=quiet) as client,
-        _witness(packed.paths + pack(items[0]).paths) as witness,
+        _probe_file(packed.paths + pack(items[0]).paths) as probe,
     ):
-        job = Job(packed.data, packed.paths + witness, at_once, versions())
+        job = Job(packed.data, packed.paths + probe, at_once, versions())
         tasks = _Tasks(client, address, job, items, f"{label}-{uuid4().hex[:8]}")
         try:
             with _ctrl_c(tasks.interrupt):
@@ -136,7 +136,7 @@ def _announce(dashboard: str, quiet: bool) -> None:
 
 
 @contextmanager
-def _witness(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
+def _probe_file(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
     """A temporary file in the run directory: a worker that does not see it has another disk."""
     # A directory of the same name on the worker's own disk would pass all other checks.
     ups = (up for path in paths for up in path.parents)
@@ -152,18 +152,18 @@ def _witness(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
 
 
 @contextmanager
-def _ctrl_c(heard: Callable[[], None]) -> Iterator[None]:
+def _ctrl_c(on_interrupt: Callable[[], None]) -> Iterator[None]:
     """Report Ctrl-C in addition to raising it: exceptions in the library's callbacks are lost."""
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield
         return
 
-    def press(number: int, frame: FrameType | None) -> None:
-        heard()
+    def handler(number: int, frame: FrameType | None) -> None:
+        on_interrupt()
         before(number, frame)
 
-    signal.signal(signal.SIGINT, press)
+    signal.signal(signal.SIGINT, handler)
     try:
         yield
     finally:
@@ -237,7 +237,7 @@ class _Tasks:
             threads = self._client.nthreads().values()
             slots = sum(min(n, at_once) if at_once else n for n in threads)
             self._room = max(AHEAD * slots, MIN_AHEAD)
-            self._look_again = time.monotonic() + LOOK_S
+            self._look_again = time.monotonic() + CHECK_INTERVAL_S
         return self._room
 
     def _failure(self, error: BaseException, trace: Any) -> BaseException:

@@ -27,7 +27,7 @@ from rich.progress import (
 from threadpoolctl import ThreadpoolController
 
 from pixcal.engine.bounds import held_by_others
-from pixcal.engine.parcel import Job, RemoteTask, pack
+from pixcal.engine.remote_task import Job, RemoteTask, pack
 from pixcal.model.errors import ClusterError, InputError
 from pixcal.model.options import Running
 
@@ -52,11 +52,11 @@ class Runtime(Running):
         Bytes that the whole stage may use on this machine. Dask workers have their own limits.
     quiet : bool
         No progress on stderr.
-    beside : int
+    excluded_bytes : int
         Bytes that this process held for other work when this began, which ``memory`` leaves out.
     """
 
-    beside: int = field(default_factory=held_by_others, compare=False, repr=False)
+    excluded_bytes: int = field(default_factory=held_by_others, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         known = ("threads", "processes", "sync")

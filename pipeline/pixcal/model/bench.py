@@ -267,8 +267,8 @@ class SimulatedFrames:
         for name in self.compress:
             if name not in names:
                 raise InputError(f"compress: {name!r} is not one of {', '.join(names)}")
-        for key, ladder in (("darks", self.darks), ("flats", self.flats)):
-            times = [step.exptime_s for step in ladder]
+        for key, steps in (("darks", self.darks), ("flats", self.flats)):
+            times = [step.exptime_s for step in steps]
             if len(set(times)) < len(times):
                 raise InputError(f"{key}: two entries have the same exptime_s; join them")
         if self.flats and self.flat_rate_e_s is None:

@@ -53,7 +53,7 @@ class CrestView:
         return self.arrays["used"] > 0
 
     @cached_property
-    def turned(self) -> tuple[F64, F64]:
+    def rotated(self) -> tuple[F64, F64]:
         """Coordinates (point,) across and along the fringes, px."""
         ux, uy = np.array(self.direction) / np.hypot(*self.direction)
         x, y = self.arrays["x"], self.arrays["y"]
@@ -62,7 +62,7 @@ class CrestView:
     def on(self, k: int) -> Indices:
         """Numbers of the points on a path, in their order along it."""
         points = np.flatnonzero(self.arrays["k"] == k)
-        return points[np.argsort(self.turned[1][points])]
+        return points[np.argsort(self.rotated[1][points])]
 
 
 def crest_figure(view: CrestView) -> Figure:
@@ -100,7 +100,7 @@ def _colour(k: int) -> str:
 
 def _stretched(axes: Axes, view: CrestView, paths: I64, title: str) -> None:
     """Shapes of given paths side by side: position across the fringes less its mean."""
-    across, along = view.turned
+    across, along = view.rotated
     chosen = {int(k): (on := view.on(k))[view.used[on]] for k in paths}
     reach = max([float(np.ptp(across[on])) for on in chosen.values() if len(on)], default=0.0)
     noise = float(np.median(view.sigma_px)) or 1e-6
@@ -115,10 +115,10 @@ def _stretched(axes: Axes, view: CrestView, paths: I64, title: str) -> None:
     axes.set(xlabel="k", ylabel="along (px)", title=title)
     length = 10.0 ** np.floor(np.log10(max(0.6 * spacing, 1e-9)))
     low, high = axes.get_ylim()
-    foot = low - 0.09 * (high - low)
+    bar_y = low - 0.09 * (high - low)
     left = axes.get_xlim()[0]
-    axes.plot([left, left + length], [foot, foot], color=INK, lw=3, solid_capstyle="butt")
-    note(axes, f"{length:.3g} px", (left + length, foot), (5, 0), va="center", fontsize=8)
+    axes.plot([left, left + length], [bar_y, bar_y], color=INK, lw=3, solid_capstyle="butt")
+    note(axes, f"{length:.3g} px", (left + length, bar_y), (5, 0), va="center", fontsize=8)
     finish(axes, grid=False)
 
 
@@ -145,9 +145,9 @@ def _extract(axes: Axes, view: CrestView, extract: Extract, title: str) -> None:
     x, y, every = (view.arrays[name] for name in ("x", "y", "k"))
     for k in np.unique(every):
         axes.plot(x[view.on(k)], y[view.on(k)], color=_colour(int(k)), lw=1.2)
-    for odd, label in ((0, "crest"), (1, "valley")):
-        on = every % 2 == odd
-        axes.plot(x[on], y[on], "o", color=_colour(odd), ms=6, mec="white", mew=0.8, label=label)
+    for parity, label in ((0, "crest"), (1, "valley")):
+        on = every % 2 == parity
+        axes.plot(x[on], y[on], "o", color=_colour(parity), ms=6, mec="white", mew=0.8, label=label)
     axes.set(
         xlabel="x (px)",
         ylabel="y (px)",

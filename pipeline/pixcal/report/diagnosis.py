@@ -161,8 +161,8 @@ def largest(curves: Sequence[Facts]) -> list[Facts]:
 
 def differing(result: DiagnosisContents) -> list[Facts]:
     """Statistics that differ, the largest effect first."""
-    told = (c for c in result.curves if c["in_gap"] and c["significance"] > 0)
-    return sorted(told, key=lambda c: -abs(c["size"]))
+    differ = (c for c in result.curves if c["in_gap"] and c["significance"] > 0)
+    return sorted(differ, key=lambda c: -abs(c["size"]))
 
 
 def still_differing(result: DiagnosisContents) -> list[Facts]:

@@ -136,17 +136,17 @@ def curves_figure(curves: Sequence[Mapping[str, Any]], *, with_effects: bool = T
     """Statistics side by side (up to three): above the values, below their deviations."""
     named = [places(c) for c in curves if _is_named(c)]
     # space for the longest rotated label, inches
-    turned = max(
-        [0.075 * min(len(n), 12) for names in named if _turned(names) for n in names] or [0]
+    label_height = max(
+        [0.075 * min(len(n), 12) for names in named if _rotated(names) for n in names] or [0]
     )
     lines = max(_title(c).count("\n") + 1 for c in curves)
     figure, axes = axes_grid(
-        (WIDE * (1 + len(curves)) / 4, 5.0 + turned),
+        (WIDE * (1 + len(curves)) / 4, 5.0 + label_height),
         2,
         len(curves),
         left=0.9,
         right=0.35,
-        bottom=0.6 + turned,
+        bottom=0.6 + label_height,
         top=0.45 + 0.2 * lines,
         beside=0.9,
         between=0.2,
@@ -262,8 +262,8 @@ def _place_axis(axes: Axes, curve: Mapping[str, Any], x: F64, named: bool) -> No
     if named:
         names = places(curve)
         step = -(-len(names) // 16)
-        turn = 90 if _turned(names[::step]) else 0
-        axes.set_xticks(x[::step], [_plain(n, 12) for n in names[::step]], rotation=turn)
+        rotation = 90 if _rotated(names[::step]) else 0
+        axes.set_xticks(x[::step], [_plain(n, 12) for n in names[::step]], rotation=rotation)
         axes.set_xlim(-0.6, len(x) - 0.4)
         axes.tick_params(axis="x", labelsize=9)
         return
@@ -273,7 +273,7 @@ def _place_axis(axes: Axes, curve: Mapping[str, Any], x: F64, named: bool) -> No
     plain_ticks(axes.xaxis, low, high)
 
 
-def _turned(names: Sequence[str]) -> bool:
+def _rotated(names: Sequence[str]) -> bool:
     return sum(len(n) + 2 for n in names) > ROOM
 
 

@@ -24,8 +24,8 @@ _GAIN_WORDS = {
     "used_from": "gain used:",
     "with_rounding": "with rounding",
 }
-# of the flats: heading and significant digits
-_LADDER = {
+# of the steps of flats: heading and significant digits
+_STEPS = {
     "exptime_s": ("exposure (s)", 4),
     "frames": ("frames", 4),
     "level_adu": ("level (ADU)", 5),
@@ -106,10 +106,10 @@ def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
         intercept = number(straight.get("intercept_adu"), 2)
         title = f"Exposure-time steps of the flats, intercept {intercept} ADU"
         rows = [
-            [number(level.get(key), digits) for key, (_, digits) in _LADDER.items()]
+            [number(level.get(key), digits) for key, (_, digits) in _STEPS.items()]
             for level in straight["levels"]
         ]
-        yield Table(title, [words for words, _ in _LADDER.values()], rows)
+        yield Table(title, [words for words, _ in _STEPS.values()], rows)
     sets = {
         name: dict(_flat({k: v for k, v in entry.items() if k != "flags"}))
         | {f"quantisation.{k}": v for k, v in facts.get("quantisation", {}).get(name, {}).items()}

@@ -120,14 +120,14 @@ def _jobs(
 ) -> dict[str, partial[Any]]:
     """Every summary of a map that the page shows, by name."""
     calibration, group = run_dir / "reduce" / "calibration.zarr", run_dir / "fit" / "fit.zarr"
-    undone = run_dir / "corrected" / "corrected.zarr"
+    corrected_zarr = run_dir / "corrected" / "corrected.zarr"
     there = [name for name in (*DETECTOR_MAPS, "mask") if (calibration / name / INDEX).exists()]
     maps: dict[str, Source] = {f"detector/{n}": ArrayReader(calibration / n) for n in there}
     masks = {"detector": maps.pop("detector/mask")} if "mask" in there else {}
     jobs: dict[str, partial[Any]] = {}
     if fit is not None:
         outputs = {name: group / name for name in fit["outputs"]}
-        outputs |= {f"corrected/{name}": undone / name for name in corrected}
+        outputs |= {f"corrected/{name}": corrected_zarr / name for name in corrected}
         for key, path in outputs.items():
             both = ArrayReader(path), ArrayReader(path.with_name(f"{path.name}_sigma"))
             maps |= {f"{key}/delta": both[0], f"{key}/sigma": both[1]}

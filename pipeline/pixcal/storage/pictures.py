@@ -56,7 +56,7 @@ def inspect_picture(source: SourceFile) -> FrameFile:
             )
         header = Header((key, found, "") for key, found in source.header)
         exif = _exposure_s(picture)
-    told = exposure_s((header,))
+    listed = exposure_s((header,))
     return FrameFile(
         source,
         "picture",
@@ -65,7 +65,7 @@ def inspect_picture(source: SourceFile) -> FrameFile:
         shape=(pages, ny, nx),
         coding=_CODINGS[mode],
         mjd=time_stamp_mjd((header,)),
-        exptime_s=exif if told is None else told,
+        exptime_s=exif if listed is None else listed,
         temperature_c=temperature_c((header,)),
     )
 

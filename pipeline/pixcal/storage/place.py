@@ -75,9 +75,9 @@ def explained(url: str) -> Iterator[None]:
     except (PixcalError, MemoryError):
         raise
     except FileNotFoundError as error:
-        told = " ".join(str(error).split())
+        message = " ".join(str(error).split())
         # Some messages hold only the path, which the URL already gives.
-        reason = told if " " in told else os.strerror(errno.ENOENT)
+        reason = message if " " in message else os.strerror(errno.ENOENT)
         raise FileNotFoundError(errno.ENOENT, reason, url) from error
     except ImportError as error:
         scheme = url.partition("://")[0]

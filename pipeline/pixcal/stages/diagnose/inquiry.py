@@ -246,7 +246,7 @@ def _each_of(
     kinds: Mapping[str, K], ask: Callable[..., R], runtime: Runtime, label: str
 ) -> dict[str, R]:
     """Result of ``ask`` for each effect, by its name."""
-    bound = replace(OF_ESTIMATE, memory=runtime.memory, beside=runtime.beside)
+    bound = replace(OF_ESTIMATE, memory=runtime.memory, excluded_bytes=runtime.excluded_bytes)
     asked = partial(ask, bound=bound)
     results = run_tasks(asked, list(kinds.values()), runtime.here, label=label)
     return dict(zip(kinds, results, strict=True))

@@ -240,10 +240,10 @@ def detect(evidence: Evidence, kind: Signature, bound: Bound = OF_ESTIMATE) -> f
 def _kept_within(bound: Bound, ask: Callable[[Evidence], T], evidence: Evidence) -> T | str:
     """Result of ``ask`` within a bound, or why there is none."""
     try:
-        with bound.kept():
+        with bound.enforced():
             return ask(evidence)
     except Exceeded:
-        return f"not decided: an estimate may use {bound.told()}, this one would need more"
+        return f"not decided: an estimate may use {bound.describe()}, this one would need more"
     except NotImplementedError as error:
         return str(error)
     except np.linalg.LinAlgError:

@@ -110,13 +110,13 @@ def call(job: Job, item: PickledArguments) -> Any:
     """Do one task of a job; InputError if versions differ here, or its files are missing."""
     with _counting:
         if job.name in _abandoned:
-            raise ClusterError("the run was ended elsewhere")
+            raise ClusterError("the run was cancelled by its client")
         _going_on[job.name] += 1
     try:
         with _opening:
-            function, turn = _open(job)
-        _see(item.paths)
-        with turn:
+            function, slot = _open(job)
+        _require_visible(item.paths)
+        with slot:
             return function(cloudpickle.loads(item.data))
     finally:
         with _counting:
@@ -134,7 +134,7 @@ def abandon(name: str) -> int:
 def _open(job: Job) -> tuple[Callable[[Any], Any], AbstractContextManager[Any]]:
     """The function of a job, and the context in which it runs."""
     _compare(job.versions)
-    _see(job.paths)
+    _require_visible(job.paths)
     function = cloudpickle.loads(job.function)
     # Permanently, as in Dask's own workers, since the last task is unknown. Only now, when the
     # libraries that the function needs are loaded.
@@ -143,7 +143,7 @@ def _open(job: Job) -> tuple[Callable[[Any], Any], AbstractContextManager[Any]]:
     return function, BoundedSemaphore(job.at_once) if job.at_once else nullcontext()
 
 
-def _see(paths: tuple[Path, ...]) -> None:
+def _require_visible(paths: tuple[Path, ...]) -> None:
     """Refuse work on missing files; network disks may show them with a delay."""
     begin = time.monotonic()
     for path in paths:
