@@ -161,19 +161,9 @@ def command(
     arguments: Sequence[Callable[[Command], Command]] = (run_argument,),
     tasks: bool = True,
 ) -> Callable[[Command], click.Command]:
-    """A command of RUN (or another argument) with the options of a dataclass and of how to run.
+    """A command with the options of a dataclass, whose docstring and ``lines`` are its help.
 
-    Parameters
-    ----------
-    kind : type
-        The body receives an instance as ``config``, and a `Runtime` as ``runtime``. Its docstring
-        is the help text.
-    *lines : str
-        Examples for its help.
-    arguments : sequence of callable
-        What stands before the options, in this order.
-    tasks : bool
-        Whether it runs tasks, and so has options on how to run.
+    The body receives the ``arguments`` and a ``config``; if it runs ``tasks``, also a ``runtime``.
     """
 
     def decorate(body: Command) -> click.Command:

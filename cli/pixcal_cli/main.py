@@ -14,14 +14,23 @@ import click
 
 from pixcal import __version__
 from pixcal.model.errors import ClusterError, PixcalError
-from pixcal_cli.astrometry import astrometry
 from pixcal_cli.blind import blind
 from pixcal_cli.budget import budget
 from pixcal_cli.centroids import centroids, wcs
 from pixcal_cli.click_options import examples
 from pixcal_cli.compare import compare
-from pixcal_cli.crests import crests
-from pixcal_cli.steps import allan, diagnose, fit, ingest, reduce, report, run, simulate
+from pixcal_cli.steps import (
+    allan,
+    astrometry,
+    crests,
+    diagnose,
+    fit,
+    ingest,
+    reduce,
+    report,
+    run,
+    simulate,
+)
 
 LONG_WORD = 600
 """Characters of a word, such as a value that makes no sense, that are not shown in full."""
@@ -117,13 +126,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def invoke(args: Sequence[str]) -> int:
-    """Run one command line.
-
-    Returns
-    -------
-    int
-        0 on success, 2 for a usage or input error, 1 for anything else.
-    """
+    """Run a command line; returns 0 on success, 2 for a usage or input error, else 1."""
     try:
         if os.environ.get("_PIXCAL_COMPLETE"):  # a shell asks what may follow
             cli.main(args, prog_name="pixcal", standalone_mode=False)

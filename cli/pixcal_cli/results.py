@@ -251,6 +251,63 @@ def _closed(share: float, interval: Sequence[float]) -> str:
     return f"{100 * share:.1f} % ({low:.1f} to {high:.1f} %)"
 
 
+def show_crests(run: Path) -> None:
+    """Print the points, the fibres and the difference from the fit for each set."""
+    for name, facts in read_json(run / "crests" / "crests.json")["sets"].items():
+        _show_crests_of(name, facts)
+        click.echo(f"  {run / 'products' / f'crests-{name}.png'}")
+
+
+def _show_crests_of(name: str, facts: Mapping[str, Any]) -> None:
+    click.echo(
+        f"  {name}: {facts['points_used']} of {facts['points']} points, error per point "
+        f"{facts['point_sigma_median_px']:.2g} px, chi2 {facts['chi2_reduced']:.3g}"
+    )
+    geometry, agreement = facts["geometry"], facts["agreement"]
+    for parameter in ("centre_x", "centre_y", "distance", "baseline_x", "baseline_y", "baseline_z"):
+        value, sigma = geometry[f"{parameter}_mm"], geometry[f"{parameter}_sigma_mm"]
+        line = f"    {parameter:10s} {value:.6g} ± {sigma:.2g} mm"
+        if agreement is not None:
+            other = agreement["parameters"][parameter]
+            origin = ", mostly from its prior" if other["from_prior"] else ""
+            line += f", {other['difference_sigma']:+.2f} sigma from the fit{origin}"
+        click.echo(line)
+    if agreement is None:
+        click.echo(f"    not compared: {facts['agreement_note']}")
+    else:
+        click.echo(
+            f"    phase difference: {agreement['phase_rms_px']:.2g} px rms, "
+            f"{agreement['phase_sigma_px']:.2g} px expected"
+        )
+    for sentence in facts["warnings"]:
+        click.echo(f"    note: {sentence}")
+
+
+def show_astrometry(run: Path) -> None:
+    """Print the errors of star centroids, and the requirement of the mission."""
+    from pixcal.stages.astrometry import table  # here: for a fast `pixcal --help`
+
+    result = read_json(run / "astrometry" / "astrometry.json")
+    t, axes = result["telescope"], result["axes"]
+    bound = next(iter(axes.values()))["photon_bound"]
+    click.echo(
+        f"  {t['diameter_m']:g} m, {t['focal_length_m']:g} m, {t['wavelength_nm']:g} nm: "
+        f"{t['uas_per_px'] / 1e3:.3g} mas/px, {t['px_per_lambda_over_d']:.3g} px in λ/D; "
+        f"photon noise alone {bound['px']:.3g} px, {bound['uas']:.3g} µas"
+    )
+    header = ("error of a centroid", "along", "perfect grid", "measured maps", "gain")
+    show_table(header, table(result))
+    for name, axis in axes.items():
+        need = axis["positions_to_target"]
+        perfect, measured = ("-" if (n := need[k]) is None else n for k in ("perfect", "measured"))
+        click.echo(
+            f"  positions to {need['target_px']:.0e} px along {name}, if independent: "
+            f"{perfect} with a perfect grid, {measured} with maps"
+        )
+    show_notes(result["warnings"])
+    click.echo(f"  {run / 'products' / 'astrometry.png'}")
+
+
 def show_report(run: Path) -> None:
     """Print where the page is."""
     click.echo(f"  {run / 'products' / 'report.html'}")

@@ -1,4 +1,4 @@
-"""``pixcal run``, its steps one by one, and ``pixcal simulate``."""
+"""``pixcal run``, the commands of one stage each, and ``pixcal simulate``."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -81,15 +81,11 @@ def fit(run: Path, config: options.Fit, runtime: "Runtime") -> None:
 
 allan = step(options.Allan, "pixcal allan demo", "pixcal allan demo --region 0:64,0:64")
 
+crests = step(options.Crests, "pixcal crests demo", "pixcal crests demo --frames 1 --paths 4")
+
 
 def effect_list(text: str) -> tuple[str, ...]:
-    """Names of effects, comma-separated.
-
-    Raises
-    ------
-    InputError
-        If there are none: without the option every effect is a candidate.
-    """
+    """Names of effects, comma-separated; InputError if there are none."""
     names = tuple(name.strip() for name in text.split(",") if name.strip())
     if not names:
         raise InputError(
@@ -126,6 +122,12 @@ def diagnose(
     results.show_advice(run)
     results.show_diagnosis(run)
 
+
+astrometry = step(
+    options.Astrometry,
+    "pixcal astrometry demo --truth data_samples/demo-truth",
+    "pixcal astrometry demo --diameter 2.4 --focal-length 57.6 --electrons 1e6",
+)
 
 report = step(options.Report, "pixcal report demo")
 
