@@ -24,7 +24,8 @@ def image(figure: Figure, axes: Axes, values: NDArray[Any], scale: ColourScale, 
     ny, nx = values.shape
     drawn = axes.imshow(
         np.ma.masked_invalid(values),
-        norm=scale.norm,
+        vmin=scale.low,
+        vmax=scale.high,
         cmap=scale.colours,
         origin="lower",
         interpolation="nearest",

@@ -110,14 +110,9 @@ def _against_electrons(axes: Axes, view: AstrometryView) -> None:
         )
         errors = view.first["photons"][grid]
         if errors["px"] is not None:
-            axes.errorbar(
-                view.result["stars"]["electrons"],
-                errors["px"],
-                yerr=errors["err_px"],
-                fmt="o",
-                color=COLOURS[grid],
-                ms=5,
-            )
+            style: Any = {"fmt": "o", "color": COLOURS[grid], "ms": 5}
+            stars = view.result["stars"]["electrons"]
+            axes.errorbar(stars, errors["px"], yerr=errors["err_px"], **style)
     axes.axhline(view.target_px, color=GREEN, lw=1, label=f"target, {view.target_px:g} px")
     lowest = min([view.target_px, *(f for f in _floors(view).values() if f > 0)])
     axes.set_ylim(0.3 * lowest, 20 * float(photons[0]))
@@ -137,24 +132,11 @@ def _against_positions(axes: Axes, view: AstrometryView) -> None:
         known = np.isfinite(px)
         if not known.any():
             continue
-        axes.errorbar(
-            positions[known],
-            px[known],
-            yerr=error[known],
-            fmt="o-",
-            color=COLOURS[grid],
-            ms=4,
-            lw=1,
-            label=label,
-        )
+        style: Any = {"fmt": "o-", "color": COLOURS[grid], "ms": 4, "lw": 1, "label": label}
+        axes.errorbar(positions[known], px[known], yerr=error[known], **style)
         first = np.flatnonzero(known)[0]
-        axes.plot(
-            positions,
-            px[first] * np.sqrt(positions[first] / positions),
-            color=COLOURS[grid],
-            lw=0.8,
-            ls=":",
-        )
+        independent = px[first] * np.sqrt(positions[first] / positions)
+        axes.plot(positions, independent, color=COLOURS[grid], lw=0.8, ls=":")
         values += px[known].tolist()
     axes.axhline(view.target_px, color=GREEN, lw=1)
     axes.set_xscale("log", base=2)

@@ -97,14 +97,8 @@ def _precision(axes: Axes, result: Mapping[str, Any]) -> None:
         reached = line.median / np.sqrt(line.planned)
         axes.plot(line.planned, reached, "o", color=colour, ms=8 + 3 * before)
     for line, colour, style in zip(joined, (INK, GREY), ("-", "--"), strict=False):
-        axes.plot(
-            frames,
-            line.median / np.sqrt(frames),
-            color=colour,
-            ls=style,
-            lw=1.4,
-            label=f"{line.label}, frames of all sets",
-        )
+        bound, label = line.median / np.sqrt(frames), f"{line.label}, frames of all sets"
+        axes.plot(frames, bound, color=colour, ls=style, lw=1.4, label=label)
     if wanted:
         axes.axhline(wanted, color=RED, lw=1.2)
         text = f"wanted {number(wanted)} px"
@@ -113,16 +107,9 @@ def _precision(axes: Axes, result: Mapping[str, Any]) -> None:
             axes.plot((line.median / wanted) ** 2, wanted, "s", color=RED)
     if given:
         axes.axvline(given, color=RED, lw=1.2)
-        note(
-            axes,
-            f"{number(given)} frames of each set",
-            (given, 0.02),
-            (-5, 0),
-            ha="right",
-            xycoords=("data", "axes fraction"),
-            color=RED,
-            fontsize=10,
-        )
+        text = f"{number(given)} frames of each set"
+        drawing: Any = {"xycoords": ("data", "axes fraction"), "ha": "right", "fontsize": 10}
+        note(axes, text, (given, 0.02), (-5, 0), color=RED, **drawing)
     axes.set(xscale="log", yscale="log", xlim=(frames[0], frames[-1]))
     plain_ticks(axes.xaxis, *axes.get_xlim(), most=9)
     plain_ticks(axes.yaxis, *axes.get_ylim(), most=9)

@@ -76,25 +76,15 @@ def _against(axes: Axes, view: ComponentView) -> None:
     unit, symbol = unit_for([view.reach], "px"), SYMBOLS[view.name]
     end = view.reach * unit.factor
     shown, colours = np.ma.masked_equal(view.picture, 0), SEQUENTIAL.with_extremes(bad="w")
-    axes.imshow(
-        shown,
-        origin="lower",
-        extent=(-end, end, -end, end),
-        cmap=colours,
-        norm=LogNorm(1, max(2, int(view.picture.max()))),
-        interpolation="nearest",
-    )
+    norm = LogNorm(1, max(2, int(view.picture.max())))
+    style: Any = {"origin": "lower", "interpolation": "nearest", "cmap": colours, "norm": norm}
+    axes.imshow(shown, extent=(-end, end, -end, end), **style)
     line, slope = np.array([-end, end]), view.facts["slope"]
     axes.plot(line, line, color=GREY, ls="--", lw=1, label="equal")
     if slope is not None:
         axes.plot(line, slope * line, color=RED, lw=1.3, label=f"slope {slope:.3f}")
-    axes.set(
-        xlim=(-end, end),
-        ylim=(-end, end),
-        title=f"{symbol}: pixels",
-        xlabel=f"{symbol} in 1 ({unit.label})",
-        ylabel=f"{symbol} in 2 ({unit.label})",
-    )
+    axes.set(xlim=(-end, end), ylim=(-end, end), title=f"{symbol}: pixels")
+    axes.set(xlabel=f"{symbol} in 1 ({unit.label})", ylabel=f"{symbol} in 2 ({unit.label})")
     axes.legend(fontsize=8, loc="upper left", framealpha=0.9)
 
 
@@ -126,15 +116,8 @@ def _scales(axes: Axes, view: ComponentView) -> None:
         (beyond, "beyond_noise", "D", RED, "difference beyond noise"),
     ):
         if which.any():
-            axes.errorbar(
-                at[which],
-                line("px", key)[which],
-                line("error_px", key)[which],
-                fmt=marker,
-                color=colour,
-                ms=6,
-                label=label,
-            )
+            style: Any = {"fmt": marker, "color": colour, "ms": 6, "label": label}
+            axes.errorbar(at[which], line("px", key)[which], line("error_px", key)[which], **style)
     axes.set_yscale("log")
     _round_off(axes, np.concatenate([expected, common[seen], difference]))
     names = [str(s["side_px"]) for s in scales]

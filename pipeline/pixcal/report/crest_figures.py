@@ -148,13 +148,8 @@ def _extract(axes: Axes, view: CrestView, extract: Extract, title: str) -> None:
     for parity, label in ((0, "crest"), (1, "valley")):
         on = every % 2 == parity
         axes.plot(x[on], y[on], "o", color=_colour(parity), ms=6, mec="white", mew=0.8, label=label)
-    axes.set(
-        xlabel="x (px)",
-        ylabel="y (px)",
-        title=title,
-        xlim=(x0 - 0.5, x0 + nx - 0.5),
-        ylim=(y0 - 0.5, y0 + ny - 0.5),
-    )
+    axes.set(xlim=(x0 - 0.5, x0 + nx - 0.5), ylim=(y0 - 0.5, y0 + ny - 0.5))
+    axes.set(xlabel="x (px)", ylabel="y (px)", title=title)
     axes.legend(loc="upper right", fontsize=8, framealpha=0.9)
 
 

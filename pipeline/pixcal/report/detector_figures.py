@@ -29,13 +29,8 @@ def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
     style = {"fmt": "o", "color": BLUE, "ms": 3.5, "elinewidth": 1}
     left.errorbar(level, variance, error, **style, label="pairs of flats")
     at = np.geomspace(level.min(), level.max(), 200)
-    left.plot(
-        at,
-        at / curve["gain"] + curve["read_variance"],
-        color=INK,
-        lw=1.2,
-        label=f"{curve['gain']:.4g} e⁻/ADU",
-    )
+    label = f"{curve['gain']:.4g} e⁻/ADU"
+    left.plot(at, at / curve["gain"] + curve["read_variance"], color=INK, lw=1.2, label=label)
     if curve["read_variance"] > 0:
         left.axhline(curve["read_variance"], color=GREY, ls=":", label="read noise")
     left.set(xscale="log", yscale="log", ylabel="variance (ADU²)")
@@ -63,14 +58,8 @@ def nonuniformity(patterns: Mapping[str, Curves]) -> Figure:
     (cycles/px), ``amplitude`` and ``noise`` of the spectrum, ``at`` (px) and ``profile`` of the
     means.
     """
-    figure, grid = axes_grid(
-        (WIDE, 2.6 * len(patterns) + 0.3),
-        len(patterns),
-        3,
-        right=0.1,
-        beside=0.85,
-        width_ratios=[1.3, 1, 1],
-    )
+    size, count = (WIDE, 2.6 * len(patterns) + 0.3), len(patterns)
+    figure, grid = axes_grid(size, count, 3, right=0.1, beside=0.85, width_ratios=[1.3, 1, 1])
     for (spectrum, *profiles), (name, curves) in zip(grid, patterns.items(), strict=True):
         unit = str(curves["unit"]).replace("e-", "e⁻")
         _spectra(spectrum, curves)
@@ -116,14 +105,8 @@ def linearity(levels: Sequence[Mapping[str, Any]]) -> Figure:
     left_out = [v for v in levels if v.get("deviation_percent") is None]
     figure, ((axes,),) = axes_grid((WIDE, 3.2), left=1.0)
     axes.axhline(0, color=INK, lw=1, ls="--")
-    axes.plot(
-        [v["level_e"] / 1e3 for v in used],
-        [v["deviation_percent"] for v in used],
-        "o-",
-        color=BLUE,
-        lw=1.2,
-        ms=6,
-    )
+    at = [v["level_e"] / 1e3 for v in used]
+    axes.plot(at, [v["deviation_percent"] for v in used], "o-", color=BLUE, lw=1.2, ms=6)
     for level in left_out:
         axes.axvline(level["level_e"] / 1e3, color=INK, ls=":", lw=1)
     axes.margins(y=0.25)

@@ -54,16 +54,8 @@ def gap_figure(bars: Sequence[Bar], causes: Mapping[str, Mapping[str, Any]]) -> 
         figure, ((axes,),) = axes_grid(size, left=margin, top=0.35)
         _bars(axes, bars, with_after=False)
         return figure
-    figure, ((left, right),) = axes_grid(
-        size,
-        1,
-        2,
-        left=margin,
-        bottom=0.85,
-        top=0.35,
-        beside=_room(_cause_names(causes)),
-        width_ratios=[1.25, 1],
-    )
+    margins = {"left": margin, "bottom": 0.85, "top": 0.35, "beside": _room(_cause_names(causes))}
+    figure, ((left, right),) = axes_grid(size, 1, 2, **margins, width_ratios=[1.25, 1])
     _bars(left, bars, with_after=True)
     _causes(right, causes)
     figure.legend(loc="lower center", ncols=4, fontsize=9.5, frameon=False)
@@ -140,19 +132,10 @@ def curves_figure(curves: Sequence[Mapping[str, Any]], *, with_effects: bool = T
         [0.075 * min(len(n), 12) for names in named if _rotated(names) for n in names] or [0]
     )
     lines = max(_title(c).count("\n") + 1 for c in curves)
-    figure, axes = axes_grid(
-        (WIDE * (1 + len(curves)) / 4, 5.0 + label_height),
-        2,
-        len(curves),
-        left=0.9,
-        right=0.35,
-        bottom=0.6 + label_height,
-        top=0.45 + 0.2 * lines,
-        beside=0.9,
-        between=0.2,
-        sharex="col",
-        height_ratios=[2.1, 1],
-    )
+    size = WIDE * (1 + len(curves)) / 4, 5.0 + label_height
+    margins = {"left": 0.9, "right": 0.35, "bottom": 0.6 + label_height, "top": 0.45 + 0.2 * lines}
+    drawing: Any = {"beside": 0.9, "between": 0.2, "sharex": "col", "height_ratios": [2.1, 1]}
+    figure, axes = axes_grid(size, 2, len(curves), **margins, **drawing)
     for n, (top, below, curve) in enumerate(zip(axes[0], axes[1], curves, strict=True)):
         _panel(top, below, curve, with_effects)
         if n == 0:
@@ -177,16 +160,8 @@ def _panel(top: Axes, below: Axes, curve: Mapping[str, Any], with_effects: bool)
         _simulated(top, x + side * BESIDE * named, band, colour, label, named)
         sigmas = _numbers(curve["z" if key == "nominal" else "z_after"])
         _deviations(below, x + side * BESIDE * named, sigmas, colour, named)
-    top.plot(
-        x,
-        measured * scale.factor,
-        "o" if named else "o-",
-        color=INK,
-        ms=5,
-        lw=1,
-        label=ORDER[0],
-        zorder=5,
-    )
+    style: Any = {"color": INK, "ms": 5, "lw": 1, "label": ORDER[0], "zorder": 5}
+    top.plot(x, measured * scale.factor, "o" if named else "o-", **style)
     _value_axis(top, curve, drawn * scale.factor, scale)
     _sigma_axis(below, [_numbers(curve[k]) for k in ("z", "z_after")])
     _place_axis(below, curve, x, named)
@@ -208,17 +183,8 @@ def _simulated(
     low, high = np.fmin(band["low"], band["value"]), np.fmax(band["high"], band["value"])
     if named:
         errors = [band["value"] - low, high - band["value"]]
-        axes.errorbar(
-            x,
-            band["value"],
-            errors,
-            fmt="s",
-            color=colour,
-            ms=5,
-            elinewidth=2.4,
-            alpha=0.8,
-            label=label,
-        )
+        style: Any = {"fmt": "s", "color": colour, "ms": 5, "elinewidth": 2.4, "alpha": 0.8}
+        axes.errorbar(x, band["value"], errors, label=label, **style)
         return
     axes.fill_between(x, low, high, color=colour, alpha=0.25, lw=0)
     # The nominal curve stays visible below one that coincides with it.

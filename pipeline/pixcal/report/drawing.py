@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Colormap, Normalize
+from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
@@ -57,11 +57,6 @@ class ColourScale:
     high: float
     colours: Colormap
     beyond: str
-
-    @property
-    def norm(self) -> Normalize:
-        """For matplotlib."""
-        return Normalize(self.low, self.high)
 
 
 def symmetric_scale(image: NDArray[Any]) -> ColourScale:
@@ -133,30 +128,6 @@ def place(figure: Figure, left: float, bottom: float, width: float, height: floa
     """Axes at a place given in inches from the lower left corner."""
     w, h = figure.get_size_inches()
     return figure.add_axes((left / w, bottom / h, width / w, height / h))
-
-
-def draw_map(
-    axes: Axes,
-    summary: MapSummary,
-    scale: ColourScale,
-    factor: float = 1.0,
-    start: tuple[int, int] = (0, 0),
-) -> ScalarMappable:
-    """A map with x to the right and y upwards, in pixels."""
-    ny, nx = summary.shape
-    y0, x0 = start
-    drawn = draw_blocks(
-        axes,
-        summary.image * factor,
-        summary.block,
-        start,
-        norm=scale.norm,
-        cmap=scale.colours,
-        aspect="auto",
-    )
-    axes.set(xlim=(x0 - 0.5, x0 + nx - 0.5), ylim=(y0 - 0.5, y0 + ny - 0.5))
-    axes.locator_params(nbins=5)
-    return drawn
 
 
 def draw_blocks(

@@ -16,7 +16,7 @@ from pixcal.report.drawing import (
     Unit,
     axes_grid,
     block_note,
-    draw_map,
+    draw_blocks,
     finish,
     fit_box,
     limits,
@@ -43,8 +43,12 @@ def offsets(
     scale = symmetric_scale(delta.image * unit.factor)
 
     main = place(figure, left, bottom, width, height)
-    drawn = draw_map(main, delta, scale, unit.factor, start)
-    main.set_ylabel("y (px)")
+    style: Any = {"cmap": scale.colours, "vmin": scale.low, "vmax": scale.high, "aspect": "auto"}
+    drawn = draw_blocks(main, delta.image * unit.factor, delta.block, start, **style)
+    x = start[1] + np.arange(delta.shape[1], dtype=float)
+    y = start[0] + np.arange(delta.shape[0], dtype=float)
+    main.set(xlim=(x[0] - 0.5, x[-1] + 0.5), ylim=(y[0] - 0.5, y[-1] + 0.5), ylabel="y (px)")
+    main.locator_params(nbins=5)
     main.tick_params(labelbottom=False)
     bar = place(figure, left, bottom + height + 0.15, width, 0.17)
     figure.colorbar(drawn, cax=bar, orientation="horizontal", extend=scale.beyond)
@@ -54,8 +58,6 @@ def offsets(
 
     below = place(figure, left, 0.6, width, 1.75)
     beside = place(figure, left + width + 0.25, bottom, WIDE - left - width - 0.6, height)
-    x = start[1] + np.arange(delta.shape[1], dtype=float)
-    y = start[0] + np.arange(delta.shape[0], dtype=float)
     _profile(below, x, delta.columns, sigma.columns, unit, upright=False)
     _profile(beside, y, delta.rows, sigma.rows, unit, upright=True)
     below.set_xlim(main.get_xlim())
@@ -63,17 +65,10 @@ def offsets(
     below.set(xlabel="x (px)", ylabel=f"column mean\n({unit.label})")
     beside.set(xlabel=f"row mean ({unit.label})")
     beside.tick_params(labelleft=False)
+    corner = (left + width + 0.2) / WIDE, 1.85 / total
+    style = {"frameon": False, "fontsize": 9.5, "title": "Means", "alignment": "left"}
     handles, labels = below.get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        loc="upper left",
-        frameon=False,
-        fontsize=9.5,
-        title="Means",
-        alignment="left",
-        bbox_to_anchor=((left + width + 0.2) / WIDE, 1.85 / total),
-    )
+    figure.legend(handles, labels, loc="upper left", bbox_to_anchor=corner, **style)
     numbers = (
         f"rms {delta.std * unit.factor:.3g}, robust {delta.robust_std * unit.factor:.3g}\n"
         f"median error {sigma.median * unit.factor:.3g}  ({unit.label})"
@@ -155,23 +150,11 @@ def _histogram(axes: Axes, offset: MapContents, unit: Unit, colour: str) -> None
     at = np.linspace(edges[0], edges[-1], 400)
     top = len(values) * (edges[1] - edges[0]) / (np.sqrt(2 * np.pi) * spread)
     normal = top * np.exp(-(((at - middle) / spread) ** 2) / 2)
-    axes.plot(
-        at,
-        np.maximum(normal, 0.1),
-        color=colour,
-        lw=1.0,
-        ls="--",
-        label=f"normal, σ = {spread:.3g} (robust)",
-    )
+    label = f"normal, σ = {spread:.3g} (robust)"
+    axes.plot(at, np.maximum(normal, 0.1), color=colour, lw=1.0, ls="--", label=label)
     if np.isfinite(noise) and noise > 0:
-        axes.axvspan(
-            middle - noise,
-            middle + noise,
-            color=colour,
-            alpha=0.25,
-            lw=0,
-            label=f"noise, ±1σ = ±{noise:.3g}",
-        )
+        label = f"noise, ±1σ = ±{noise:.3g}"
+        axes.axvspan(middle - noise, middle + noise, color=colour, alpha=0.25, lw=0, label=label)
 
 
 def power(maps: Sequence[MapContents], vectors: Mapping[str, tuple[float, float]]) -> Figure:

@@ -73,12 +73,9 @@ def section(name: str, contents: Contents) -> str:
 
 
 def _fill(template: str, contents: Contents, **values: Any) -> str:
+    blocks: Any = {"trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(
-        loader=PackageLoader("pixcal.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=PackageLoader("pixcal.report"), autoescape=True, undefined=StrictUndefined, **blocks
     )
     environment.filters["not_tested"] = text.not_tested
     environment.filters |= vars(verdict) | vars(diagnosis_words) | vars(tables)

@@ -36,15 +36,8 @@ def temporal(sets: Sequence[SetContents]) -> Figure:
     """Parameters of each frame, a column for each set, with histograms of the phase below."""
     moving = any(s.series.moving for s in sets)
     rows = 5 if moving else 3
-    figure, grid = axes_grid(
-        (WIDE, 1.55 * (rows + 1) + 1.2),
-        rows + 1,
-        len(sets),
-        left=0.95,
-        beside=0.95,
-        top=0.35,
-        between=0.5,
-    )
+    margins = {"left": 0.95, "top": 0.35, "beside": 0.95, "between": 0.5}
+    figure, grid = axes_grid((WIDE, 1.55 * (rows + 1) + 1.2), rows + 1, len(sets), **margins)
     for column, fringes in zip(grid.T, sets, strict=True):
         step = -(-len(fringes.series.time) // 6000)  # every n-th frame of longer runs
         time, clock = _clock(fringes.series.time[::step])
@@ -204,13 +197,8 @@ def _allan_lines(
     if knee := measured.get("knee_frames"):
         for each in (axes, below):
             each.axvline(knee, color=color, ls=":", lw=1.4)
-        axes.annotate(
-            f" knee: {knee:.0f} frames",
-            (knee, 0.04),
-            xycoords=("data", "axes fraction"),
-            fontsize=10,
-            color=color,
-        )
+        style: Any = {"xycoords": ("data", "axes fraction"), "fontsize": 10, "color": color}
+        axes.annotate(f" knee: {knee:.0f} frames", (knee, 0.04), **style)
 
 
 def _add_clock(axes: Axes, frames: F64, seconds: F64) -> None:
