@@ -320,7 +320,7 @@ def test_other_versions_are_refused(
 
 
 def test_tasks_are_planned_into_the_memory_of_the_workers(cluster: Any) -> None:
-    limits = {worker.memory for worker in workers_of(cluster.address, quiet=True)}
+    limits = {worker["memory_limit"] for worker in workers_of(cluster.runtime).values()}
     assert limits == {1200 * MIB}
     room = int(USABLE * 1200 * MIB) - DASK_WORKER_BYTES
     for per_task, expected in ((room // 2, 2), (room // 2 + 1, 1), (room, 1), (0, 2)):

@@ -17,13 +17,14 @@ from pixcal.estimators.test_statistics.noise import OUTLIERS
 from pixcal.report import diagnosis_maps as maps
 from pixcal.report import diagnosis_words
 from pixcal.report import page as page_module
-from pixcal.report.contents import Contents, DiagnosisContents, StageRecord
+from pixcal.report.contents import Contents, DiagnosisContents
 from pixcal.report.diagnosis_figures import Bar, curves_figure, gap_figure
 from pixcal.report.diagnosis_words import percent, place, places, with_interval
 from pixcal.report.drawing import png
-from pixcal.report.page import render, section
+from pixcal.report.page import fill, render
 from pixcal.report.tables import provenance
 from pixcal.report.verdict import cards
+from pixcal.storage.manifest import Manifest
 
 NOTICED = 3.7
 NASTY = "<script>alert('$\\frac{1}{$')</script> & \"quotes\"\n\t\x07é漢"
@@ -237,7 +238,7 @@ def words(text: str) -> str:
 
 
 def diagnosis(of: Contents) -> Shown:
-    return Shown(section("diagnosis", of))
+    return Shown(fill("diagnosis", of))
 
 
 def text_of(shown: Shown) -> str:
@@ -379,7 +380,8 @@ def test_a_replay_is_not_shown_as_a_strength_of_zero() -> None:
 
 def test_options_with_parameters_are_named_in_the_provenance() -> None:
     effects = [{"effect": "ipc", "parameters": {"share": 0.1}}, {"effect": "lag"}]
-    stage = StageRecord("corrected", "k", 2, "0", {"effects": effects, "own": []}, {})
+    config = {"effects": effects, "own": []}
+    stage = vars(Manifest("corrected", 2, "k", config, {}))
     stages, _ = provenance(Contents({"detector": {}}, (stage,)))
     assert stages.rows[0][-1] == "effects ipc, lag; own –"
 
@@ -476,7 +478,7 @@ def test_a_cause_names_its_law_and_what_that_closes_where_it_differs() -> None:
 
 @pytest.mark.usefixtures("without_figures")
 def test_a_richer_nominal_bench_is_named() -> None:
-    stage = StageRecord("diagnose", "k", 2, "0", {"nominal": {"ipc": {}, "lag": {}}}, {})
+    stage = {"stage": "diagnose", "config": {"nominal": {"ipc": {}, "lag": {}}}}
     assert "Included from the start: ipc and lag." in (
         diagnosis(dataclasses.replace(contents(a_diagnosis()), stages=(stage,))).text
     )

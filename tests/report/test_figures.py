@@ -13,7 +13,7 @@ from PIL import Image
 
 from pixcal.report import detector_figures, map_figures, map_panels, set_figures
 from pixcal.report.colours import DIVERGING, MASKED, PALETTE, SEQUENTIAL
-from pixcal.report.contents import FrameHistory, MapContents, SetContents
+from pixcal.report.contents import MapContents, SetContents
 from pixcal.report.drawing import png, span_scale, symmetric_scale, unit_for
 from pixcal.report.summary import (
     ArraySource,
@@ -148,7 +148,8 @@ def a_set(frames: int, *, moving: bool) -> SetContents:
     rng = np.random.default_rng(3)
     time = 0.14 * np.arange(frames)
     free = 1e-6 * rng.normal(size=(2, frames)) * moving
-    series = FrameHistory(time, np.ones(frames), np.ones(frames), rng.uniform(-3, 3, frames), *free)
+    series = {"time": time, "B": np.ones(frames), "A": np.ones(frames)}
+    series |= {"phi": rng.uniform(-3, 3, frames), "dkx": free[0], "dky": free[1]}
     level = a_map((40, 50), 2e4, 10.0)
     chi2 = a_map((40, 50), 1.0, 0.1)
     facts = {"frames": frames, "chi2_reduced": 1.01, "crb_median_px": 3e-4}

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pixcal.report.contents import Contents, FrameHistory, MapContents, SetContents
-from pixcal.report.page import section
+from pixcal.report.contents import Contents, MapContents, SetContents
+from pixcal.report.page import fill
 from pixcal.report.summary import ArraySource, summarise, summarise_flags
 from pixcal.report.verdict import cards, findings, headline
 
@@ -34,8 +34,7 @@ def contents(
         "batch_period_s": 0.14,
     } | (facts or {})
     one = summarise(ArraySource(np.ones(shape)))
-    zeros = np.zeros(3)
-    series = FrameHistory(zeros, zeros, zeros, zeros, zeros, zeros)
+    series = dict.fromkeys(("time", "B", "A", "phi", "dkx", "dky"), np.zeros(3))
     summary = summarise_flags(ArraySource(flags))
     fringes = SetContents("s", chosen, one, one, one, summary, series, allan or dict(WHITE))
     sigma = summarise(ArraySource(np.full(shape, 2e-4)))
@@ -158,7 +157,7 @@ def test_a_finding_on_several_sets_is_one_sentence() -> None:
 
 def test_corrected_maps_are_shown_beside_those_of_the_fit() -> None:
     run = contents()
-    assert "corrected" not in section("maps", run)
-    shown = section("maps", replace(run, corrected=run.offsets))
+    assert "corrected" not in fill("maps", run)
+    shown = fill("maps", replace(run, corrected=run.offsets))
     assert shown.index("Map of δx.") < shown.index("Map of δx, corrected.")
     assert shown.count("this is the map to use") == 1

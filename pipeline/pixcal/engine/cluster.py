@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -26,6 +25,7 @@ from distributed.comm import CommClosedError
 
 from pixcal.engine.remote_task import Job, RemoteTask, abandon, pack, versions
 from pixcal.model.errors import ClusterError, InputError
+from pixcal.model.options import Running
 
 AHEAD = 4  # tasks submitted per thread, because the end of a task is reported with a delay
 # least number of submitted tasks, so that an adaptive cluster grows by demand
@@ -37,54 +37,36 @@ HELD = (".lock", ".partial")
 Ended = Callable[[int, Any], None]
 
 
-@dataclass(frozen=True)
-class DaskWorker:
-    """A worker of a cluster; ``memory``: its limit (bytes), 0 without one."""
-
-    address: str
-    threads: int
-    memory: int
-
-
-def workers_of(address: str, *, quiet: bool) -> list[DaskWorker]:
-    """The present workers of a cluster; waits for at least one."""
-    with _connect(address, quiet=quiet) as client:
-        workers = client.scheduler_info(n_workers=-1)["workers"]
-        if not workers and not quiet:
-            print(f"no workers at {address} yet: dask worker {address}", file=sys.stderr)
+def workers_of(runtime: Running) -> dict[str, dict[str, Any]]:
+    """The present workers of a cluster by address, as Dask describes them; waits for one."""
+    with _connect(runtime) as client:
+        workers: dict[str, dict[str, Any]] = client.scheduler_info(n_workers=-1)["workers"]
+        if not workers and not runtime.quiet:
+            at = runtime.cluster
+            print(f"no workers at {at} yet: dask worker {at}", file=sys.stderr)
         while not workers:
             time.sleep(0.2)
             workers = client.scheduler_info(n_workers=-1)["workers"]
-    return [
-        DaskWorker(where, facts["nthreads"], facts["memory_limit"] or 0)
-        for where, facts in workers.items()
-    ]
+    return workers
 
 
 def run_on_cluster(
-    address: str,
-    function: Callable[[Any], Any],
-    items: Sequence[Any],
-    ended: Ended,
-    *,
-    label: str,
-    at_once: int,
-    quiet: bool,
+    function: Callable[[Any], Any], items: Sequence[Any], runtime: Running, ended: Ended, label: str
 ) -> None:
-    """Do tasks on a cluster, ``at_once`` at a time per worker process (0: one per thread).
+    """Do tasks on a cluster; ``ended`` gets the number and result of each.
 
-    ``ended`` gets the number and result of each. InputError: no scheduler, or workers lack files or
-    versions; ClusterError: the scheduler is lost, or a task kills workers again and again.
+    InputError: no scheduler, or workers lack files or versions; ClusterError: the scheduler is
+    lost, or a task kills workers again and again.
     """
     if not items:
         return
     packed = pack(function)
     with (
-        _connect(address, quiet=quiet) as client,
+        _connect(runtime) as client,
         _probe_file(packed.paths + pack(items[0]).paths) as probe,
     ):
-        job = Job(packed.data, packed.paths + probe, at_once, versions())
-        tasks = _Tasks(client, address, job, items, f"{label}-{uuid4().hex[:8]}")
+        job = Job(packed.data, packed.paths + probe, runtime.workers, versions())
+        tasks = _Tasks(client, runtime.cluster, job, items, f"{label}-{uuid4().hex[:8]}")
         try:
             with _ctrl_c(tasks.interrupt):
                 for number, result in tasks.results():
@@ -92,14 +74,15 @@ def run_on_cluster(
                     tasks.stop_if_interrupted()
                 tasks.stop_if_interrupted()
         except (CommClosedError, CancelledError) as error:
-            message = f"--cluster {address}: the connection to the scheduler was lost"
+            message = f"--cluster {runtime.cluster}: the connection to the scheduler was lost"
             raise ClusterError(message) from error
         finally:
             tasks.cancel()
 
 
 @contextmanager
-def _connect(address: str, *, quiet: bool) -> Iterator[Client]:
+def _connect(runtime: Running) -> Iterator[Client]:
+    address = runtime.cluster
     if address.startswith("tls:") and not Security().get_connection_args("client")["ssl_context"]:
         raise InputError(
             f"--cluster {address}: Dask's configuration names no certificates; give them there "
@@ -118,7 +101,7 @@ def _connect(address: str, *, quiet: bool) -> Iterator[Client]:
             ) from error
         with client:
             with suppress(KeyError):
-                _announce(client.dashboard_link, quiet)
+                _announce(client.dashboard_link, runtime.quiet)
             yield client
     finally:
         log.disabled = disabled

@@ -72,16 +72,16 @@ def _plan_on_cluster(what: str, bytes_per_task: int, shared_bytes: int, runtime:
     from pixcal.engine.cluster import workers_of
 
     make_plan(what, 0, shared_bytes, Runtime(memory=runtime.memory))
-    workers = workers_of(runtime.cluster, quiet=runtime.quiet)
-    at_once = runtime.workers or max(worker.threads for worker in workers)
-    for worker in workers:
-        if not worker.memory:
+    workers = workers_of(runtime)
+    at_once = runtime.workers or max(worker["nthreads"] for worker in workers.values())
+    for address, worker in workers.items():
+        if not worker["memory_limit"]:
             continue
-        have, need = int(USABLE * worker.memory), DASK_WORKER_BYTES + bytes_per_task
+        have, need = int(USABLE * worker["memory_limit"]), DASK_WORKER_BYTES + bytes_per_task
         if need > have:
             raise PlanError(
                 f"--cluster {runtime.cluster}: {what} needs {need >> 20} MiB in a worker, "
-                f"{worker.address} may use {have >> 20} MiB ({USABLE:.0%} of its limit); start it "
+                f"{address} may use {have >> 20} MiB ({USABLE:.0%} of its limit); start it "
                 "with a larger --memory-limit"
             )
         at_once = min(at_once, (have - DASK_WORKER_BYTES) // max(bytes_per_task, 1))

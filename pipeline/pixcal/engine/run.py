@@ -34,7 +34,7 @@ from pixcal.model.options import Running
 R = TypeVar("R")
 DEATHS = 3  # tolerated successive deaths of workers without a completed task in between
 
-Ended = Callable[[int, Any], None]
+Ended = Callable[[int, Any], None]  # gets the number and the result of a task
 
 
 @dataclass(frozen=True)
@@ -132,28 +132,15 @@ def run_tasks(
             # Here, not at the top: it takes long to import, and starts threads.
             from pixcal.engine.cluster import run_on_cluster
 
-            run_on_cluster(
-                runtime.cluster,
-                function,
-                items,
-                ended,
-                label=label,
-                at_once=runtime.workers,
-                quiet=runtime.quiet,
-            )
+            run_on_cluster(function, items, runtime, ended, label)
         elif runtime.cluster == "processes":
             run_in_processes(function, items, runtime.n_workers, ended)
         elif runtime.cluster == "threads" and len(items) > 1:
             run_in_threads(function, items, runtime.n_workers, ended)
         else:
-            run_here(function, items, ended)
+            for number, item in enumerate(items):
+                ended(number, function(item))
     return [results[number] for number in range(len(items))]
-
-
-def run_here(function: Callable[[Any], Any], items: Sequence[Any], ended: Ended) -> None:
-    """Do the tasks in this thread; ``ended`` gets the number and the result of each."""
-    for number, item in enumerate(items):
-        ended(number, function(item))
 
 
 def run_in_threads(

@@ -1,5 +1,7 @@
 """Array types by data type; docstrings give shapes and units."""
 
+from typing import Any, Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,3 +14,14 @@ U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
+
+
+class Source(Protocol):
+    """A map (y, x) that is read block by block, such as an array on disk."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Rows and columns."""
+
+    def read(self, *ranges: tuple[int, int]) -> NDArray[Any]:
+        """A block, given (start, stop) of rows and of columns."""

@@ -22,23 +22,6 @@ class MapContents:
 
 
 @dataclass(frozen=True)
-class FrameHistory:
-    """Parameters of each frame (t,): time in s, phi in rad, dkx and dky in rad/px."""
-
-    time: F64
-    B: F64
-    A: F64
-    phi: F64
-    dkx: F64
-    dky: F64
-
-    @property
-    def moving(self) -> bool:
-        """Whether the fringe vector was free in each frame."""
-        return bool(np.any(self.dkx != 0) or np.any(self.dky != 0))
-
-
-@dataclass(frozen=True)
 class SetContents:
     """One fringe set."""
 
@@ -48,8 +31,14 @@ class SetContents:
     visibility: MapSummary
     chi2: MapSummary
     flags: FlagSummary
-    series: FrameHistory
+    # parameters of each frame (t,): `time` in s, `B`, `A`, `phi` in rad, `dkx`, `dky` in rad/px
+    series: Mapping[str, F64]
     allan: dict[str, Any] | None = None  # its entry in ``allan.json``
+
+    @property
+    def moving(self) -> bool:
+        """Whether the fringe vector was free in each frame."""
+        return bool(np.any(self.series["dkx"] != 0) or np.any(self.series["dky"] != 0))
 
 
 # title and unit of each map of the reduction
@@ -94,23 +83,11 @@ class DiagnosisContents:
 
 
 @dataclass(frozen=True)
-class StageRecord:
-    """Facts from the manifest of a stage."""
-
-    name: str
-    key: str
-    format: int
-    pixcal: str
-    config: dict[str, Any]
-    inputs: dict[str, str]
-
-
-@dataclass(frozen=True)
 class Contents:
     """A whole run."""
 
     acquisition: dict[str, Any]  # as in `acquisition.json`
-    stages: tuple[StageRecord, ...]
+    stages: tuple[Mapping[str, Any], ...]  # as in the manifest of each
     # by array, its ``frames.json`` and the shape (y, x) of its frames; empty where not ingested
     arrays: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     detector: DetectorContents = field(default_factory=DetectorContents)
@@ -143,7 +120,7 @@ class Contents:
     @property
     def nominal_effects(self) -> list[str]:
         """Effects of the nominal simulation (``--nominal``)."""
-        given = [s.config.get("nominal") for s in self.stages if s.name == "diagnose"]
+        given = [s["config"].get("nominal") for s in self.stages if s["stage"] == "diagnose"]
         return list(given[0] or ()) if given else []
 
     def masks(self) -> dict[str, FlagSummary]:

@@ -53,7 +53,7 @@ def render(contents: Contents) -> str:
     """Draw all figures and write the page: HTML without external references."""
     what = "pixel offsets" if contents.has_fringes else "detector"
     name = contents.acquisition["detector"].get("name")
-    return _fill(
+    return fill(
         "page",
         contents,
         title=f"{name}: {what}" if name else what.capitalize(),
@@ -67,12 +67,8 @@ def render(contents: Contents) -> str:
     )
 
 
-def section(name: str, contents: Contents) -> str:
-    """One section alone."""
-    return _fill(name, contents)
-
-
-def _fill(template: str, contents: Contents, **values: Any) -> str:
+def fill(template: str, contents: Contents, **values: Any) -> str:
+    """The page, or a section of it."""
     blocks: Any = {"trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(
         loader=PackageLoader("pixcal.report"), autoescape=True, undefined=StrictUndefined, **blocks

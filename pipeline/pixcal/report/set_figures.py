@@ -34,13 +34,13 @@ TURN = ("0", "π", "2π")  # labels of a phase axis
 
 def temporal(sets: Sequence[SetContents]) -> Figure:
     """Parameters of each frame, a column for each set, with histograms of the phase below."""
-    moving = any(s.series.moving for s in sets)
+    moving = any(s.moving for s in sets)
     rows = 5 if moving else 3
     margins = {"left": 0.95, "top": 0.35, "beside": 0.95, "between": 0.5}
     figure, grid = axes_grid((WIDE, 1.55 * (rows + 1) + 1.2), rows + 1, len(sets), **margins)
     for column, fringes in zip(grid.T, sets, strict=True):
-        step = -(-len(fringes.series.time) // 6000)  # every n-th frame of longer runs
-        time, clock = _clock(fringes.series.time[::step])
+        step = -(-len(fringes.series["time"]) // 6000)  # every n-th frame of longer runs
+        time, clock = _clock(fringes.series["time"][::step])
         for axes, (label, values) in zip(column, _parameters(fringes, moving), strict=False):
             size = float(np.clip(70 / np.sqrt(max(len(time), 1)), 1.2, 4.5))
             drawing: Any = {"ms": size, "mew": 0}
@@ -53,24 +53,25 @@ def temporal(sets: Sequence[SetContents]) -> Figure:
         column[rows - 1].set_xlabel(
             f"time ({clock})" + (f", every {step}th frame" if step > 1 else "")
         )
-        _phases(column[-1], np.mod(fringes.series.phi, 2 * np.pi))
+        _phases(column[-1], np.mod(fringes.series["phi"], 2 * np.pi))
     return figure
 
 
 def _parameters(fringes: SetContents, moving: bool) -> list[tuple[str, F64]]:
     """Label and values of each row."""
     series = fringes.series
-    level = float(np.nanmean(series.B)) or 1.0
-    contrast = fringes.visibility.median * series.A / np.where(series.B != 0, series.B, np.nan)
+    mean, amplitude = series["B"], series["A"]
+    level = float(np.nanmean(mean)) or 1.0
+    contrast = fringes.visibility.median * amplitude / np.where(mean != 0, mean, np.nan)
     rows = [
-        ("B − mean (%)", 100 * (series.B / level - 1)),
+        ("B − mean (%)", 100 * (mean / level - 1)),
         ("visibility", contrast),
-        ("φ (rad)", np.mod(series.phi, 2 * np.pi)),
+        ("φ (rad)", np.mod(series["phi"], 2 * np.pi)),
     ]
     if moving:
-        unit = unit_for(np.concatenate([series.dkx, series.dky]), "rad/px")
-        rows.append((f"δkx ({unit.label})", series.dkx * unit.factor))
-        rows.append((f"δky ({unit.label})", series.dky * unit.factor))
+        unit = unit_for(np.concatenate([series["dkx"], series["dky"]]), "rad/px")
+        rows.append((f"δkx ({unit.label})", series["dkx"] * unit.factor))
+        rows.append((f"δky ({unit.label})", series["dky"] * unit.factor))
     return rows
 
 

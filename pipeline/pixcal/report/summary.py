@@ -7,30 +7,19 @@ use all pixels; spectra use windows spread over the map.
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from math import gcd
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.kernels.robust import median_and_sigma
-from pixcal.model.arrays import F32, F64, I64, U8, Mask
+from pixcal.model.arrays import F32, F64, I64, U8, Mask, Source
 
 SHOWN_PIXELS = 400  # most blocks along the longer side of a map on the page
 SAMPLE = 1_000_000  # most pixels of a histogram
 BAND_ROWS = 128  # rows read at a time: one row of chunks
 SEGMENT = 256  # longest side of the windows whose power spectra are averaged
 DETAIL = 96  # side of the window that is shown pixel by pixel when the whole map cannot be
-
-
-class Source(Protocol):
-    """A map (y, x) that is read block by block, such as an array on disk."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Rows and columns."""
-
-    def read(self, *ranges: tuple[int, int]) -> NDArray[Any]:
-        """A block, given (start, stop) of rows and of columns."""
 
 
 @dataclass(frozen=True)

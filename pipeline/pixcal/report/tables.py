@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pixcal.model.flags import PixelFlag
-from pixcal.report.contents import Contents, SetContents, StageRecord
+from pixcal.report.contents import Contents, SetContents
 from pixcal.report.summary import FlagSummary, MapSummary
 from pixcal.report.text import (
     date_of_mjd,
@@ -206,20 +206,20 @@ def is_table(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and all(isinstance(v, Mapping) for v in value)
 
 
-def _stages(stages: Sequence[StageRecord]) -> Iterator[Table]:
+def _stages(stages: Sequence[Mapping[str, Any]]) -> Iterator[Table]:
     """Inputs of each stage, by key; and the digests of the files."""
-    present = {stage.name: stage.key for stage in stages}
+    present = {stage["stage"]: stage["key"] for stage in stages}
     rows, files = [], []
     for stage in stages:
         # The acquisition has a table of its own.
-        options = {k: v for k, v in stage.config.items() if k != "acquisition"}
+        options = {k: v for k, v in stage["config"].items() if k != "acquisition"}
         made_from = [
             name if present.get(name, key) == key else f"another {name}, {key}"
-            for name, key in stage.inputs.items()
+            for name, key in stage["inputs"].items()
         ]
-        facts = [stage.name, stage.pixcal, str(stage.format), stage.key]
+        facts = [stage["stage"], stage["pixcal"], str(stage["format"]), stage["key"]]
         rows.append([*facts, ", ".join(made_from) or "–", _listed(options) or "–"])
-        files += [[name, key] for name, key in stage.inputs.items() if name not in present]
+        files += [[name, key] for name, key in stage["inputs"].items() if name not in present]
     header = ["stage", "pixcal", "format", "key", "made from", "options"]
     yield Table("Stages", header, rows)
     if files:

@@ -13,6 +13,7 @@ from pixcal.effects import effects
 from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.test_statistics.gap import CHANCE, sigmas_among, sigmas_of
+from pixcal.model.arrays import Source
 from pixcal.model.config import result_options
 from pixcal.model.options import Report as Config
 from pixcal.report.contents import (
@@ -20,10 +21,8 @@ from pixcal.report.contents import (
     Contents,
     DetectorContents,
     DiagnosisContents,
-    FrameHistory,
     MapContents,
     SetContents,
-    StageRecord,
 )
 from pixcal.report.page import render
 from pixcal.report.summary import (
@@ -32,7 +31,6 @@ from pixcal.report.summary import (
     SAMPLE,
     SEGMENT,
     RatioSource,
-    Source,
     detail,
     spectrum,
     summarise,
@@ -82,10 +80,7 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
     summary = advice(run_dir)
     return Contents(
         acquisition=read_json(run_dir / "ingest" / "acquisition.json"),
-        stages=tuple(
-            StageRecord(m.stage, m.key, m.format, m.pixcal, m.config, m.inputs)
-            for m in manifests.values()
-        ),
+        stages=tuple(map(vars, manifests.values())),
         arrays=_arrays(run_dir, manifests),
         detector=DetectorContents(
             facts,
@@ -172,7 +167,7 @@ def _set(
 ) -> SetContents:
     maps = {of: results[f"set/{name}/{of}"] for of in ("iota", "visibility", "chi2")}
     columns = ("time", "B", "A", "phi", "dkx", "dky")
-    series = FrameHistory(*(ArrayReader(group / name / n).read().astype(float) for n in columns))
+    series = {n: ArrayReader(group / name / n).read().astype(float) for n in columns}
     flags = results[f"flags/set/{name}"]
     return SetContents(name, facts, **maps, flags=flags, series=series, allan=allan.get(name))
 

@@ -60,10 +60,6 @@ class Build:
         """Folder for temporary files of the build."""
         return self.folder / SCRATCH
 
-    def discard(self) -> None:
-        """Remove everything written: the next run starts from the beginning."""
-        discard(self.folder, self.folder.parents[1])
-
     def journal(self) -> set[str]:
         """Steps noted as done by an earlier, interrupted build."""
         # Only steps of the present boot: after a power failure, data may not have reached the disk.

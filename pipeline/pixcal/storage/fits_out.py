@@ -37,22 +37,13 @@ class FrameWriter:
     ) -> "FrameWriter":
         """Write the header and allocate the space on disk; OSError if there is none."""
         header = _header(shape, dtype, cards or {}).tostring(padding=True).encode("ascii")
-        writer = cls(path, shape, dtype, len(header))
+        data_bytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        blocks = -(-data_bytes // BLOCK)
         with aside_of(path).open("wb") as file:
             file.write(header)
             file.flush()
-            os.posix_fallocate(file.fileno(), 0, writer.file_bytes)
-        return writer
-
-    @property
-    def data_bytes(self) -> int:
-        """Bytes of the samples."""
-        return int(np.prod(self.shape, dtype=np.int64)) * np.dtype(self.dtype).itemsize
-
-    @property
-    def file_bytes(self) -> int:
-        """Bytes of the file: header and data, each filled up to whole blocks."""
-        return self.data_at + -(-self.data_bytes // BLOCK) * BLOCK
+            os.posix_fallocate(file.fileno(), 0, len(header) + blocks * BLOCK)
+        return cls(path, shape, dtype, len(header))
 
     def write_rows(self, row: int, data: NDArray[Any], plane: int = 0) -> None:
         """Write whole rows (rows, x) of a plane; different ones may be written at the same time."""

@@ -3,7 +3,7 @@
 import errno
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -144,17 +144,14 @@ class UrlFolder:
     path: UrlPath
 
     def write(self, files: Iterable[File], *, durable: bool = False) -> None:
-        for batch in _batches(files):
-            self._send(batch)
-
-    def _send(self, batch: Mapping[str, bytes]) -> None:
         system, root = self.path.filesystem()
-        with explained(self.path.url):
-            if not system.async_impl:
-                # Those of the object stores are, and there are no folders to be made.
-                for folder in sorted({f"{root}/{name}".rpartition("/")[0] for name in batch}):
-                    system.makedirs(folder, exist_ok=True)
-            system.pipe({f"{root}/{name}": content for name, content in batch.items()})
+        for batch in _batches(files):
+            with explained(self.path.url):
+                if not system.async_impl:
+                    # Those of the object stores are, and there are no folders to be made.
+                    for folder in sorted({f"{root}/{name}".rpartition("/")[0] for name in batch}):
+                        system.makedirs(folder, exist_ok=True)
+                system.pipe({f"{root}/{name}": content for name, content in batch.items()})
 
     def ends(self, names: Sequence[str]) -> Iterator[tuple[int, bytes]]:
         system, root = self.path.filesystem()

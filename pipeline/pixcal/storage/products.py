@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 import numpy as np
 from astropy.io import fits
@@ -17,7 +17,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from pixcal import __version__
-from pixcal.model.arrays import F32, U8
+from pixcal.model.arrays import F32, U8, Source
 from pixcal.model.errors import DamagedError
 from pixcal.model.flags import PixelFlag
 from pixcal.storage.fits_out import BLOCK
@@ -117,20 +117,11 @@ Card = tuple[str, Any, str]
 _NOT_A_MAP = (OSError, KeyError, TypeError, ValueError, AstropyUserWarning, fits.VerifyError)
 
 
-class Rows(Protocol):
-    """A map (y, x) that is read in bands of rows, as `pixcal.storage.cube.ArrayReader` does."""
-
-    shape: tuple[int, ...]
-
-    def read(self, rows: tuple[int, int], /) -> NDArray[Any]:
-        """Rows from one to before another."""
-
-
 def write_map(
     path: Path,
-    data: Rows | F32,
-    sigma: Rows | F32,
-    mask: Rows | U8,
+    data: Source | F32,
+    sigma: Source | F32,
+    mask: Source | U8,
     cards: Sequence[Card],
     history: Sequence[str] = (),
 ) -> None:
@@ -158,7 +149,7 @@ def write_map(
             _write_image(file, hdu.header, source)
 
 
-def _write_image(file: BinaryIO, header: fits.Header, source: Rows | NDArray[Any]) -> None:
+def _write_image(file: BinaryIO, header: fits.Header, source: Source | NDArray[Any]) -> None:
     """Append an image; its header holds the checksums."""
     # No time in the comments, so that equal maps have equal bytes.
     header["CHECKSUM"] = ("0" * 16, "by pixcal")

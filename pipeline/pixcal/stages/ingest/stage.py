@@ -30,7 +30,7 @@ from pixcal.model.options import Ingest as Config
 from pixcal.stages.ingest.arrays import FRAMES_A_PIECE, Writers, find_kept, take_over
 from pixcal.stages.ingest.cut_frames import cut_from, cut_warning
 from pixcal.stages.steps import run_steps
-from pixcal.storage.artefact import Build
+from pixcal.storage.artefact import Build, discard
 from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.cube_place import base_of, chosen_base, cubes_of
 from pixcal.storage.fits_in import FrameFile
@@ -388,7 +388,7 @@ def _close(
         raise
     except InputError:
         # The data that were read are unreliable.
-        made.discard()
+        discard(made.folder, made.folder.parents[1])
         raise
     write_json(made.folder / "acquisition.json", to_plain(described))
     listed, places, warnings = {}, {}, []
