@@ -67,11 +67,8 @@ class Truth:
     def error(self, offsets: F64, modes: int | None = None) -> float:
         """Error of a map, px rms, with modes removed.
 
-        Parameters
-        ----------
-        offsets : (y, x) offsets along the fringe axis, px; NaN where there are none
-        modes : how many of the seven modes of the physics note's section 2 are taken off: the first
-            ``PLANE``, or all
+        ``offsets``: (y, x) along the fringe axis, px; NaN where there are none. ``modes``: how many
+        of the seven modes of the physics note's section 2 are removed: the first ``PLANE``, or all.
         """
         good = np.isfinite(offsets)
         y, x = np.nonzero(good)
@@ -89,14 +86,9 @@ def phase_bound(
 ) -> F64:
     """Cramér-Rao bound of a pixel's phase, the frames known; rad², shape (p,).
 
-    Parameters
-    ----------
-    iota : (p,) mean light, e-
-    visibility : alpha / iota
-    psi : (p,) phase, rad
-    level, amplitude : (t,) B and A of the frames
-    turn : (p, t) phi of the frames at the pixels, rad
-    noise : (p,) variance without the shot noise of the light, e-²
+    ``iota``: (p,) mean light, e-. ``visibility``: alpha / iota. ``psi``: (p,) phase, rad.
+    ``level, amplitude``: (t,) B and A of the frames. ``turn``: (p, t) phi of the frames at the
+    pixels, rad. ``noise``: (p,) variance without the shot noise of the light, e-².
     """
     wave, slope = np.sin(psi[:, None] + turn), np.cos(psi[:, None] + turn)
     alpha = visibility * iota[:, None]

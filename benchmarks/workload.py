@@ -144,12 +144,8 @@ class Workload:
     def scan(self, threads: int, *, weighted: bool = False) -> float:
         """Seconds to decode all chunks and add their samples, shared among threads.
 
-        The barest use of the fit's own reader.
-
-        Parameters
-        ----------
-        weighted : add them as the fit does, each sample with its weight, by the fit's own kernel:
-            what no fit can do without
+        The barest use of the fit's own reader. ``weighted``: add them as the fit does, each sample
+        with its weight, by the fit's own kernel: what no fit can do without.
         """
 
         def part(number: int) -> None:

@@ -44,15 +44,10 @@ FLATS_S = (0.006, 0.014, 0.022, 0.03)
 
 
 def draw_bench(layout: Layout, rng: np.random.Generator) -> Bench:
-    """A bench within the ranges of real ones.
+    """A bench within the ranges of real ones; ``rng`` is separate from that of the case's truth.
 
     One fringe set has random phases and the other a ramp, because some effects are detectable only
     with one of these.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        For the case's layout, separate from that of its truth.
     """
     detector = SimulatedDetector(
         shape=layout.shape,

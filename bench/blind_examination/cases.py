@@ -35,19 +35,9 @@ MAX_SEED = 10**17
 
 
 def make(out: Path, sealed: Path, config: MakeConfig, runtime: Runtime) -> Examination:
-    """Make an examination.
+    """Make an examination: the cases in ``out``, when all are complete, the truth in ``sealed``.
 
-    Parameters
-    ----------
-    out : Path
-        Directory of the cases; it appears when all are complete.
-    sealed : Path
-        File of the truth.
-
-    Raises
-    ------
-    InputError
-        If an output exists already, or the truth would lie inside the cases.
+    InputError if an output exists already, or the truth would lie inside the cases.
     """
     _check(out, sealed, config)
     seed = EXAMINATION + secrets.randbelow(MAX_SEED) if config.seed is None else config.seed

@@ -81,19 +81,9 @@ class Examination:
 
 
 def draw_examination(cases: int, seed: int, size: str, bench: str = "both") -> Examination:
-    """Draw the truth of all cases.
+    """Draw the truth of all cases; InputError if the second bench is needed and cannot be run.
 
-    Parameters
-    ----------
-    size : str
-        One of `LAYOUTS`.
-    bench : str
-        Simulator of the cases: ``second``, ``own`` or ``both``.
-
-    Raises
-    ------
-    InputError
-        If the second bench is requested and cannot be run.
+    ``size``: one of `LAYOUTS`. ``bench``: simulator of the cases, ``second``, ``own`` or ``both``.
     """
     rng = np.random.default_rng([seed, _TRUTH])
     absent = catalogue()[2] if bench != "own" else ()

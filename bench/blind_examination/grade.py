@@ -73,15 +73,7 @@ QUESTIONS = {
 
 
 def grade(case: str, truth: Truth, diagnosis: Diagnosis | None, error: str = "") -> Grade:
-    """Compare a diagnosis with the truth.
-
-    Parameters
-    ----------
-    diagnosis : mapping, optional
-        ``diagnosis.json``; None if the diagnosis failed.
-    error : str
-        Reason of the failure.
-    """
+    """Compare ``diagnosis.json`` with the truth; None for a failed one, with its ``error``."""
     variant = ", ".join(f"{d.effect}: {d.variant} {d.strength:.3g}" for d in truth.drawn)
     times = min((d.times for d in truth.drawn if d.times is not None), default=None)
     about = (case, truth.part, truth.names, variant, times, truth.left_out)

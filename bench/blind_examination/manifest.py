@@ -49,13 +49,7 @@ def write_manifest(folder: Path, examination: Examination, commitment: str) -> N
 
 
 def read_manifest(folder: Path) -> ExaminationManifest:
-    """Read the manifest.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
+    """Read the manifest; InputError if there is none."""
     file = folder / FILE
     if not file.is_file():
         raise InputError(f"{file}: not found; give a directory that 'pixcal blind make' wrote")

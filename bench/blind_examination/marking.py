@@ -29,27 +29,10 @@ _TIMED = ("diagnosis", "maps")
 
 
 def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> dict[str, Any]:
-    """Score an examination: ``score.json`` and ``score.md`` in its folder.
+    """Score an examination: ``score.json``, also returned, and ``score.md`` in its folder.
 
-    Cases that were not run yet count as missing and are not scored.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the cases.
-    sealed : Path
-        The truth.
-
-    Returns
-    -------
-    dict
-        Contents of ``score.json``.
-
-    Raises
-    ------
-    InputError
-        If the truth does not belong to the cases, no case was run, or examinations of several
-        sizes are given.
+    Cases that were not run yet count as missing and are not scored. InputError if the truth does
+    not belong to the cases, no case was run, or examinations of several sizes are given.
     """
     exams = [(folder, sealed), *config.also]
     _require_alike([own for own, _ in exams])

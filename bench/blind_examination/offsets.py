@@ -61,21 +61,9 @@ def true_offsets(truth: Truth, bench: Bench, layout: Layout) -> tuple[F64, F64]:
 def offset_errors(
     products: Path, acquisition: Path, truth: Truth, bench: Bench, layout: Layout
 ) -> tuple[AxisError, ...]:
-    """Errors of the maps of a case.
+    """Errors of the maps of a case in ``products``, as ``pixcal fit --with-diagnosis`` left them.
 
-    Parameters
-    ----------
-    products : Path
-        Folder of the maps, as ``pixcal fit --with-diagnosis`` leaves it.
-    acquisition, bench : Path, Bench
-        Of the case.
-    layout : Layout
-        Of its examination.
-
-    Raises
-    ------
-    InputError
-        If a map is damaged, or fitted by a model whose modes are not known.
+    InputError if a map is damaged, or fitted by a model whose modes are not known.
     """
     fitted: Sets = read_json(products / "fit.json")["sets"]
     if any(facts["crb_median_px"] is None for facts in fitted.values()):

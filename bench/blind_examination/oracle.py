@@ -46,23 +46,9 @@ class Oracle:
 def ask_oracle(
     acquisition: Path, diagnosed: Path, truth: Truth, bench: Bench, runtime: Runtime
 ) -> Oracle:
-    """Simulate the true effects.
+    """Simulate the true effects; InputError if that is not possible on the nominal bench.
 
-    Parameters
-    ----------
-    acquisition : Path
-        Of the case.
-    diagnosed : Path
-        The artefact of its diagnosis, whose statistics are used.
-    truth : Truth
-        Of the library's own effects.
-    bench : Bench
-        Of the case.
-
-    Raises
-    ------
-    InputError
-        If the effects cannot be simulated on the nominal bench.
+    ``diagnosed``: the artefact of the case's diagnosis, whose statistics are used.
     """
     scratch = Path(tempfile.mkdtemp(prefix="pixcal-oracle-"))
     try:

@@ -30,14 +30,8 @@ def check_parameters(
 ) -> list[ParameterCheck]:
     """Checks of every parameter for which the diagnosis gives an error.
 
-    Parameters
-    ----------
-    true : mapping
-        Parameters as in a bench file; missing ones have their defaults.
-    estimated : mapping
-        All parameters.
-    errors : mapping
-        By name of the parameter, as in ``uncertainty`` of the diagnosis.
+    ``true``: parameters as in a bench file; missing ones have their defaults. ``estimated``: all.
+    ``errors``: by name of the parameter, as in ``uncertainty`` of the diagnosis.
     """
     whole = to_plain(parse_effects({effect: dict(true)}, "truth")[0])
     if "couplings" in whole:

@@ -36,19 +36,9 @@ LARGE = ("ingest", "reduce", "sweep", "fit", "corrected")
 
 
 def run(folder: Path, config: RunConfig, runtime: Runtime) -> tuple[int, int]:
-    """Diagnose the cases of a folder, except those diagnosed before.
+    """Diagnose the cases of a folder, except those diagnosed before; numbers of cases and failures.
 
-    Returns
-    -------
-    (int, int)
-        Numbers of cases diagnosed now, and of failures.
-
-    Raises
-    ------
-    InputError
-        If the folder has no examination.
-    PlanError
-        If a case does not fit the memory.
+    InputError if the folder has no examination, PlanError if a case does not fit the memory.
     """
     manifest = read_manifest(folder)
     pending = [
@@ -63,24 +53,9 @@ def run(folder: Path, config: RunConfig, runtime: Runtime) -> tuple[int, int]:
 
 
 def share(what: str, size: str, cases: int, runtime: Runtime) -> tuple[Runtime, Runtime]:
-    """Number of simultaneous cases, and the memory of each, which has one core.
+    """Runtime for all cases, and for each, which has one core and a share of the memory.
 
-    Parameters
-    ----------
-    what : str
-        Name of the work, for messages.
-    size : str
-        Of the examination.
-
-    Returns
-    -------
-    (Runtime, Runtime)
-        For all cases, and for each case.
-
-    Raises
-    ------
-    PlanError
-        If not even one case fits the memory.
+    ``what``: name of the work, for messages. PlanError if not even one case fits the memory.
     """
     layout = LAYOUTS[size]
     half = math.prod(layout.shape) * -(-layout.frames // 2)

@@ -40,13 +40,7 @@ def write_seal(path: Path, examination: Examination, benches: tuple[Bench, ...])
 
 
 def read_seal(path: Path, commitment: str) -> Sealed:
-    """Open a sealed file.
-
-    Raises
-    ------
-    InputError
-        If it is missing, or does not match the commitment.
-    """
+    """Open a sealed file; InputError if it is missing, or does not match the commitment."""
     if not path.is_file():
         raise InputError(
             f"--sealed {path}: not found; give the file that 'pixcal blind make' wrote"

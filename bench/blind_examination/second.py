@@ -66,10 +66,7 @@ def missing() -> list[str]:
 def catalogue() -> tuple[tuple[str, ...], tuple[SecondLaw, ...], tuple[str, ...]]:
     """Variations of ordinary benches, available laws, and missing packages for other laws.
 
-    Raises
-    ------
-    InputError
-        If the second bench cannot be run.
+    InputError if the second bench cannot be run.
     """
     if missing():
         raise InputError(

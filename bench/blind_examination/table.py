@@ -192,25 +192,13 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def write_between(page: Path, size: str, text: str) -> None:
-    """Put a table on a page, between ``<!-- blind:SIZE -->`` and ``<!-- end -->``.
-
-    Raises
-    ------
-    InputError
-        If the page or its marks are not there.
-    """
+    """Put a table on a page, between ``<!-- blind:SIZE -->`` and ``<!-- end -->``."""
     before, after = around_table(page, size)
     page.write_text(f"{before}\n\n{text}\n{after}", encoding="utf-8")
 
 
 def around_table(page: Path, size: str) -> tuple[str, str]:
-    """What stands on a page before and after a table, the marks included.
-
-    Raises
-    ------
-    InputError
-        If the page or its marks are not there.
-    """
+    """What stands on a page before and after a table, marks included; InputError without them."""
     begin, end = f"<!-- blind:{size} -->", "<!-- end -->"
     if not page.is_file():
         raise InputError(f"--write {page}: not found")

@@ -28,23 +28,11 @@ class Chosen:
 def make_case(
     case: str, seed: int, layout: Layout, strength: float | None = None, plain: bool = False
 ) -> tuple[Bench, dict[str, Any]]:
-    """A bench with the effects of a case, and the truth.
+    """A bench with the effects of a case, and the truth; CaseError if there is no such case.
 
-    Parameters
-    ----------
-    case : str
-        ``ordinary``, ``ordinary/VARIATION``, ``EFFECT``, ``EFFECT/LAW``, or these joined by ``+``.
-    seed : int
-    layout : Layout
-    strength : float, optional
-        From 0 (barely visible) to 1 (strong); by default drawn from the seed.
-    plain : bool
-        Whether the bench has no ordinary variations besides the effects.
-
-    Raises
-    ------
-    CaseError
-        If there is no such case.
+    ``case``: ``ordinary``, ``ordinary/VARIATION``, ``EFFECT``, ``EFFECT/LAW``, or these joined by
+    ``+``. ``strength``: from 0 (barely visible) to 1 (strong); by default drawn from the seed.
+    ``plain``: without ordinary variations besides the effects.
     """
     chosen: list[Chosen] = []
     varied = set() if plain else draw_variations(seed)

@@ -25,95 +25,44 @@ def stream(seed: int, *names: str | int) -> np.random.Generator:
 
 @dataclass
 class Beam:
-    """Light from the tip of a fibre, or from its image in a reflecting surface.
+    """Light from the tip of a fibre, or from its image in a reflecting surface."""
 
-    Attributes
-    ----------
-    fibre : int
-        0 or 1; the light of the second passes through the phase modulator.
-    tip_mm : ndarray (3,)
-        Position from the centre of the plane at the nominal distance, z towards the detector.
-    aim_mm : ndarray (2,)
-        Intersection of the beam's axis with the detector, from the centre of the window.
-    waist_um : float
-        1/e^2 radius of the fibre's mode.
-    amplitude : float
-        Of the field on the axis, at the nominal distance.
-    jones : (float, float)
-        Direction of the polarisation.
-    delay_rad : float
-    """
-
-    fibre: int
-    tip_mm: F64
-    aim_mm: F64
-    waist_um: float
-    amplitude: float = 1.0
-    jones: tuple[float, float] = (1.0, 0.0)
+    fibre: int  # 0 or 1; the light of the second passes through the phase modulator
+    tip_mm: F64  # (3,) from the centre of the plane at the nominal distance, z towards the detector
+    aim_mm: F64  # (2,) intersection of the beam's axis with the detector, from the window's centre
+    waist_um: float  # 1/e² radius of the fibre's mode
+    amplitude: float = 1.0  # of the field on the axis, at the nominal distance
+    jones: tuple[float, float] = (1.0, 0.0)  # direction of the polarisation
     delay_rad: float = 0.0
 
 
 @dataclass
 class FringeSet:
-    """Light of one fringe set.
-
-    Attributes
-    ----------
-    name : str
-    declared_mm : (float, float)
-        Baseline that the acquisition declares.
-    beams : list of Beam
-    peak_e : float
-        Mean of the brightest pixel in the brightest frame.
-    coherence : float
-    stray : ndarray (y, x)
-        Light that does not interfere, as a share of the mean light.
-    """
+    """Light of one fringe set."""
 
     name: str
-    declared_mm: tuple[float, float]
+    declared_mm: tuple[float, float]  # baseline that the acquisition declares
     beams: list[Beam]
-    peak_e: float
+    peak_e: float  # mean of the brightest pixel in the brightest frame
     coherence: float
-    stray: F64
+    stray: F64  # (y, x) light that does not interfere, as a share of the mean light
 
 
 @dataclass
 class Run:
-    """Consecutive frames of one kind, including unrecorded ones.
-
-    Attributes
-    ----------
-    name, kind : str
-        The kind is ``bias``, ``dark``, ``flat`` or ``fringes``.
-    exptime_s, start_s : float
-    number : int
-        Of the fringe set.
-    phase : ndarray (t,)
-        Of the modulator, rad.
-    power : ndarray (t, 2)
-        Of the two fibres (of the lamp: the first), 1 on average.
-    contrast : ndarray (t,)
-        Factor on the coherence.
-    tilt : ndarray (t, 2)
-        Added to the fringe vector along x and y, rad/px.
-    row_phase : ndarray (t, y)
-        Added to the phase of each row, rad.
-    level_e : ndarray (t,)
-        Added to the bias.
-    """
+    """Consecutive frames of one kind, including unrecorded ones."""
 
     name: str
-    kind: str
+    kind: str  # `bias`, `dark`, `flat` or `fringes`
     exptime_s: float
     start_s: float
-    number: int
-    phase: F64
-    power: F64
-    contrast: F64
-    tilt: F64
-    row_phase: F64
-    level_e: F64
+    number: int  # of the fringe set
+    phase: F64  # (t,) of the modulator, rad
+    power: F64  # (t, 2) of the two fibres (of the lamp: the first), 1 on average
+    contrast: F64  # (t,) factor on the coherence
+    tilt: F64  # (t, 2) added to the fringe vector along x and y, rad/px
+    row_phase: F64  # (t, y) added to the phase of each row, rad
+    level_e: F64  # (t,) added to the bias
 
     @property
     def frames(self) -> int:
@@ -156,43 +105,21 @@ Step = Callable[[F64, Frame], F64]
 
 @dataclass
 class Bench:
-    """Optics and detector; effects change them, or add steps to the readout of a frame.
-
-    Attributes
-    ----------
-    seed : int
-    pitch_um, wavelength_nm, distance_mm, period_s : float
-    delta_x, delta_y : ndarray (y, x)
-        Offsets of the pixels, px.
-    response, flat_response : ndarray (y, x)
-        To the fringes' light and to the lamp's.
-    dark_e : ndarray (y, x)
-        Electrons in an exposure of the fringes.
-    read_noise_e, bias_adu, relative_gain : ndarray (y, x)
-    gain_e_per_adu, declared_gain : float
-    full_well_e, flat_e, peak_e : float
-    sets : list of FringeSet
-    runs : list of Run
-    charge, signal, offset, samples : list of callables
-        Steps on collected electrons, on their voltage, on offsets of the readout (e-), and on
-        samples before rounding (ADU).
-    notes : dict
-        Ordinary variations that were drawn.
-    stamped : bool
-        Whether headers have the time and duration of exposures.
-    """
+    """Optics and detector; effects change them, or add steps to the readout of a frame."""
 
     seed: int
     pitch_um: float
     wavelength_nm: float
     distance_mm: float
     period_s: float
+    # delta_x, delta_y: (y, x) offsets of the pixels, px
     delta_x: F64
     delta_y: F64
+    # response, flat_response: (y, x) to the fringes' light and to the lamp's
     response: F64
     flat_response: F64
-    dark_e: F64
-    read_noise_e: F64
+    dark_e: F64  # (y, x) in an exposure of the fringes
+    read_noise_e: F64  # (y, x), as bias_adu and relative_gain
     bias_adu: F64
     relative_gain: F64
     gain_e_per_adu: float
@@ -202,12 +129,14 @@ class Bench:
     peak_e: float
     sets: list[FringeSet] = field(default_factory=list)
     runs: list[Run] = field(default_factory=list)
+    # charge, signal, offset, samples: steps on collected electrons, on their voltage, on
+    # offsets of the readout (e-), and on samples before rounding (ADU)
     charge: list[Step] = field(default_factory=list)
     signal: list[Step] = field(default_factory=list)
     offset: list[Step] = field(default_factory=list)
     samples: list[Step] = field(default_factory=list)
-    notes: dict[str, Any] = field(default_factory=dict)
-    stamped: bool = True
+    notes: dict[str, Any] = field(default_factory=dict)  # ordinary variations that were drawn
+    stamped: bool = True  # whether headers have the time and duration of exposures
 
     @property
     def shape(self) -> tuple[int, int]:

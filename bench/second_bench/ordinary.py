@@ -66,26 +66,14 @@ PAUSE_S = 60.0
 
 @dataclass(frozen=True)
 class Layout:
-    """What is recorded.
+    """What is recorded."""
 
-    Attributes
-    ----------
-    shape : (int, int)
-        Rows and columns.
-    frames : int
-        Of each fringe set.
-    bias, dark, flat : int
-        Frames; darks last 1 s.
-    sets : int
-        Fringe sets: 2, or 1 with the first direction alone.
-    """
-
-    shape: tuple[int, int] = (128, 128)
-    frames: int = 600
-    bias: int = 40
+    shape: tuple[int, int] = (128, 128)  # rows and columns
+    frames: int = 600  # of each fringe set
+    bias: int = 40  # bias, dark, flat: frames; darks last 1 s
     dark: int = 0
     flat: int = 40
-    sets: int = 2
+    sets: int = 2  # fringe sets: 2, or 1 with the first direction alone
 
 
 def draw_variations(seed: int) -> set[str]:
@@ -95,15 +83,7 @@ def draw_variations(seed: int) -> set[str]:
 
 
 def draw_bench(layout: Layout, seed: int, varied: set[str]) -> Bench:
-    """A bench without faults.
-
-    Parameters
-    ----------
-    layout : Layout
-    seed : int
-    varied : set of str
-        Of `VARIATIONS`: deviations from the simplest bench.
-    """
+    """A bench without faults; ``varied``: deviations from the simplest, of `VARIATIONS`."""
     rng = stream(seed, "detector")
     shape = layout.shape
     gain = float(np.exp(rng.uniform(np.log(0.5), np.log(4)))) if "gain" in varied else 1.0

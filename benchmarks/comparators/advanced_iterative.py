@@ -29,17 +29,10 @@ def fit_phases(
     tolerance_rad: float = TOLERANCE_RAD,
     max_iterations: int = MAX_ITERATIONS,
 ) -> F64:
-    """Phase of every pixel; that of the last iteration where the frames' never stand still.
+    """Phase (y, x) of every pixel: psi of ``a + b cos(psi + phi)``, rad, in ±pi.
 
-    Parameters
-    ----------
-    cube : (t, y, x) frames, e-
-    vector : nominal fringe vector (kx, ky), rad/px
-
-    Returns
-    -------
-    (y, x) float64
-        psi of ``a + b cos(psi + phi)``, rad, in ±pi.
+    That of the last iteration where the frames' never stand still. ``cube``: (t, y, x) frames, e-.
+    ``vector``: nominal fringe vector (kx, ky), rad/px.
     """
     frames = cube.reshape(len(cube), -1)
     y, x = np.indices(cube.shape[1:])

@@ -24,19 +24,11 @@ ITERATIONS = 5
 def fit_phases(
     cube: F64, vector: tuple[float, float], *, constant: bool, iterations: int = ITERATIONS
 ) -> F64:
-    """Phase of every pixel.
+    """Phase (y, x) of every pixel: psi of ``B iota + A alpha sin(psi + phi)``, rad, modulo a turn.
 
-    Parameters
-    ----------
-    cube : (t, y, x) frames, e-
-    vector : nominal fringe vector (kx, ky), rad/px; right to a fraction of a fringe across the
-        window
-    constant : set B and A to their means from the second iteration on
-
-    Returns
-    -------
-    (y, x) float64
-        psi of ``B iota + A alpha sin(psi + phi)``, rad, modulo a turn.
+    ``cube``: (t, y, x) frames, e-. ``vector``: nominal fringe vector (kx, ky), rad/px, right to a
+    fraction of a fringe across the window. ``constant``: set B and A to their means from the second
+    iteration on.
     """
     frames = cube.reshape(len(cube), -1)
     y, x = (axis.ravel() - axis.mean() for axis in np.indices(cube.shape[1:]))

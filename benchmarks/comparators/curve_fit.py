@@ -18,17 +18,9 @@ F64 = NDArray[np.float64]
 
 
 def demodulate(cube: F64, vector: tuple[float, float]) -> F64:
-    """B, A and phi of every frame, for iota and alpha of mean 1.
+    """B, A (e-) and phi (rad) of every frame, (3, t), for iota and alpha of mean 1.
 
-    Parameters
-    ----------
-    cube : (t, y, x) frames, e-
-    vector : nominal fringe vector (kx, ky), rad/px
-
-    Returns
-    -------
-    (3, t) float64
-        e-, e-, rad.
+    ``cube``: (t, y, x) frames, e-. ``vector``: nominal fringe vector (kx, ky), rad/px.
     """
     ny, nx = cube.shape[1:]
     # The zeros at the ends of the Hann window lie outside of the frame.
@@ -57,20 +49,10 @@ def fit_phases(
     chosen: NDArray[np.bool_],
     read_noise: float,
 ) -> F64:
-    """Phase of chosen pixels.
+    """Phase (y, x): psi of ``B iota + A alpha sin(psi + phi)``, rad; NaN where not ``chosen``.
 
-    Parameters
-    ----------
-    cube : (t, y, x) frames, e-
-    vector : nominal fringe vector (kx, ky), rad/px
-    frames : (3, t) from `demodulate`
-    chosen : (y, x) pixels to fit
-    read_noise : e- rms
-
-    Returns
-    -------
-    (y, x) float64
-        psi of ``B iota + A alpha sin(psi + phi)``, rad; NaN where not chosen.
+    ``cube``: (t, y, x) frames, e-. ``vector``: nominal fringe vector (kx, ky), rad/px. ``frames``:
+    (3, t) from `demodulate`. ``read_noise``: e- rms.
     """
     phase = np.full(chosen.shape, np.nan)
     for y, x in np.argwhere(chosen):

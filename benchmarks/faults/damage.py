@@ -65,11 +65,9 @@ def stored(bench: Bench, artefact: str, *, chunks: bool) -> list[str]:
 
 
 def metadata(bench: Bench, artefact: str, damage: Damage, times: int | None, seed: int) -> Outcome:
-    """Damage files beside the chunks: the next command names them; their own makes them again.
+    """Damage the files beside the chunks, or ``times`` of them.
 
-    Parameters
-    ----------
-    times : how many of the files; None for each
+    The next command names them; their own makes them again.
     """
     outcome = Outcome(_fault(damage, "metadata file"))
     rng = random.Random(f"{artefact} {_name(damage)} {seed}")

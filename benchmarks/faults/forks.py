@@ -61,12 +61,8 @@ def _server() -> ForkServerContext:
 class Command:
     """A command line of pixcal that has begun.
 
-    Parameters
-    ----------
-    args : sequence of str
-        As typed after ``pixcal``; ``--quiet`` is added.
-    before : callable, optional
-        Called in the process before the command (a function of a module, or a partial of one).
+    ``args``: as typed after ``pixcal``; ``--quiet`` is added. ``before``: called in the process
+    before the command (a function of a module, or a partial of one).
     """
 
     def __init__(self, args: Sequence[str], before: Callable[[], None] | None = None) -> None:

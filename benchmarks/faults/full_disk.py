@@ -23,12 +23,7 @@ _LINE = ("disk full; complete results are kept: free some space and run the same
 
 
 def at_writes(bench: Bench, stage: str, times: int | None, seed: int) -> Outcome:
-    """Let a write of a command fail half-way, each of them or some, and all that follow.
-
-    Parameters
-    ----------
-    times : how many of the writes; None for all, one after the other
-    """
+    """Let each write of a command, or ``times`` of them, fail half-way, and all that follow."""
     outcome = Outcome("disk full at the n-th write")
     earlier = STAGES[: STAGES.index(stage)]
     total = _count(bench, stage, earlier)

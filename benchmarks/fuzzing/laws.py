@@ -148,18 +148,10 @@ def _kib(status: Path, key: str) -> int:
 
 
 def pixcal(*args: str | Path, names: Sequence[str] = ()) -> int:
-    """Run a command in this process and hold its end against the laws.
+    """Run a command in this process and hold its end against the laws; returns 0 or 2.
 
-    Parameters
-    ----------
-    args : the command line
-    names : a refusal must name one of these: the file, the key or the option that is bad
-
-    Returns
-    -------
-    0 or 2
-
-    Raises Broken for any other exit code, a traceback, not one line, or a line that does not help.
+    ``names``: a refusal must name one of these: the file, the key or the option that is bad. Raises
+    Broken for any other exit code, a traceback, not one line, or a line that does not help.
     """
     # As the interpreter makes its own: what cannot be encoded is an error on stdout only.
     out = io.TextIOWrapper(io.BytesIO(), "utf-8", "strict")
@@ -228,12 +220,9 @@ def _line(words: Sequence[str]) -> str:
 
 
 def calibrate(acquisition: Path, run: Path, names: Sequence[str] = (), *more: str) -> Answer:
-    """Take an acquisition through ingest, reduce, fit and allan, as far as they go.
+    """Take an acquisition through ingest, reduce, fit, allan and ``more``, as far as they go.
 
-    Parameters
-    ----------
-    names : what a refusal of ingest must name one of; those of later steps name the set or the run
-    more : further commands, e.g. ``report``
+    ``names``: what a refusal of ingest must name one of; later steps name the set or the run.
     """
     if pixcal("ingest", acquisition, "--out", run, *RUNTIME, names=names) == 2:
         return "refused"

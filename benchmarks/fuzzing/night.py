@@ -22,27 +22,12 @@ WITHIN = 6.0
 
 @dataclass
 class Night:
-    """Frames of a window in straight fringes; lengths in px, levels in electrons.
-
-    Attributes
-    ----------
-    shape : (int, int)
-        Rows and columns.
-    count : int
-        Frames of each set.
-    vectors : dict
-        Fringe vector (kx, ky) of each set, rad/px.
-    frames : dict
-        Filled by `expose`: samples (t, y, x) in ADU, float64, not yet rounded; by file stem.
-    described : dict
-        Contents of ``acquisition.yaml``, as it should be.
-    spoilt : (y, x) bool
-        Pixels that must have no value in the maps.
-    """
+    """Frames of a window in straight fringes; lengths in px, levels in electrons."""
 
     rng: np.random.Generator
-    shape: tuple[int, int] = (23, 29)
-    count: int = 40
+    shape: tuple[int, int] = (23, 29)  # rows and columns
+    count: int = 40  # frames of each set
+    # fringe vector (kx, ky) of each set, rad/px
     vectors: dict[str, tuple[float, float]] = field(default_factory=dict)
     level: float = 20_000.0
     visibility: float = 0.9
@@ -62,9 +47,10 @@ class Night:
             if rng.random() < 0.5:
                 del self.vectors[str(rng.choice(list(self.vectors)))]
         self.delta_x, self.delta_y = rng.normal(0, self.delta_rms, (2, *shape))
-        self.spoilt = np.zeros(shape, bool)
+        self.spoilt = np.zeros(shape, bool)  # pixels that must have no value in the maps
+        # samples (t, y, x) in ADU, float64, not yet rounded; by file stem
         self.frames: dict[str, F64] = {}
-        self.described = self._describe()
+        self.described = self._describe()  # contents of ``acquisition.yaml``, as it should be
         self._expose()
 
     def _expose(self) -> None:

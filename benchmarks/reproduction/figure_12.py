@@ -34,12 +34,8 @@ def predicted_teeth(couplings: Sequence[Coupling], vector: tuple[float, float]) 
     """Offset (row,) that couplings feign in each row of their period, px, less its mean.
 
     The phase of a receiver moves by ``arg(sum_n k_n exp(i K n))``, n from the receiver to where
-    its signal comes from (physics note, section 5).
-
-    Parameters
-    ----------
-    couplings : that do not depend on the column
-    vector : fringe vector (kx, ky), rad/px
+    its signal comes from (physics note, section 5). ``couplings`` do not depend on the column;
+    ``vector``: fringe vector (kx, ky), rad/px.
     """
     if any(c.every_columns > 1 for c in couplings):
         raise ValueError("couplings depend on the column: teeth of rows are not all of it")

@@ -40,11 +40,7 @@ def sloping_harmonics(shape: tuple[int, int], vector: tuple[float, float]) -> F6
 def teeth(values: F64, period: int, edge: int = 2) -> F64:
     """Mean (period,) of rows that are whole periods apart, less the mean of all.
 
-    Parameters
-    ----------
-    values : (y, x)
-    period : rows
-    edge : rows and columns at the window's edges that are left out
+    ``values``: (y, x). ``edge``: rows and columns at the window's edges that are left out.
     """
     inner = values[edge:-edge, edge:-edge]
     row = (np.arange(len(inner)) + edge) % period
@@ -88,12 +84,8 @@ class Crest:
 
         To leading order the straight model leaves ``-q_a q² / (2 D²)`` on the fringe axis a, q from
         the foot: about a point far from it, its second order is
-        ``(3 c_a u_a² + 2 c_b u_a u_b + c_a u_b²) p / (2 D²)``, c the offset.
-
-        Parameters
-        ----------
-        distance, pitch : mm
-        axis : 0 where the fringe vector is along x, 1 along y
+        ``(3 c_a u_a² + 2 c_b u_a u_b + c_a u_b²) p / (2 D²)``, c the offset. ``distance, pitch``:
+        mm. ``axis``: 0 where the fringe vector is along x, 1 along y.
         """
         scale = pitch / (2 * distance**2)
         along, across = (self.xx, self.yy) if axis == 0 else (self.yy, self.xx)

@@ -13,38 +13,18 @@ Apply = Callable[[Bench, float, np.random.Generator], dict[str, Any]]
 
 @dataclass(frozen=True)
 class Law:
-    """One law of an effect.
+    """One law of an effect."""
 
-    Attributes
-    ----------
-    effect, name : str
-        The effect's name is pixcal's, if pixcal has the effect.
-    weak, strong : float
-        Sizes at strengths 0 and 1.
-    unit : str
-        Of the size.
-    apply : callable
-        Changes a bench by a size; returns further drawn values.
-    known : bool
-        Whether pixcal has this effect.
-    decidable : bool
-        Whether frames of the bench can show it at all.
-    varied_phases : bool
-        Whether it is detectable only if the phase step differs from frame to frame.
-    needs : str
-        Package that it needs besides HCIPy and GalSim.
-    """
-
-    effect: str
+    effect: str  # as pixcal calls it, if pixcal has it
     name: str
-    weak: float
+    weak: float  # weak, strong: sizes at strengths 0 and 1
     strong: float
-    unit: str
-    apply: Apply
-    known: bool = True
-    decidable: bool = True
-    varied_phases: bool = False
-    needs: str = ""
+    unit: str  # of the size
+    apply: Apply  # changes a bench by a size; returns further drawn values
+    known: bool = True  # whether pixcal has this effect
+    decidable: bool = True  # whether frames of the bench can show it at all
+    varied_phases: bool = False  # whether it shows only if phase steps differ from frame to frame
+    needs: str = ""  # package that it needs besides HCIPy and GalSim
 
 
 LAWS: list[Law] = []

@@ -24,55 +24,33 @@ class Series:
 
 @dataclass
 class Sensor:
-    """A sensor and its recorded series; steps change an image (y, x) in electrons.
-
-    Attributes
-    ----------
-    gain, declared_gain : float
-        e-/ADU.
-    bits : int
-    read_noise_e, bias_adu, response, dark_e_s : ndarray (y, x)
-    well_e, top_e : float
-        Full well; light of the brightest flats that are not meant to saturate.
-    defects, unclear : ndarray (y, x)
-        Pixels to mask, and pixels that may be masked or not.
-    flicker : float
-        Of the lamp, from frame to frame, relative rms.
-    response_curve : callable
-        Signal (e-) of the collected charge (e-).
-    lighting, collected, amplified : list of callables
-        Steps on the mean light, on the charge, and on what readout adds; given the frame's number.
-    converter : callable
-        Codes of real samples (ADU).
-    shift : int
-        Shift of the codes in the files, bits.
-    stored : dtype
-        Of the samples in the files.
-    shared_e : float
-        Noise common to pixels of an output but not to the frame, rms; part of the read noise.
-    """
+    """A sensor and its recorded series; steps change an image (y, x) in electrons."""
 
     rng: np.random.Generator
-    gain: float
+    gain: float  # gain, declared_gain: e-/ADU
     declared_gain: float
     bits: int
-    read_noise_e: F64
+    read_noise_e: F64  # (y, x), as bias_adu, response and dark_e_s
     bias_adu: F64
     response: F64
     dark_e_s: F64
-    well_e: float
-    top_e: float
-    flicker: float
-    defects: NDArray[np.bool_]
-    unclear: NDArray[np.bool_]
+    well_e: float  # full well
+    top_e: float  # light of the brightest flats that are not meant to saturate
+    flicker: float  # of the lamp, from frame to frame, relative rms
+    defects: NDArray[np.bool_]  # (y, x) pixels to mask
+    unclear: NDArray[np.bool_]  # (y, x) pixels that may be masked or not
     series: list[Series] = field(default_factory=list)
-    response_curve: Callable[[F64], F64] = lambda e: e
+    response_curve: Callable[[F64], F64] = lambda e: e  # signal (e-) of the charge (e-)
+    # lighting, collected, amplified: steps on the mean light, on the charge, and on what readout
+    # adds; given the frame's number
     lighting: list[Callable[[F64, int], F64]] = field(default_factory=list)
     collected: list[Callable[[F64, int], F64]] = field(default_factory=list)
     amplified: list[Callable[[F64, int], F64]] = field(default_factory=list)
-    converter: Callable[[F64], F64] = np.rint
-    shift: int = 0
+    converter: Callable[[F64], F64] = np.rint  # codes of real samples (ADU)
+    shift: int = 0  # shift of the codes in the files, bits
+    # of the samples in the files
     stored: type[np.uint16] | type[np.float32] = np.uint16
+    # rms noise common to the pixels of an output, not to the frame; part of the read noise
     shared_e: float = 0.0
 
     @property
@@ -195,23 +173,13 @@ Change = Callable[[Sensor], Drawn]
 
 @dataclass(frozen=True)
 class Kind:
-    """Kind of camera.
+    """Kind of camera."""
 
-    Attributes
-    ----------
-    change : callable
-        Changes an ordinary sensor; returns the drawn values.
-    cause : str
-        Causes to name, joined by " + ", each with its alternatives; empty: none, and no gap; "?":
-        none, as the change is not a listed effect.
-    highest : float
-        Highest level of the flats, over ``top_e``.
-    converter : callable, optional
-    """
-
-    change: Change
+    change: Change  # changes an ordinary sensor; returns the drawn values
+    # causes to name, joined by " + ", each with its alternatives; empty: none, and no gap; "?":
+    # none, as the change is not a listed effect
     cause: str
-    highest: float
+    highest: float  # highest level of the flats, over `top_e`
     converter: Converter | None
 
 
