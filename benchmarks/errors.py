@@ -12,14 +12,11 @@ where it stopped.
 """
 
 import argparse
-import tempfile
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.random import default_rng
 
 import pixcal
@@ -28,8 +25,7 @@ from blind_examination.strengths import VARIANTS
 from pixcal.effects import known_effects
 from pixcal.model.config import to_plain
 from pixcal.stages.evidence import load_evidence
-from power import bench
-from study import run_study
+from study import bench, reduced, run_study
 
 PAGE = Path(__file__).parents[1] / "docs/appendix/errors.md"
 # words in the names of parameters that are roots of measured variances
@@ -50,13 +46,8 @@ def examine(case: Case) -> dict[str, Any]:
         "times": times,
         "draw": draw,
     }
-    with tempfile.TemporaryDirectory() as folder:
-        file, acquisition, run = (Path(folder, n) for n in ("bench.yaml", "acq", "run"))
-        plain = bench(seed) | {"effects": {variant.effect: true}}
-        file.write_text(yaml.safe_dump(plain), encoding="utf-8")
-        pixcal.simulate(file, acquisition)
-        for step in (partial(pixcal.ingest, acquisition), pixcal.reduce, pixcal.fit):
-            step(run)
+    with reduced(bench(seed) | {"effects": {variant.effect: true}}) as run:
+        pixcal.fit(run)
         found = known_effects()[variant.effect].estimate(load_evidence(run))
     if found is None:
         return marks | {"sigmas": None, "by_law": False, "parameters": {}}

@@ -12,67 +12,18 @@ an interrupted study goes on where it stopped.
 
 import argparse
 import json
-import tempfile
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import yaml
 from numpy.random import default_rng
 
 import pixcal
 from blind_examination.strengths import variants_of
-from pixcal.model.bench import SCHEMA
-from study import run_study
+from study import bench, reduced, run_study
 
 STRENGTHS = (0.3, 1.0, 3.0, 10.0)  # times the threshold
 Case = tuple[str, float, int]  # effect ("" for none), strength, number of the draw
-
-
-def bench(seed: int) -> dict[str, Any]:
-    """Two sets of 300 frames on 61 x 67 pixels, with bias, darks and three levels of flats."""
-    detector = {
-        "seed": seed + 1,
-        "shape": [61, 67],
-        "pitch_um": 4.4,
-        "gain_e_per_adu": 1.0,
-        "read_noise_e": 16.0,
-        "bias_adu": 500,
-        "bias_pixel_rms_adu": 4.0,
-        "dark_e_s": 24.0,
-        "prnu_rms": 0.01,
-        "delta_rms_px": 2.0e-3,
-        "hot_fraction": 0.004,
-        "hot_rate_e_s": 3.0e4,
-    }
-    fringes = [
-        {"name": name, "baseline_mm": baseline, "count": 300, "peak_e": 45000}
-        for name, baseline in (("vertical", [11.5, 0.0]), ("horizontal", [0.0, 6.4]))
-    ]
-    frames = {
-        "exptime_s": 0.02,
-        "period_s": 0.14,
-        "per_file": 500,
-        "bias": 60,
-        "darks": [{"exptime_s": 0.5, "count": 20}],
-        "flat_rate_e_s": 1.25e6,
-        "flats": [{"exptime_s": 0.01 * n, "count": 20} for n in (1, 2, 3)],
-        "fringes": fringes,
-    }
-    optics = {
-        "wavelength_nm": 632.8,
-        "distance_mm": 400.0,
-        "beam_radius_mm": 35.0,
-        "visibility": 0.95,
-    }
-    return {
-        "schema": SCHEMA,
-        "seed": seed,
-        "detector": detector,
-        "optics": optics,
-        "frames": frames,
-    }
 
 
 def examine(case: Case) -> dict[str, Any]:
@@ -86,12 +37,8 @@ def examine(case: Case) -> dict[str, Any]:
         variant = variants[(draw + STRENGTHS.index(strength)) % len(variants)]
         drawn = variant.make(strength * variant.threshold("small"), default_rng(seed))
         plain = bench(seed) | {"effects": {name: drawn}}
-    with tempfile.TemporaryDirectory() as folder:
-        file, acquisition, run = (Path(folder, n) for n in ("bench.yaml", "acq", "run"))
-        file.write_text(yaml.safe_dump(plain), encoding="utf-8")
-        pixcal.simulate(file, acquisition)
-        for step in (partial(pixcal.ingest, acquisition), pixcal.reduce, pixcal.diagnose):
-            step(run)
+    with reduced(plain) as run:
+        pixcal.diagnose(run)
         diagnosis = json.loads((run / "products" / "diagnosis.json").read_text(encoding="utf-8"))
     own = [c.get("sigmas") for c in diagnosis["candidates"] if c["effect"] == name]
     return {

@@ -41,9 +41,9 @@ def blind() -> None:
 )
 def make(folder: Path, sealed: Path, config: MakeConfig, runtime: "Runtime") -> None:
     """The cases."""
-    from blind_examination import examination as stage  # here: for a fast `pixcal --help`
+    from blind_examination import cases  # here: for a fast `pixcal --help`
 
-    examination = stage.make(folder, sealed, config, runtime)
+    examination = cases.make(folder, sealed, config, runtime)
     click.echo(f"cases in {folder}: {config.cases}; their truth in {sealed}")
     printing.show_notes(examination.notes)
 
@@ -56,9 +56,9 @@ def make(folder: Path, sealed: Path, config: MakeConfig, runtime: "Runtime") -> 
 )
 def run(folder: Path, config: RunConfig, runtime: "Runtime") -> None:
     """The diagnoses."""
-    from blind_examination import examination as stage  # here: for a fast `pixcal --help`
+    from blind_examination import running  # here: for a fast `pixcal --help`
 
-    done, failed = stage.run(folder, config, runtime)
+    done, failed = running.run(folder, config, runtime)
     failures = f", {failed} of which failed" if failed else ""
     click.echo(f"cases diagnosed: {done}{failures}; results in {folder / 'runs'}")
 
@@ -72,9 +72,9 @@ def run(folder: Path, config: RunConfig, runtime: "Runtime") -> None:
 )
 def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: "Runtime") -> None:
     """The scores."""
-    from blind_examination import examination as stage  # here: for a fast `pixcal --help`
+    from blind_examination import marking  # here: for a fast `pixcal --help`
 
-    result = stage.score(folder, sealed, config, runtime)
+    result = marking.score(folder, sealed, config, runtime)
     _show(result)
     for file in (folder / "score.json", folder / "score.md"):
         click.echo(f"  {file}")

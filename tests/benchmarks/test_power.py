@@ -5,6 +5,7 @@ from pathlib import Path
 import yaml
 
 import power
+import study
 from pixcal.model.bench import load_bench
 
 
@@ -30,6 +31,6 @@ def test_the_table_counts_effects_named_and_false_causes() -> None:
 
 
 def test_a_bench_of_the_study_is_a_bench_file(tmp_path: Path) -> None:
-    (tmp_path / "bench.yaml").write_text(yaml.safe_dump(power.bench(7)))
+    (tmp_path / "bench.yaml").write_text(yaml.safe_dump(study.bench(7)))
     bench = load_bench(tmp_path / "bench.yaml")
     assert [one.count for one in bench.frames.fringes] == [300, 300]

@@ -13,9 +13,8 @@ import pytest
 import yaml
 from astropy.io import fits
 
-from blind_examination import examination as blind
 from blind_examination.benches import LAYOUTS
-from blind_examination.cases import write_examination
+from blind_examination.cases import make, write_examination
 from blind_examination.draw import (
     LEFT_OUT,
     NOTHING,
@@ -33,9 +32,11 @@ from blind_examination.draw import (
 )
 from blind_examination.grade import grade
 from blind_examination.manifest import read_manifest
+from blind_examination.marking import score
 from blind_examination.offsets import offset_errors
+from blind_examination.options import MakeConfig, RunConfig, ScoreConfig
 from blind_examination.parameters import check_parameters
-from blind_examination.running import share
+from blind_examination.running import run, share
 from blind_examination.seal import read_seal
 from blind_examination.second import SecondCase, catalogue, second_offsets
 from blind_examination.strengths import STRONGEST, VARIANTS, Variant
@@ -266,11 +267,11 @@ def test_a_seed_that_is_not_given_cannot_be_guessed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("blind_examination.cases.write_examination", lambda *_: None)
-    config = blind.MakeConfig(1, bench="own")
-    seeds = {blind.make(tmp_path / "e", tmp_path / "t", config, SYNC).seed for _ in range(8)}
+    config = MakeConfig(1, bench="own")
+    seeds = {make(tmp_path / "e", tmp_path / "t", config, SYNC).seed for _ in range(8)}
     assert len(seeds) == 8
     assert all(seed >= 1000 for seed in seeds)
-    given = blind.make(tmp_path / "e", tmp_path / "t", replace(config, seed=7), SYNC)
+    given = make(tmp_path / "e", tmp_path / "t", replace(config, seed=7), SYNC)
     assert given.seed == 7
 
 
@@ -311,15 +312,15 @@ def test_the_truth_cannot_be_changed_afterwards(exam: tuple[Path, Path], tmp_pat
 
 def test_what_stands_in_the_way_is_refused(exam: tuple[Path, Path], tmp_path: Path) -> None:
     folder, sealed = exam
-    config = blind.MakeConfig(1, 3, "tiny")
+    config = MakeConfig(1, 3, "tiny")
     with pytest.raises(InputError, match="not empty"):
-        blind.make(folder, tmp_path / "truth.json", config, SYNC)
+        make(folder, tmp_path / "truth.json", config, SYNC)
     with pytest.raises(InputError, match="already exists"):
-        blind.make(tmp_path / "new", sealed, config, SYNC)
+        make(tmp_path / "new", sealed, config, SYNC)
     with pytest.raises(InputError, match="apart"):
-        blind.make(tmp_path / "new", tmp_path / "new" / "truth.json", config, SYNC)
+        make(tmp_path / "new", tmp_path / "new" / "truth.json", config, SYNC)
     with pytest.raises(InputError, match=r"blind\.json"):
-        blind.run(tmp_path, blind.RunConfig(), SYNC)
+        run(tmp_path, RunConfig(), SYNC)
 
 
 # How it is sat.
@@ -341,14 +342,14 @@ def test_cases_are_diagnosed_once_and_without_what_is_left_out(
 
     monkeypatch.setattr(diagnose, "run", diagnosed)
     with pytest.raises(InputError, match="blind run"):
-        blind.score(folder, sealed, blind.ScoreConfig(), SYNC)
-    assert blind.run(folder, blind.RunConfig(limit=1), SYNC) == (1, 0)
+        score(folder, sealed, ScoreConfig(), SYNC)
+    assert run(folder, RunConfig(limit=1), SYNC) == (1, 0)
     assert not (folder / "runs" / "case-0001" / "ingest").exists()
     nowhere = tmp_path / "nowhere.md"
     with pytest.raises(InputError, match=r"nowhere\.md: not found"):
-        blind.score(folder, sealed, blind.ScoreConfig(write=nowhere), SYNC)
+        score(folder, sealed, ScoreConfig(write=nowhere), SYNC)
     assert not (folder / "score.json").exists()
-    found = blind.score(folder, sealed, blind.ScoreConfig(), SYNC)
+    found = score(folder, sealed, ScoreConfig(), SYNC)
     assert [c["case"] for c in found["cases"]] == ["case-0001"]
     assert found["missing"] == ["case-0002", "case-0003"]
     # Of those that are still to be sat nothing is told, nor the seed that they are drawn from.
@@ -356,21 +357,21 @@ def test_cases_are_diagnosed_once_and_without_what_is_left_out(
     assert found["seed"] is None
     assert "quadratic" not in told
     assert len(found["runs"]["codes"]) == 1
-    assert blind.run(folder, blind.RunConfig(), SYNC) == (2, 1)
+    assert run(folder, RunConfig(), SYNC) == (2, 1)
     assert asked == ["lag", "ipc", "nonlinearity"]
-    found = blind.score(folder, sealed, blind.ScoreConfig(), SYNC)
+    found = score(folder, sealed, ScoreConfig(), SYNC)
     assert [c["right"] for c in found["cases"]] == [True, False, False]
     assert "cannot be fitted" in found["cases"][1]["why"]
     broken.clear()
-    assert blind.run(folder, blind.RunConfig(), SYNC) == (0, 0), "a failure is an answer too"
+    assert run(folder, RunConfig(), SYNC) == (0, 0), "a failure is an answer too"
     # What was begun by other code is not gone on with.
     begun = folder / "runs" / "case-0003"
     write_json(begun / "begun.json", {"code": "other"})
     (begun / "done.json").unlink()
     (begun / "left").touch()
-    assert blind.run(folder, blind.RunConfig(), SYNC) == (1, 0)
+    assert run(folder, RunConfig(), SYNC) == (1, 0)
     assert not (begun / "left").exists()
-    assert blind.run(folder, blind.RunConfig(again=True, keep=True), SYNC) == (3, 0)
+    assert run(folder, RunConfig(again=True, keep=True), SYNC) == (3, 0)
     assert (folder / "runs" / "case-0001" / "reduce").is_dir()
 
 
@@ -633,8 +634,8 @@ def test_strong_effects_are_found_and_nothing_is_claimed(tmp_path: Path) -> None
     )
     folder, sealed = tmp_path / "exam", tmp_path / "truth.json"
     write_examination(folder, sealed, Examination(12, "tiny", truths), SYNC)
-    assert blind.run(folder, blind.RunConfig(), SYNC) == (4, 0)
-    found = blind.score(folder, sealed, blind.ScoreConfig(), SYNC)
+    assert run(folder, RunConfig(), SYNC) == (4, 0)
+    found = score(folder, sealed, ScoreConfig(), SYNC)
     assert [case["why"] for case in found["cases"]] == 4 * [""]
     for part in found["parts"].values():
         for question, count in part["questions"].items():
