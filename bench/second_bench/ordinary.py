@@ -12,17 +12,7 @@ from second_bench.less_common import (
     vary_runs,
     without_dropped,
 )
-from second_bench.model import (
-    EXPTIME_S,
-    F64,
-    TOP_ADU,
-    Beam,
-    Bench,
-    FringeSet,
-    Run,
-    new_run,
-    stream,
-)
+from second_bench.model import EXPTIME_S, F64, TOP_ADU, Beam, Bench, FringeSet, Run, new_run, stream
 
 VARIATIONS = (
     "aim",

@@ -102,11 +102,7 @@ def pixcal(*args: str | Path, before: Callable[[], None] | None = None) -> Ended
 
 
 def _main(
-    args: Sequence[str],
-    out: Path,
-    err: Path,
-    before: Callable[[], None] | None,
-    listens: Event,
+    args: Sequence[str], out: Path, err: Path, before: Callable[[], None] | None, listens: Event
 ) -> None:
     for number, file in ((1, out), (2, err)):
         os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT), number)

@@ -219,16 +219,7 @@ def _option(case: Case) -> Answer:
     (here / "locked").chmod(0o500)
     label = (parameter.metavar or str(parameter.name)).strip("[].").split("]")[0]
     shown = one_line(value.encode("utf-8", "backslashreplace").decode())
-    names = [
-        *parameter.opts,
-        label,
-        label.upper(),
-        "RUN",
-        "ACQ",
-        "run",
-        "option",
-        shown[:40],
-    ]
+    names = [*parameter.opts, label, label.upper(), "RUN", "ACQ", "run", "option", shown[:40]]
     line = _line(words, command, parameter, value)
     if words[0] in SLOW:
         _parse_only(command, line[len(words) :])

@@ -41,7 +41,7 @@ MENDS = re.compile(
     r"|are needed|not valid YAML|not allowed|twice|not found|number too large|in the range"
     r"|too large|is not |cannot be (read|used|written)|MiB are allowed|Did you mean|Possible|choose"
     r"|no room|do not fit|at least|more than half|is zero|no frames at all|not a |not in UTC"
-    r"|no permission|empty",
+    r"|no permission|empty"
 )
 """Words by which a message says what would mend the input, or what was expected instead."""
 

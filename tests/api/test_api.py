@@ -290,10 +290,7 @@ def test_what_is_wrong_is_named(changes: dict[str, Any], message: str, tmp_path:
         (lambda run: pixcal.fit(run, chi2_limit=0.5), "pixcal.fit: chi2_limit: 0.5 must be"),
         (lambda run: pixcal.reduce(run, hot_sigma=1), "pixcal.reduce: hot_sigma: 1 is below 5"),
         (lambda run: pixcal.allan(run, region=(0, 9)), "pixcal.allan: region: expected 4 values"),
-        (
-            lambda run: pixcal.fit(run, own=["mine.py"]),
-            "--own: only used with --with-diagnosis",
-        ),
+        (lambda run: pixcal.fit(run, own=["mine.py"]), "--own: only used with --with-diagnosis"),
         (lambda run: pixcal.fit(run, with_diagnosis=True), "diagnose: not there yet; run 'pixcal"),
         (lambda run: run.diagnosis, "diagnose: not there yet; run 'pixcal diagnose"),
         (lambda run: run.corrected, "corrected: not there yet; run 'pixcal"),

@@ -592,10 +592,7 @@ def test_what_is_up_to_date_is_left_alone(bench_run: Path) -> None:
     ids=["to allan", "all"],
 )
 def test_the_steps_one_by_one_give_the_same(
-    bench_run: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    stages: list[str],
-    files: tuple[str, ...],
+    bench_run: Path, monkeypatch: pytest.MonkeyPatch, stages: list[str], files: tuple[str, ...]
 ) -> None:
     """Also with another number of workers and other memory; progress goes to stderr only."""
     monkeypatch.setattr(report_page, "png", lambda figure: b"")
@@ -614,8 +611,7 @@ def test_the_steps_one_by_one_give_the_same(
 
 
 @pytest.mark.parametrize(
-    ("command", "name", "config"),
-    [("fit", "model", fit.Config), ("reduce", "gain", reduce.Config)],
+    ("command", "name", "config"), [("fit", "model", fit.Config), ("reduce", "gain", reduce.Config)]
 )
 def test_the_choices_are_those_of_the_stage(command: str, name: str, config: type) -> None:
     (option,) = (p for p in cli.commands[command].params if p.name == name)

@@ -179,9 +179,7 @@ def test_what_a_walk_explains_as_well_is_no_ramp(
 
 
 @pytest.mark.long
-def test_few_frames_count_and_nothing_in_them_is_nothing(
-    acquired: Callable[..., Evidence],
-) -> None:
+def test_few_frames_count_and_nothing_in_them_is_nothing(acquired: Callable[..., Evidence]) -> None:
     evidence, rng = acquired(), np.random.default_rng(14)
     seen = []
     for _ in range(60):
@@ -289,9 +287,7 @@ def test_a_walk_of_the_fringe_runs_alone_is_found(acquired: Callable[..., Eviden
 
 
 @pytest.mark.long
-def test_a_ramp_that_begins_anew_with_each_run_is_found(
-    acquired: Callable[..., Evidence],
-) -> None:
+def test_a_ramp_that_begins_anew_with_each_run_is_found(acquired: Callable[..., Evidence]) -> None:
     found = BiasDrift.estimate(acquired(None, {"bias_drift": RUN | {"run_ramp_e_h": -4000.0}}))
     assert found is not None
     assert isinstance(found.effect, BiasDrift)
@@ -382,14 +378,7 @@ def test_the_level_of_an_offset_shows_in_the_shot_noise_it_lacks(
 ) -> None:
     evidence = acquired(
         None,
-        {
-            "bias_drift": {
-                **RUN,
-                "tracks": [
-                    {"set": "vertical", "time_s": [0.0], "value": [900.0]},
-                ],
-            }
-        },
+        {"bias_drift": {**RUN, "tracks": [{"set": "vertical", "time_s": [0.0], "value": [900.0]}]}},
     )
     level, error = noiseless_level(evidence, evidence.fringes["vertical"])
     none, _ = noiseless_level(evidence, evidence.fringes["horizontal"])

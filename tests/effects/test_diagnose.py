@@ -31,11 +31,7 @@ from pixcal.stages.diagnose.windows import chosen_windows, frames_of_half, split
 from pixcal_cli.main import invoke
 
 SYNC = Runtime(cluster="sync")
-SMALL = {
-    "detector.shape": [53, 59],
-    "frames.fringes.0.count": 120,
-    "frames.fringes.1.count": 110,
-}
+SMALL = {"detector.shape": [53, 59], "frames.fringes.0.count": 120, "frames.fringes.1.count": 110}
 FEW = ("lag", "row_noise", "fringe_jitter", "quantisation")
 """Candidates of most tests, for speed."""
 

@@ -165,9 +165,7 @@ def test_whether_what_comes_out_has_noise_shows_in_the_residuals(
 def test_pixels_that_differ_tell_where_the_contrast_is_noisy(
     acquired: Callable[..., Evidence],
 ) -> None:
-    noisy = {
-        "optics.visibility": 0.9,
-    }
+    noisy = {"optics.visibility": 0.9}
     white = {"vibration_rad": 0.0, "polarisation": 0.03, "polarisation_s": 0.0}
     effects = {"contrast_noise": white, "lag": {"share": 0.004, "spread": 0.2}}
     evidence = acquired(noisy, effects)

@@ -72,9 +72,7 @@ def test_a_bent_response_leaves_the_gain_at_level_zero(
     assert change(bench, bent) == pytest.approx(1.0, abs=0.05)
 
 
-def test_narrow_codes_scale_noise_and_mean_alike(
-    make_effect_bench: Callable[..., Bench],
-) -> None:
+def test_narrow_codes_scale_noise_and_mean_alike(make_effect_bench: Callable[..., Bench]) -> None:
     """A 16th of the codes is 0.8 codes narrow: the response is steeper, and the noise larger."""
     bench = make_effect_bench({"detector.shape": [61, 67], "detector.gain_e_per_adu": 40.0})
     widths = np.zeros(4000)

@@ -22,9 +22,7 @@ SHAPE = (160, 96)
 GOOD = np.ones(SHAPE, np.bool_)
 
 
-def test_an_output_moves_as_a_whole_and_by_itself(
-    make_effect_bench: Callable[..., Bench],
-) -> None:
+def test_an_output_moves_as_a_whole_and_by_itself(make_effect_bench: Callable[..., Bench]) -> None:
     bench = make_effect_bench()
     bias = next(r for r in recordings(bench) if r.kind == "bias")
     change = frames_of(bench, bias, [OutputJitter(5.0, 0.0, (20,), (32,))]).astype(float)
@@ -42,8 +40,7 @@ def test_an_output_moves_as_a_whole_and_by_itself(
 
 
 @pytest.mark.parametrize(
-    ("rms", "rows", "columns"),
-    [(3.0, (24,), (32,)), (2.0, (), (20, 44)), (12.0, (40,), ())],
+    ("rms", "rows", "columns"), [(3.0, (24,), (32,)), (2.0, (), (20, 44)), (12.0, (40,), ())]
 )
 def test_edges_and_sizes_are_found(
     acquired: Callable[..., Evidence],

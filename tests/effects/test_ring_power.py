@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pixcal.effects.flat_error import (
-    NARROW,
-    Ring,
-    _of_long_waves,
-    _of_short_waves,
-    ring_power,
-)
+from pixcal.effects.flat_error import NARROW, Ring, _of_long_waves, _of_short_waves, ring_power
 from pixcal.estimators.maps.map_fit import polynomial, without
 
 F64 = NDArray[np.float64]

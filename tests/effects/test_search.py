@@ -403,8 +403,7 @@ def test_a_cause_that_closes_much_less_than_stays_open_is_not_claimed(
 
 
 @pytest.mark.parametrize(
-    ("open_still", "alone", "claimed"),
-    [(0.5, 1.0, False), (0.5, 0.8, True), (0.1, 1.0, True)],
+    ("open_still", "alone", "claimed"), [(0.5, 1.0, False), (0.5, 0.8, True), (0.1, 1.0, True)]
 )
 def test_two_causes_that_only_make_good_for_each_other_are_not_claimed(
     monkeypatch: pytest.MonkeyPatch, open_still: float, alone: float, claimed: bool
@@ -549,10 +548,7 @@ def test_an_effect_that_was_hinted_at_and_not_taken_is_told_so() -> None:
     for seed in range(800, 840):
         found, _ = search(
             {"left": 0.03, "little": 0.0035},
-            [
-                candidate("left", 0.03),
-                candidate("little", 0.0035, sigmas=3.0),
-            ],
+            [candidate("left", 0.03), candidate("little", 0.0035, sigmas=3.0)],
             None,
             seed,
         )

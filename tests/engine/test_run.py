@@ -21,12 +21,7 @@ from pixcal.model.errors import InputError
 
 # Functions that other processes can import: those of the standard library.
 POWER = partial(pow, 3)
-LOCAL = [
-    Runtime("sync"),
-    Runtime("threads", 1),
-    Runtime("threads", 3),
-    Runtime("processes", 2),
-]
+LOCAL = [Runtime("sync"), Runtime("threads", 1), Runtime("threads", 3), Runtime("processes", 2)]
 
 
 @pytest.fixture(params=[*LOCAL, "cluster"], ids=str)

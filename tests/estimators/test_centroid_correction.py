@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import dblquad
 
-from pixcal.estimators.star_centroids import (
-    correct_centroids,
-    correction_map,
-    gaussian_star,
-)
+from pixcal.estimators.star_centroids import correct_centroids, correction_map, gaussian_star
 
 SHAPE = (60, 70)
 

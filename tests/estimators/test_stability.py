@@ -84,11 +84,7 @@ WHITE_CASES: dict[str, tuple[int, int, dict[str, Any]]] = {
     "few batches": (9, 250, {}),
     "few pixels": (24, 30, {}),
     "gap": (41, 200, {"gap": slice(15, 22)}),
-    "uneven noise": (
-        30,
-        300,
-        {"noise": np.exp(0.5 * np.random.default_rng(1).normal(size=300))},
-    ),
+    "uneven noise": (30, 300, {"noise": np.exp(0.5 * np.random.default_rng(1).normal(size=300))}),
 }
 
 
@@ -144,10 +140,7 @@ def test_limits_of_a_pixel_agree_with_chi_square() -> None:
 
 @pytest.mark.parametrize(
     ("drift", "knee", "most"),
-    [
-        (random_walk, np.sqrt(3 / 0.01), 1.5),
-        (shared_drift, np.cbrt(2 / 0.05**2), 1.5),
-    ],
+    [(random_walk, np.sqrt(3 / 0.01), 1.5), (shared_drift, np.cbrt(2 / 0.05**2), 1.5)],
 )
 def test_a_strong_drift_is_found_where_it_is(drift: Drift, knee: float, most: float) -> None:
     found = list(islice(curves(60, 400, drift), 20))

@@ -34,11 +34,7 @@ class Whole:
     parts: tuple[Part, ...] = quantity(())
 
 
-part = st.builds(
-    Part,
-    name=st.text(max_size=20),
-    weight_kg=st.floats(0, 1e6, exclude_min=True),
-)
+part = st.builds(Part, name=st.text(max_size=20), weight_kg=st.floats(0, 1e6, exclude_min=True))
 whole = st.builds(
     Whole,
     count=st.integers(1, 1000),

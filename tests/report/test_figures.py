@@ -192,8 +192,7 @@ def allan_entry(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [{}, {"knee_frames": 900.0}, {"slope": None}, {"seconds": [0.0, 0.0, 0.0]}],
+    "changes", [{}, {"knee_frames": 900.0}, {"slope": None}, {"seconds": [0.0, 0.0, 0.0]}]
 )
 def test_the_allan_plot(changes: dict[str, Any]) -> None:
     facts = {"frames": 2000, "crb_median_px": 4.5e-4}

@@ -111,9 +111,7 @@ def test_a_ratio_is_nan_where_there_is_no_light() -> None:
 
 
 @pytest.mark.parametrize("shape", [(67, 131), (300, 517)])
-def test_white_noise_has_a_flat_spectrum_at_the_level_of_its_errors(
-    shape: tuple[int, int],
-) -> None:
+def test_white_noise_has_a_flat_spectrum_at_the_level_of_its_errors(shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(3)
     sigma = 1e-3 * np.linspace(1, 2, shape[1]) * np.ones(shape)
     delta = sigma * rng.normal(size=shape)

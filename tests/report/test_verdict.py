@@ -109,10 +109,7 @@ def test_masked_pixels(masked: int, level: str) -> None:
     [
         ({"fringe_vector_moves": True}, "fringe vector varies"),
         (
-            {
-                "model": "hyperbolic",
-                "geometry": {"centre_x_mm": 79.0, "centre_x_nominal_mm": 0.0},
-            },
+            {"model": "hyperbolic", "geometry": {"centre_x_mm": 79.0, "centre_x_nominal_mm": 0.0}},
             "79.0 mm from their nominal position along x",
         ),
     ],

@@ -8,15 +8,7 @@ from pixcal.effects.ipc import Ipc
 from pixcal.kernels.crosstalk import Coupling, couple
 from pixcal.kernels.optics import Geometry, phase
 from reproduction.figure_12 import period_of, predicted_teeth
-from reproduction.maps import (
-    Crest,
-    Whiteness,
-    harmonics,
-    plane,
-    sloping_harmonics,
-    teeth,
-    without,
-)
+from reproduction.maps import Crest, Whiteness, harmonics, plane, sloping_harmonics, teeth, without
 
 F64 = NDArray[np.float64]
 SHAPE = (83, 101)

@@ -387,12 +387,7 @@ def test_each_case_gets_the_memory_that_it_asks_for(
     over, each = share("cases", "standard", 10, runtime)
     assert over.workers == at_once
     half, sets = 128 * 128 * 300, 3
-    make_plan(
-        "diagnose",
-        look.ESTIMATE_BYTES * half,
-        look.EVIDENCE_BYTES * half * sets,
-        each,
-    )
+    make_plan("diagnose", look.ESTIMATE_BYTES * half, look.EVIDENCE_BYTES * half * sets, each)
     with pytest.raises(PlanError, match="cases"):
         share("cases", "standard", 10, replace(runtime, memory=1 << 30))
 

@@ -278,9 +278,7 @@ def test_the_dataset_is_cf_for_xarray_and_dask(bench: tuple[Path, Camera, Any]) 
     assert set(tree.children) == {"vertical", "short"}
 
 
-def test_saturated_samples_have_no_weight_and_are_counted(
-    bench: tuple[Path, Camera, Any],
-) -> None:
+def test_saturated_samples_have_no_weight_and_are_counted(bench: tuple[Path, Camera, Any]) -> None:
     run, _, _ = bench
     found = report(run)["sets"]
     assert found["vertical"]["saturated_samples"] == 4
@@ -295,9 +293,7 @@ def test_saturated_samples_have_no_weight_and_are_counted(
     assert not both.any(), "a set's mask holds the flags of the calibration"
 
 
-def test_the_stored_precision_costs_less_than_a_thousandth(
-    bench: tuple[Path, Camera, Any],
-) -> None:
+def test_the_stored_precision_costs_less_than_a_thousandth(bench: tuple[Path, Camera, Any]) -> None:
     run, _, made = bench
     found = report(run)["quantisation"]["vertical"]
     assert found["share_of_variance_dark"] < 1e-3
@@ -372,10 +368,7 @@ class Killed(BaseException):
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("survived", [1, 3, 5])
 def test_a_run_that_was_cut_short_goes_on(
-    bench: tuple[Path, Camera, Any],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    survived: int,
+    bench: tuple[Path, Camera, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, survived: int
 ) -> None:
     run, _, _ = bench
     shutil.copytree(run / "ingest", tmp_path / "ingest")

@@ -295,11 +295,7 @@ def write_diagnose(run: Path, verdict: str = "explained", effects: tuple[str, ..
     }
     inputs = {"reduce": read_manifest(run / "reduce").key}
     with build(
-        run,
-        "diagnose",
-        DIAGNOSIS_FORMAT,
-        {"effects": list(effects), "nominal": {}},
-        inputs,
+        run, "diagnose", DIAGNOSIS_FORMAT, {"effects": list(effects), "nominal": {}}, inputs
     ) as made:
         write_json(made.folder / "diagnosis.json", facts)
         write_json(made.folder / "curves.json", [curve])

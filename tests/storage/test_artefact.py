@@ -90,10 +90,7 @@ def test_a_build_is_resumed_by_its_own_key_only(tmp_path: Path) -> None:
         made.note('odd "name"\n')
         (made.folder / "data").write_text("kept")
         raise RuntimeError
-    with (
-        suppress(RuntimeError),
-        build(tmp_path, "fit", 1, CONFIG | {"limit": 9}, INPUTS) as other,
-    ):
+    with suppress(RuntimeError), build(tmp_path, "fit", 1, CONFIG | {"limit": 9}, INPUTS) as other:
         assert not other.resumed
         assert other.journal() == set()
         raise RuntimeError

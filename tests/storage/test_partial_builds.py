@@ -92,10 +92,7 @@ def test_killed_between_the_moves(
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "rename", killed)
-        with (
-            pytest.raises(KeyboardInterrupt),
-            build(tmp_path, "fit", 1, {"number": 2}, {}) as made,
-        ):
+        with pytest.raises(KeyboardInterrupt), build(tmp_path, "fit", 1, {"number": 2}, {}) as made:
             made.note("one step")
     with lock(tmp_path):
         manifest = read_manifest(tmp_path / "fit")

@@ -114,9 +114,7 @@ def exponentials(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 @law("lag", "traps", 20, 800, "e- that traps hold", varied_phases=True, needs="pyxel")
 def traps(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     """Traps of limited capacity, by Pyxel's model of persistence."""
-    from pyxel.models.charge_collection.utils_persistence import (
-        compute_simple_persistence,
-    )
+    from pyxel.models.charge_collection.utils_persistence import compute_simple_persistence
 
     frames = float(rng.uniform(1.2, 3))
     level = float(rng.uniform(0.15, 0.5)) * bench.peak_e

@@ -25,9 +25,7 @@ def charge_transfer(bench: Bench, size: float, rng: np.random.Generator) -> _Dra
     By Pyxel's model of distortion (Short et al. 2013): the tail grows with the number of transfers,
     and less than in proportion to the charge.
     """
-    from pyxel.models.charge_transfer.utils_cdm import (
-        run_cdm_parallel,
-    )
+    from pyxel.models.charge_transfer.utils_cdm import run_cdm_parallel
 
     beta, volume, well = 0.37, 1e-10, 1.5 * bench.peak_e
     step = 1e-3
@@ -96,13 +94,7 @@ def pixel_nonlinearity(bench: Bench, size: float, rng: np.random.Generator) -> _
 
 
 @law(
-    "mirror_crosstalk",
-    "halves",
-    3e-4,
-    0.01,
-    "of the mirrored pixel",
-    known=False,
-    decidable=False,
+    "mirror_crosstalk", "halves", 3e-4, 0.01, "of the mirrored pixel", known=False, decidable=False
 )
 def mirror_crosstalk(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     """Coupling of two outputs that are read simultaneously, from both sides inwards.

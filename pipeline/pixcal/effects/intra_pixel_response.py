@@ -103,11 +103,7 @@ class IntraPixelResponse(Effect):
         rms_error = float(np.hypot(rms_error, rms * width_error / max(width, 0.5)))
         return Estimate(
             cls((width, width), min(rms, 0.5)),
-            {
-                "width_px[0]": width_error,
-                "width_px[1]": width_error,
-                "width_rms_px": rms_error,
-            },
+            {"width_px[0]": width_error, "width_px[1]": width_error, "width_rms_px": rms_error},
             # Of the scatter only, because unequal fibre powers also change a visibility.
             float(scatter / its_error),
             "visibility that varies from pixel to pixel, more strongly at shorter fringe periods",

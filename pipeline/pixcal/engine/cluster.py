@@ -61,10 +61,7 @@ def run_on_cluster(
     if not items:
         return
     packed = pack(function)
-    with (
-        _connect(runtime) as client,
-        _probe_file(packed.paths + pack(items[0]).paths) as probe,
-    ):
+    with _connect(runtime) as client, _probe_file(packed.paths + pack(items[0]).paths) as probe:
         job = Job(packed.data, packed.paths + probe, runtime.workers, versions())
         tasks = _Tasks(client, runtime.cluster, job, items, f"{label}-{uuid4().hex[:8]}")
         try:

@@ -26,14 +26,7 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec
 
 from pixcal.model.errors import DamagedError
-from pixcal.storage.folder import (
-    INDEX,
-    File,
-    copy_files,
-    link_files,
-    open_folder,
-    read_file,
-)
+from pixcal.storage.folder import INDEX, File, copy_files, link_files, open_folder, read_file
 from pixcal.storage.memory import MemoryArray, MemoryPath
 from pixcal.storage.place import Place, UrlPath
 from pixcal.storage.read_ahead import AHEAD, ReadAhead

@@ -6,12 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from pixcal.estimators.detector.flat_ladder import (
-    FLICKER_KNOWN,
-    flicker,
-    level_before,
-    warming,
-)
+from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker, level_before, warming
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.frame_order import follows

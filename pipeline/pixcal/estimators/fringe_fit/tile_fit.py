@@ -7,13 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, SmoothPhasor, smooth_phasor
-from pixcal.kernels.bilinear import (
-    GAP,
-    GOES_ON,
-    N_SUMS,
-    solve_pixels,
-    sweep_batches,
-)
+from pixcal.kernels.bilinear import GAP, GOES_ON, N_SUMS, solve_pixels, sweep_batches
 from pixcal.kernels.robust import median
 from pixcal.model.arrays import C128, F32, F64, U16, Mask
 

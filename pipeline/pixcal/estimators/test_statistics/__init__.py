@@ -77,17 +77,7 @@ def statistic(
         of_set = sets and not together
         name = getattr(measure, "__name__", "")
         return Statistic(
-            name,
-            title,
-            domain,
-            quantity,
-            unit,
-            x,
-            kind,
-            of_set,
-            together,
-            floor,
-            measure,
+            name, title, domain, quantity, unit, x, kind, of_set, together, floor, measure
         )
 
     return mark

@@ -12,11 +12,7 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.stages import reduce
-from pixcal.stages.diagnose.frames_used import (
-    FramesUsed,
-    frames_of,
-    missing_frames,
-)
+from pixcal.stages.diagnose.frames_used import FramesUsed, frames_of, missing_frames
 from pixcal.stages.diagnose.measuring import nominal_bench
 from pixcal.stages.diagnose.parts import Half, Raw, evidence_of, take
 from pixcal.stages.diagnose.trial import Curves, Signature, Window, averaged, measured_curves

@@ -285,10 +285,7 @@ def _pieces(
 
 
 def _fill(
-    made: Build,
-    tables: Mapping[str, Sequence[Frame]],
-    copied: Mapping[str, bool],
-    runtime: Runtime,
+    made: Build, tables: Mapping[str, Sequence[Frame]], copied: Mapping[str, bool], runtime: Runtime
 ) -> None:
     """Read and write all blocks that an earlier run has not written."""
     rows, plan = _plan(tables, copied, made.cubes, runtime)

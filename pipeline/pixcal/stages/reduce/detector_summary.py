@@ -182,12 +182,7 @@ def pair_sums(folder: Place, job: Measuring) -> F64:
 
 
 def _gain(
-    sums: F64,
-    read_noise: Measure | None,
-    lost: float,
-    wander: float,
-    top: float,
-    job: Measuring,
+    sums: F64, read_noise: Measure | None, lost: float, wander: float, top: float, job: Measuring
 ) -> GainFit | None:
     """Photon transfer below the level ``top`` (ADU above bias) of saturation, neighbours added.
 

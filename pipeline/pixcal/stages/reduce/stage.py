@@ -225,11 +225,7 @@ def _calibrate(
 
 
 def _report(
-    made: Build,
-    source: Ingested,
-    config: Config,
-    found: Reduction,
-    runtime: Runtime,
+    made: Build, source: Ingested, config: Config, found: Reduction, runtime: Runtime
 ) -> None:
     job, summary, sets = found.job, found.summary, found.sets
     piled = source.saturation_found if source.detector.saturation_adu is None else None
