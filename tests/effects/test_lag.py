@@ -10,7 +10,7 @@ from all_frames import frames_of
 
 from pixcal.effects.lag import Lag
 from pixcal.estimators.detector.flat_ladder import warming
-from pixcal.estimators.detector.frame_lag import Uneven, lag_of_flats
+from pixcal.estimators.detector.frame_lag import LagNonuniformity, lag_of_flats
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack, central_crop
 from pixcal.kernels.normals import Key, pixel_normals
 from pixcal.kernels.scene import Rows
@@ -174,7 +174,7 @@ def test_pixels_that_differ_tell_where_the_contrast_is_noisy(
     assert isinstance(found.effect, Lag)
     assert 1e-3 < found.errors["share"] < 4e-3
     assert abs(found.effect.share - 0.004) < 4 * found.errors["share"]
-    assert Uneven.of(central_crop(evidence).fringes.values()).sigmas > 10
+    assert LagNonuniformity.of(central_crop(evidence).fringes.values()).sigmas > 10
     assert found.significance > 10
     nothing = Lag.estimate(acquired(noisy, {"contrast_noise": white}))
     assert nothing is not None
