@@ -208,11 +208,11 @@ def frame_numbers(table: Mapping[str, list[Any]]) -> Indices:
 
 def _start(ingested: Ingested, name: str) -> float:
     """Time of an array's frame 0 after the first frame of all, s; nan when unknown."""
-    begin = {key: _begin(table) for key, table in ingested.tables.items()}
-    return float(begin[name] - np.min(list(begin.values()))) * DAY_S
+    begin = {key: begin_mjd(table) for key, table in ingested.tables.items()}
+    return float(begin[name] - np.fmin.reduce(list(begin.values()))) * DAY_S
 
 
-def _begin(table: Mapping[str, list[Any]]) -> float:
+def begin_mjd(table: Mapping[str, list[Any]]) -> float:
     """Time stamp of an array's frame 0, days; nan when unknown."""
     stamps = np.array(table["mjd"], float) - np.array(table["time_s"], float) / DAY_S
     # Later planes of a cube without exposure time have none.

@@ -77,11 +77,15 @@ def take(
 
 def select(tables: Mapping[str, Table], half: Half) -> dict[str, Table]:
     """Rows of the tables that belong to a half, with the numbers of the frames."""
-    return {
-        name: {key: [column[n] for n in frames] for key, column in tables[name].items()}
-        | {"frame": frames.tolist()}
-        for name, frames in half.items()
-    }
+    found: dict[str, Table] = {}
+    for name, frames in half.items():
+        own = {key: [column[n] for n in frames] for key, column in tables[name].items()}
+        # In a cube, only the first plane may have a time stamp.
+        if len(frames) and all(mjd is None for mjd in own["mjd"]):
+            begin = evidence.begin_mjd(tables[name]) + own["time_s"][0] / evidence.DAY_S
+            own["mjd"][0] = float(begin) if np.isfinite(begin) else None
+        found[name] = own | {"frame": frames.tolist()}
+    return found
 
 
 def evidence_of(raw: Raw, part: Part, window: tuple[int, int]) -> Evidence:

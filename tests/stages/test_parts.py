@@ -1,0 +1,25 @@
+"""Tables of a part of the frames."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pixcal.stages.diagnose.parts import select
+from pixcal.stages.evidence import begin_mjd
+
+CUBE: dict[str, list[Any]] = {"time_s": [0.0, 1.5, 3.0, 4.5, 6.0], "mjd": [61100.25, *[None] * 4]}
+
+
+@pytest.mark.parametrize("frames", [[0, 1], [1, 3], [4]])
+def test_an_array_begins_when_it_did_whichever_frames_are_taken(frames: list[int]) -> None:
+    found = select({"bias": CUBE}, {"bias": np.array(frames)})["bias"]
+    assert begin_mjd(found) == pytest.approx(61100.25, abs=1e-8)
+    assert found["time_s"] == [CUBE["time_s"][n] for n in frames]
+
+
+def test_without_time_stamps_the_beginning_stays_unknown() -> None:
+    table = CUBE | {"mjd": [None] * 5}
+    found = select({"bias": table}, {"bias": np.array([2, 3])})["bias"]
+    assert np.isnan(begin_mjd(found))
+    assert found["mjd"] == [None, None]
