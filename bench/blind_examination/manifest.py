@@ -8,7 +8,7 @@ from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
 from pixcal.storage.manifest import read_json, write_json
 
-SCHEMA = "pixcal/blind/1"
+SCHEMA = "pixcal/blind/2"
 FILE = "blind.json"
 RUNS = "runs"
 EXAMINATION = 1000  # lowest seed of examinations; lower ones are for development

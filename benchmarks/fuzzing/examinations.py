@@ -22,7 +22,7 @@ JUNK = (b"", b"[]", b"{}", b"null", b"3", b"\xff\xfe", b"{", b'{"schema": "pixca
 
 @cache
 def _exams() -> tuple[Path, Path]:
-    """Folders, each with an examination that was sat (no gap each time) and its truth."""
+    """Folders, each with an examination that was run (no gap each time) and its truth."""
     folder = lasting_folder()
     made = []
     for seed in (1, 2):
@@ -67,7 +67,7 @@ def _spoil_json(case: Case, file: Path) -> None:
 
 
 def _exam(case: Case) -> Answer:
-    """An examination, spoilt in one place, to be scored, or to be sat where nothing is left."""
+    """An examination, spoilt in one place, to be scored, or continued where nothing is left."""
     first, second = _exams()
     exam, truth = case.folder / "exam", case.folder / "truth.json"
     shutil.copytree(first / "exam", exam, copy_function=os.link)
@@ -84,7 +84,7 @@ def _exam(case: Case) -> Answer:
             "foreign",
             "diagnosis",
             "diagnosis",
-            "sat",
+            "done",
             "case",
             "page",
         )
@@ -103,7 +103,7 @@ def _exam(case: Case) -> Answer:
         (where / str(case.pick("case-0009", "notes.txt", ".DS_Store", "blind.json~"))).touch()
     elif what == "diagnosis":
         _spoil_json(case, run / "products" / "diagnosis.json")
-    elif what == "sat":
+    elif what == "done":
         _spoil_json(case, run / "done.json")
     elif what == "case":
         shutil.rmtree(case.pick(exam / "runs", run, exam / run.name))

@@ -68,7 +68,7 @@ def test_significance_is_that_of_the_best_of_many_looks():
 
     def of(best, tests):
         return Choice(
-            (), PixelClasses(1, 1, (0, 0)), (support.TestFamily(best, tests),)
+            (), PixelClasses(1, 1, (0, 0)), (support.FamilyOfTests(best, tests),)
         ).significance
 
     rng = np.random.default_rng(2)
@@ -90,7 +90,7 @@ def test_significance_is_that_of_the_better_of_two_groups_of_looks():
             (),
             PixelClasses(1, 1, (0, 0)),
             tuple(
-                support.TestFamily(
+                support.FamilyOfTests(
                     float((rng.standard_normal(n) ** 2).max()), round(n / INDEPENDENT)
                 )
                 for n in (700, 7)

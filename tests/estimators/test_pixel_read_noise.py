@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.detector.pixel_read_noise import FEWEST, PixelNoise
+from pixcal.estimators.detector.pixel_read_noise import FEWEST, PixelNoise, squares_without_hits
 
 SHAPE = (70, 61)
 GOOD = np.ones(SHAPE, bool)
@@ -108,3 +108,28 @@ def test_pixels_masked_for_other_reasons_do_not_change_the_noise_of_good_ones(sh
 
 def test_too_few_frames_tell_nothing() -> None:
     assert PixelNoise.of([frames(0.1, FEWEST - 1)], GOOD) is None
+
+
+@pytest.mark.parametrize("count", [FEWEST, 13, 40])
+def test_squares_of_normal_noise_are_those_about_the_mean(count: int) -> None:
+    stack = frames(0.2, count) + 7
+    squares = squares_without_hits(stack)
+    np.testing.assert_allclose(squares, ((stack - stack.mean(axis=0)) ** 2).sum(axis=0), rtol=1e-3)
+
+
+@pytest.mark.parametrize("count", [FEWEST, 20])
+def test_one_hit_leaves_the_squares_of_the_other_samples(count: int) -> None:
+    stack = frames(0.0, count)
+    others = np.var(stack[1:], axis=0, ddof=1) * (count - 1)
+    stack[0] += 1500
+    np.testing.assert_allclose(squares_without_hits(stack), others, rtol=0.02)
+    stack[1] += 1500  # Twice is no particle.
+    assert (squares_without_hits(stack) > 10 * others).all()
+
+
+def test_pixels_that_particles_hit_are_not_drawn_noisy() -> None:
+    stack, rng = frames(0.0, 20), np.random.default_rng(6)
+    hit = rng.choice(stack[0].size, 40, replace=False)
+    stack.reshape(20, -1)[rng.integers(0, 20, 40), hit] += rng.exponential(2000, 40) + 500
+    drawn = PixelNoise.of([stack], GOOD).drawn(np.random.default_rng(1))
+    assert drawn.max() < 1.6

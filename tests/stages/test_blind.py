@@ -323,7 +323,7 @@ def test_what_stands_in_the_way_is_refused(exam: tuple[Path, Path], tmp_path: Pa
         run(tmp_path, RunConfig(), SYNC)
 
 
-# How it is sat.
+# How it is run.
 
 
 def test_cases_are_diagnosed_once_and_without_what_is_left_out(
@@ -352,7 +352,7 @@ def test_cases_are_diagnosed_once_and_without_what_is_left_out(
     found = score(folder, sealed, ScoreConfig(), SYNC)
     assert [c["case"] for c in found["cases"]] == ["case-0001"]
     assert found["missing"] == ["case-0002", "case-0003"]
-    # Of those that are still to be sat nothing is told, nor the seed that they are drawn from.
+    # Of those that are still to be run nothing is told, nor the seed that they are drawn from.
     told = (folder / "score.json").read_text() + (folder / "score.md").read_text()
     assert found["seed"] is None
     assert "quadratic" not in told

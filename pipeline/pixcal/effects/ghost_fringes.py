@@ -13,7 +13,7 @@ from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
 from pixcal.model.arrays import C128, F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
-from pixcal.simulation.forward import Part
+from pixcal.simulation.forward import Scalable
 from pixcal.simulation.recording import Recording
 
 Beat = tuple[float, float]
@@ -41,7 +41,7 @@ ALIKE, ALIKE_SIGMAS = 0.1, 5.0
 
 
 @dataclass(frozen=True)
-class GhostWave(Part):
+class GhostWave(Scalable):
     """One ghost as it is measured in the maps of a fringe set, with no assumption on its origin."""
 
     strengths = ("static", "forward", "backward")

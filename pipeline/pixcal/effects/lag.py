@@ -36,7 +36,7 @@ class Lag(Effect):
     Before the first frame of a recording the pixels were empty, or held what the last frame of the
     recording before left (`carried`). A barrier may hold back another share of each band of the
     level; traps take charge as long as they have room (`capacity_e`). Maps show nothing of it: the
-    frame before is a sum of the same maps. `restored` undoes it on frames.
+    frame before is a sum of the same maps. `restored` undoes one share, without traps, on frames.
     """
 
     name = "lag"

@@ -19,7 +19,7 @@ from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import SETS_DISAGREE, Effect, Estimate, Stage
-from pixcal.simulation.forward import Part
+from pixcal.simulation.forward import Scalable
 from pixcal.simulation.shot import Shot
 
 FALLOFF_PX = 0.5  # falloff of boundary shifts (brighter-fatter effect) fitted with the response
@@ -35,7 +35,7 @@ _OTHER_ORDER = 4
 
 
 @dataclass(frozen=True)
-class CurvePoint(Part):
+class CurvePoint(Scalable):
     """A point of a measured response."""
 
     strengths = ("change_e",)

@@ -12,7 +12,7 @@ from pixcal.kernels.scene import DetectorMaps, Rows
 from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, FringeMaps, LightStart, Stage
-from pixcal.simulation.forward import Part
+from pixcal.simulation.forward import Scalable
 from pixcal.simulation.recording import Recording
 
 DEGREE = 8  # of the polynomials of a measured pattern
@@ -25,7 +25,7 @@ def _polynomials(places: bytes) -> F64:
 
 
 @dataclass(frozen=True)
-class StrayPattern(Part):
+class StrayPattern(Scalable):
     """Stray light as measured in one fringe set, on a part of the detector."""
 
     strengths = ("coefficients",)

@@ -53,7 +53,7 @@ def workers_of(runtime: Running) -> dict[str, dict[str, Any]]:
 def run_on_cluster(
     function: Callable[[Any], Any], items: Sequence[Any], runtime: Running, ended: Ended, label: str
 ) -> None:
-    """Do tasks on a cluster; ``ended`` gets the number and result of each.
+    """Run tasks on a cluster; ``ended`` gets the number and result of each.
 
     InputError: no scheduler, or workers lack files or versions; ClusterError: the scheduler is
     lost, or a task kills workers again and again.

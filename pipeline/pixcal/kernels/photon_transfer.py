@@ -148,8 +148,8 @@ def bin_pairs(blocks: F64) -> F64:
 
 # Prior of the covariances of neighbours over the shot noise: normal numbers that fall off with a
 # power of the distance. All of a kernel have one size in common, and each differs from it by `_OWN`
-# times as much. The size is zero by this chance, or any from the smallest (or from the error, if
-# that is less) to the largest.
+# times as much. The size is zero with probability `_NOTHING`, or any from the smallest (or from the
+# error, if that is less) to the largest.
 _NOTHING, _SMALLEST, _LARGEST, _OWN = 0.3, 2e-3, 0.1, 0.3
 _POWERS = (2.0, 3.0, 6.0)  # of charge that pushes (2, 3), of capacitance
 

@@ -37,7 +37,7 @@ class Stage(IntEnum):
 
 
 @dataclass(frozen=True)
-class Part:
+class Scalable:
     """A model, or a part of it, with strengths of its own."""
 
     strengths: ClassVar[tuple[str, ...]]
@@ -49,7 +49,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class ForwardModel(Part):
+class ForwardModel(Scalable):
     """Base of all effects; a subclass is a frozen dataclass in a file of its own in ``effects/``.
 
     Attributes

@@ -11,12 +11,12 @@ from pixcal.estimators.frame_series.fringe_motion import vector_courses
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
-from pixcal.simulation.forward import Part
+from pixcal.simulation.forward import Scalable
 from pixcal.simulation.recording import Recording
 
 
 @dataclass(frozen=True)
-class Track(Part):
+class Track(Scalable):
     """A quantity of the frames of a fringe set, linear between points, constant beyond them."""
 
     strengths = ("value",)

@@ -195,7 +195,7 @@ def _stacks(ingested: Ingested, part: Part) -> tuple[Stack, ...]:
 
 def groups(table: Mapping[str, list[Any]]) -> list[Indices]:
     """Numbers of the frames of each exposure time and lamp, in ascending order; unknown last."""
-    exposures = np.array([np.inf if t is None else t for t in table["exptime_s"]], float)
+    exposures = np.nan_to_num(np.array(table["exptime_s"], float), nan=np.inf)
     steps = np.array(table.get("step") or np.zeros(len(exposures)), int)
     pairs = sorted(set(zip(exposures.tolist(), steps.tolist(), strict=True)))
     return [np.flatnonzero((exposures == t) & (steps == step)) for t, step in pairs]
@@ -209,7 +209,7 @@ def frame_numbers(table: Mapping[str, list[Any]]) -> Indices:
 def _start(ingested: Ingested, name: str) -> float:
     """Time of an array's frame 0 after the first frame of all, s; nan when unknown."""
     begin = {key: begin_mjd(table) for key, table in ingested.tables.items()}
-    return float(begin[name] - np.fmin.reduce(list(begin.values()))) * DAY_S
+    return float(begin[name] - np.min(list(begin.values()))) * DAY_S
 
 
 def begin_mjd(table: Mapping[str, list[Any]]) -> float:

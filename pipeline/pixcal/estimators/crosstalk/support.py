@@ -29,7 +29,7 @@ NOTHING = 1e-6  # weight of a share below which it is not measured
 
 
 @dataclass(frozen=True)
-class TestFamily:
+class FamilyOfTests:
     """Tests made together."""
 
     best: float  # largest chi-square of one of them
@@ -59,7 +59,7 @@ class Choice:
 
     links: tuple[int, ...]  # that stand out
     classes: PixelClasses  # of the period
-    families: tuple[TestFamily, ...]  # each with the same share of the chance
+    families: tuple[FamilyOfTests, ...]  # each with the same share of the chance
 
     @property
     def significance(self) -> float:
@@ -100,8 +100,8 @@ def choose(measured: MeasuredLinks, pattern: Callable[[PixelClasses], float]) ->
         )
     none = PixelClasses(1, 1, measured.first)
     classes = _period(measured.of(there), pattern, critical) if there else none
-    anywhere = TestFamily(max(float(best.max()), 1e-9), tests)
-    adjacent = TestFamily(max(float(gains[0, close].max()), alike, 1e-9), few)
+    anywhere = FamilyOfTests(max(float(best.max()), 1e-9), tests)
+    adjacent = FamilyOfTests(max(float(gains[0, close].max()), alike, 1e-9), few)
     return Choice(there, classes, (anywhere, adjacent))
 
 

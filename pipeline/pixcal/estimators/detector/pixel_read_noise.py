@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import digamma, polygamma
+from scipy.special import digamma, polygamma, stdtrit
 
 from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F32, F64, Indices, Mask
@@ -19,6 +19,7 @@ OUTLIER = 4.0  # standard deviations of all pixels beyond which one is excluded 
 FINENESS, MOST = 8, 256  # grid points: per error of a logarithm, and at most
 STEPS = 1000  # of expectation maximisation
 BROAD = 0.01  # share of the start distribution that is uniform over the grid
+HIT = 1e-6  # chance of a normal sample beyond which it is a hit by a particle
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class PixelNoise:
         for frames in stacks:
             rest = frames - frames.mean(axis=0)
             rest -= np.median(rest[:, good], axis=1)[:, None, None]
-            squares += np.einsum("tyx,tyx->yx", rest, rest, dtype=float)
+            squares += squares_without_hits(rest)
         measured = good
         if noisy is not None:
             loud = 1 + OUTLIER * np.sqrt(2 / freedom)
@@ -84,6 +85,24 @@ class PixelNoise:
         log[known] = self.log[index] + (within[known] - 0.5) * (self.log[1] - self.log[0])
         before = (np.exp(log) - self.rounding) / (1 - self.rounding)
         return np.sqrt(np.maximum(before, 0)).astype(np.float32)
+
+
+def squares_without_hits(frames: F32) -> F64:
+    """Sum of squares (y, x) of frames (t, y, x) about their mean, as without a single hit.
+
+    A pixel that a particle hits in one frame is not noisy: a sample that is no normal number beside
+    the others of its pixel is left out, and their sum extrapolated. It takes `FEWEST` frames.
+    """
+    count, rest = len(frames), frames - frames.mean(axis=0)
+    rest *= rest
+    total: F64 = rest.sum(axis=0, dtype=float)
+    if count < FEWEST:
+        return total
+    # What a sample takes with it when it is left out: it displaces the mean as well.
+    largest = rest.max(axis=0) * (count / (count - 1))
+    variance = np.maximum(total - largest, 0) / (count - 2)
+    hit = largest > stdtrit(count - 2, 1 - HIT / 2) ** 2 * variance
+    return np.asarray(np.where(hit, variance * (count - 1), total))
 
 
 def _likeliest(chance: F64, count: Indices, start: F64) -> F64:

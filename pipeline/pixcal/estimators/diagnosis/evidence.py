@@ -180,7 +180,7 @@ class Evidence:
         return signal * self.flat.astype(np.float32) + dark.astype(np.float32)
 
     def dark_noise(self, stack: Stack) -> tuple[F32, F32]:
-        """Darks (t, y, x), less medians of pixels and frames, and sigma, e-; NaN if flagged."""
+        """Unlit frames (t, y, x), less medians of pixels and frames; sigma; e-, NaN if flagged."""
         rest = (stack.adu - np.median(stack.adu, axis=0)) * self.gain
         rest = np.where(self.good, rest, np.nan)
         rest -= np.nanmedian(rest, axis=(1, 2), keepdims=True) if self.good.any() else 0
@@ -232,7 +232,7 @@ class Evidence:
 
 
 def once(make: Callable[Concatenate[Evidence, P], T]) -> Callable[Concatenate[Evidence, P], T]:
-    """Decorate a function of an evidence, whose results are to be kept in it (`Evidence.once`).
+    """Decorate a function of `Evidence` whose results are to be kept in it (`Evidence.once`).
 
     Further arguments: hashable ones, stacks of the evidence, and arrays.
     """

@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
-from scipy.integrate import quad
 from scipy.ndimage import maximum_filter
-from scipy.special import chdtr
 
+from pixcal.estimators.detector.pixel_read_noise import FEWEST, squares_without_hits
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics import Curve, family, statistic
 from pixcal.estimators.test_statistics.look import (
@@ -148,7 +147,7 @@ def outliers(data: FringeSetData) -> Curve:
     floor=1.0,
 )
 def dark_outliers(evidence: Evidence) -> Curve | None:
-    """The same without light, where noise is low and darks have long exposures."""
+    """The same without light: darks have long exposures, bias frames show hits during readout."""
     limits, counts = np.array(OUTLIERS), np.zeros((2, len(OUTLIERS)))
     every = (*evidence.of_kind("bias"), *evidence.of_kind("dark"))
     stacks = [stack for stack in every if len(stack.adu) >= MIN_DARKS]
@@ -182,12 +181,11 @@ def pixel_peakedness(data: FringeSetData) -> Curve:
     sets=False,
 )
 def read_noise(evidence: Evidence) -> Curve | None:
-    """Quantiles over the pixels of variance over that of the read noise.
+    """Quantiles over the pixels of variance over the read noise's, hits by particles left out.
 
-    Masked pixels count if they jump, the sample of a pixel that is furthest off does not: a
-    particle hits it in one frame.
+    Masked pixels count if they jump.
     """
-    stacks = [s for s in evidence.of_kind("bias") if len(s.adu) >= 8]
+    stacks = [s for s in evidence.of_kind("bias") if len(s.adu) >= FEWEST]
     if not stacks or not evidence.dithered:
         return None
     rounded = evidence.read_noise > evidence.amplifier_noise
@@ -199,19 +197,10 @@ def read_noise(evidence: Evidence) -> Curve | None:
     # A median of integers jumps by a code.
     level = frame_means(stacks[0].adu, evidence.good).astype(np.float32)
     frames = stacks[0].adu - level[:, None, None]
-    variance = calm_variance(frames) * (evidence.gain / evidence.read_noise) ** 2
+    variance = squares_without_hits(frames) / (len(frames) - 1)
+    variance *= (evidence.gain / evidence.read_noise) ** 2
     counted = evidence.good | jumping(frames)
     return Curve(np.array(QUANTILES), ranges_about(variance[counted], QUANTILES))
-
-
-def calm_variance(frames: F32) -> F64:
-    """Variance (y, x) of normal frames (t, y, x), without each pixel's furthest sample."""
-    count, rest = len(frames), frames - frames.mean(axis=0)
-    rest *= rest
-    total = rest.sum(axis=0, dtype=float) - rest.max(axis=0) * count / (count - 1)
-    # The largest of the squares of so many normal numbers.
-    largest, _ = quad(lambda x: 1 - chdtr(1, x) ** count, 0, np.inf)
-    return np.asarray(total / (count - 1 - largest))
 
 
 def jumping(frames: F32) -> Mask:

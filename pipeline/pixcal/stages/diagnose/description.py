@@ -17,7 +17,7 @@ from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import plain_bench
 from pixcal.stages.diagnose.nominal import SetTruth
 from pixcal.stages.diagnose.parts import Half, Table
-from pixcal.stages.evidence import groups
+from pixcal.stages.evidence import DAY_S, begin_mjd, groups
 
 _LATE = 0.05  # fraction of a period above which a frame counts as late
 _LIFTED = 8.0  # level without light after the pedestal, in units of the read noise
@@ -135,7 +135,7 @@ def _in_sequence(
     tables: Mapping[str, Table],
 ) -> list[Recording]:
     """Each recording linked to the preceding one, if time stamps identify it."""
-    stamps = [np.array(tables[name]["mjd"], float)[numbers] for name, numbers in places]
+    stamps = [_days(tables[name])[numbers] for name, numbers in places]
     found = []
     for recording, own in zip(recordings, stamps, strict=True):
         earlier = [
@@ -148,12 +148,17 @@ def _in_sequence(
     return found
 
 
+def _days(table: Table) -> F64:
+    """Time (t,) of the frames of an array, days; a cube may have the stamp of its first plane."""
+    return np.asarray(begin_mjd(table) + np.array(table["time_s"], float) / DAY_S)
+
+
 def _start(tables: Mapping[str, Table]) -> dict[str, float]:
     """Start of each array after the first frame of the acquisition, s; in order if unknown."""
-    stamps = {name: np.array(table["mjd"], float) for name, table in tables.items()}
+    stamps = {name: _days(table) for name, table in tables.items()}
     if all(np.isfinite(s).all() for s in stamps.values()):
         first = min(float(s.min()) for s in stamps.values())
-        return {name: float(s[0] - first) * 86400 for name, s in stamps.items()}
+        return {name: float(s[0] - first) * DAY_S for name, s in stamps.items()}
     found, clock = {}, 0.0
     for name, table in tables.items():
         found[name] = clock

@@ -55,7 +55,7 @@ SIMILAR = 0.7  # largest fraction of a candidate's significance that other effec
 
 
 def affordable(samples: int) -> int:
-    """Number of simulations that a search may use; each has a number of ``samples``."""
+    """Number of simulations that a search may use; each of ``samples`` samples."""
     return int(np.clip(SEARCH_SAMPLES // max(samples, 1), LEAST_SIMULATIONS, SIMULATIONS))
 
 
