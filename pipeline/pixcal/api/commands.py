@@ -136,8 +136,8 @@ def function_of(
 
     lines = [inspect.getdoc(kind) or "", "", "Parameters", "----------"]
     for n, parameter in signature.parameters.items():
-        told = f"{_words(parameter)}\n    {options[n].metadata['doc']}" if n in options else ""
-        lines.append(f"{n} : {told or _ARGUMENTS[n][1]}")
+        described = f"{_words(parameter)}\n    {options[n].metadata['doc']}" if n in options else ""
+        lines.append(f"{n} : {described or _ARGUMENTS[n][1]}")
     lines += ["", "Returns", "-------", returns] if returns else []
     lines += ["", "Raises", "------", "InputError", f"    If {fails}."]
     function.__name__ = function.__qualname__ = name

@@ -145,7 +145,7 @@ class Nonlinearity(Effect):
         quadratic, cubic = (float(np.clip(v, -0.3, 0.3)) for v in found.sizes)
         effect = cls(quadratic, cubic, found.level_e)
         more, refused = None, ""
-        told = found.significance, found.why
+        evidence_for = found.significance, found.why
         bent = None if evidence.fringes else ladder_curve(evidence)
         if bent is not None:
             points = np.pad(bent.charge, (1, 0)).tolist(), np.pad(bent.change, (1, 0)).tolist()
@@ -156,7 +156,7 @@ class Nonlinearity(Effect):
             return Estimate(
                 cls(0.0, 0.0, found.level_e, tuple(map(CurvePoint, *points))),
                 named,
-                *told,
+                *evidence_for,
                 steps,
                 law="response curve of second and third order",
                 by_law=effect,
@@ -169,13 +169,13 @@ class Nonlinearity(Effect):
         errors = np.sqrt(np.diag(found.covariance))
         named = {"quadratic": float(errors[0]), "cubic": float(errors[1])}
         if more is None:
-            return Estimate(effect, named, *told, refused=refused, size=found.size)
+            return Estimate(effect, named, *evidence_for, refused=refused, size=found.size)
         named |= {f"bends[{n}].change_e": error for n, error in enumerate(more[1])}
         curve = replace(effect, bends=more[0])
         return Estimate(
             replace(curve, bends=(*more[0], *_straight_on(curve, evidence))),
             named,
-            *told,
+            *evidence_for,
             law="response curve of second and third order",
             by_law=effect,
             refused=refused,
@@ -219,8 +219,8 @@ def _polynomial(evidence: Evidence) -> _Polynomial | None:
     level = _full_scale(evidence, Nonlinearity().level_e)
     levels, curve = ladder_response(evidence, level), _of_noise(evidence, level)
     # Information on the quadratic term only, as the exposure-time steps also give a cubic term.
-    told = [0.0 if one is None else np.linalg.inv(one[1])[0, 0] for one in (levels, curve)]
-    by_levels = told[0] > told[1]
+    variances = [0.0 if one is None else np.linalg.inv(one[1])[0, 0] for one in (levels, curve)]
+    by_levels = variances[0] > variances[1]
     if evidence.fringes:
         shifts = boundary_shifts(FALLOFF_PX)
         part = central_crop(evidence)
@@ -262,8 +262,8 @@ def _bends(
     knots = np.array([0.0, *seen[seen >= KNOTS[1] * top]])
     change, covariance, agreement = fit_curve(evidence, response, knots)
     chi2 = float(change @ np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ change)
-    told = sigmas_of_chi2(chi2, len(change) - 2) > SIGNIFICANT
-    if not told or chi2 < BESIDE * chi2_of_polynomial:
+    significant = sigmas_of_chi2(chi2, len(change) - 2) > SIGNIFICANT
+    if not significant or chi2 < BESIDE * chi2_of_polynomial:
         return None, agreement
     bends = tuple(
         CurvePoint(float(k), float(c)) for k, c in zip(knots, [0.0, *change], strict=True)

@@ -242,12 +242,13 @@ def fit_frames(
             model, of_line = _with_line(model, own, line, fit.basis)
             errors |= of_line
     kinds = {w.channels is LIGHT for w in fit.basis.every}
-    told = ["intensity and contrast"] * (True in kinds) + ["the fringe vector"] * (False in kinds)
+    names = {True: "intensity and contrast", False: "the fringe vector"}
+    varying = [name for light, name in names.items() if light in kinds]
     return FrameFit(
         model,
         errors,
         found.significance,
-        f"changes of {' and '.join(told)} from frame to frame, the same in two halves of the "
+        f"changes of {' and '.join(varying)} from frame to frame, the same in two halves of the "
         f"pixels{ALIKE if False in kinds and not changes.crossed else ''}",
         fit.sets_differ(),
     )

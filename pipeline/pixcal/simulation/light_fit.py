@@ -45,7 +45,7 @@ STRAIGHT = 0.02  # largest error of the linear prediction of a step's change, re
 # share of an effect's largest signal in any kind of map, below which a kind is left out: with
 # similar noise in all, so small a signal carries no information
 LEAST = 0.01
-UNTOLD = 1e-8  # residual share of a signal's square below which smooth surfaces absorb it
+ABSORBED = 1e-8  # residual share of a signal's square below which smooth surfaces absorb it
 LOWEST = -3.0  # lowest significance, standard deviations
 # least observed share of the predicted change of a map; errors that the prediction must exceed
 AGREED, SHOWN = 0.5, 2.0
@@ -305,14 +305,14 @@ def _least_squares(
             parts.append(replace(part, signals=shown))
             whole[some] += (own[some, kind][:, one.good] ** 2).sum(axis=1)
             left += (shown**2).sum(axis=0)
-    told = np.flatnonzero(left > UNTOLD * whole)
+    determined = np.flatnonzero(left > ABSORBED * whole)
     found = MapFit(np.zeros(len(whole)), np.zeros((len(whole),) * 2), 0.0)
-    if not len(told):
+    if not len(determined):
         return found
-    size = np.sqrt(left[told])
-    fit = fit_maps([replace(p, signals=p.signals[:, told] / size) for p in parts])
-    found.values[told] = fit.values / size
-    found.covariance[np.ix_(told, told)] = fit.covariance / np.outer(size, size)
+    size = np.sqrt(left[determined])
+    fit = fit_maps([replace(p, signals=p.signals[:, determined] / size) for p in parts])
+    found.values[determined] = fit.values / size
+    found.covariance[np.ix_(determined, determined)] = fit.covariance / np.outer(size, size)
     return replace(found, gain=fit.gain)
 
 

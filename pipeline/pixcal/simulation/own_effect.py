@@ -96,7 +96,7 @@ def _told(step: Callable[..., Any], file: Path, gives_back: bool) -> Callable[..
     """A method that raises InputError if it fails or returns a wrong result."""
 
     @functools.wraps(step)
-    def told(self: Effect, *args: Any) -> Any:
+    def explained(self: Effect, *args: Any) -> Any:
         try:
             result = step(self, *args)
             if gives_back:
@@ -107,7 +107,7 @@ def _told(step: Callable[..., Any], file: Path, gives_back: bool) -> Callable[..
             raise InputError(f"{file}: {step.__name__}: {_reason(error)}; fix the file") from error
         return result
 
-    return told
+    return explained
 
 
 def _asked(name: str, method: Any, check: Callable[[Any, type[Effect]], None], file: Path) -> Any:
@@ -174,5 +174,5 @@ def _compare(result: Any, given: Any) -> None:
 
 
 def _reason(error: BaseException) -> str:
-    told = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-    return f"{' '.join(told.split()):.200}"
+    message = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    return f"{' '.join(message.split()):.200}"

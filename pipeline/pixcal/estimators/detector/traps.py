@@ -31,7 +31,7 @@ NOT_EVEN = 25.0  # chi-square from which the share depends on the level
 # of full scale without such a limit
 RETENTIONS, CAPACITIES = (0.3, 0.6), (0.1, 0.2, 0.4, 0.7)
 STEPS = 12  # Gauss-Newton steps for such traps
-_UNTOLD = 1e-9  # relative error below which a parameter does not influence the frames
+_NO_INFLUENCE = 1e-9  # relative error below which a parameter does not influence the frames
 
 Loss = Callable[[F64, F32], F32]
 
@@ -55,7 +55,7 @@ class FittedLoss:
     def errors(self) -> F64:
         """1-sigma (p,); equal to the parameter where the frames do not constrain it."""
         errors, size = np.sqrt(np.diag(self.covariance).clip(0)), np.abs(self.value)
-        return np.where(errors > _UNTOLD * size, errors, size)
+        return np.where(errors > _NO_INFLUENCE * size, errors, size)
 
 
 class LossFit:

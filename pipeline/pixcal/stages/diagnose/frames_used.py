@@ -80,8 +80,8 @@ def recommend_frames(
     missing: Mapping[str, str], kinds: Iterable[type[Effect]] = (Effect,)
 ) -> list[str]:
     """Missing frames that separate effects, or else all that show them (default: any effect)."""
-    told = [set(kind.frames_needed) for kind in kinds]
-    some, every = told[0].union(*told), told[0].intersection(*told)
+    needed = [set(kind.frames_needed) for kind in kinds]
+    some, every = needed[0].union(*needed), needed[0].intersection(*needed)
     for wanted in (some - every, some):
         if frames := [words for name, words in missing.items() if name in wanted]:
             return frames

@@ -55,8 +55,9 @@ def look_at(
 ) -> DiagnosisInput:
     """Select the parts of a reduced run to analyse, and measure their nominal bench.
 
-    ``on_evidence``: from the evidence to fit and to test, and the runtime of estimates, gives the
-    estimates to use as statistics. Raises InputError: too few frames, or a part cannot be fitted.
+    ``on_evidence``: called with the evidence to fit, the evidence to test, and the runtime of
+    estimates; returns the estimates to use as statistics. Raises InputError: too few frames, or a
+    part cannot be fitted.
     """
     ingested = Ingested(run_dir / "ingest")
     acquisition, reduction = _acquisition(run_dir, ingested), _reduction(run_dir)

@@ -249,6 +249,6 @@ def _kept_within(bound: Bound, ask: Callable[[Evidence], T], evidence: Evidence)
     except np.linalg.LinAlgError:
         return "cannot be estimated here: these frames do not determine its parameters"
     except (InputError, ValueError, ArithmeticError) as error:
-        told = str(error)
-        reason = told if told.startswith("not decided") else f"cannot be estimated here: {told}"
+        text = str(error)
+        reason = text if text.startswith("not decided") else f"cannot be estimated here: {text}"
         return " ".join(reason.split())[:300]

@@ -75,16 +75,16 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
         runtime,
         label="maps",
     )
-    told = [of_tile for of_strip in every for of_tile in of_strip]
+    of_tiles = [of_tile for of_strip in every for of_tile in of_strip]
     for writer in writers.values():
         writer.finish()
     sets = {}
     for n, f in enumerate(fitted):
-        good = sum(t.good[n] for t in told)
-        errors = np.concatenate([t.sigma[n] for t in told])
+        good = sum(t.good[n] for t in of_tiles)
+        errors = np.concatenate([t.sigma[n] for t in of_tiles])
         sets[f.name] = ny * nx - good, float(np.median(errors))
-    freedom = sum(t.freedom for t in told)
-    square = sum(t.square for t in told)
+    freedom = sum(t.freedom for t in of_tiles)
+    square = sum(t.square for t in of_tiles)
     return Totals(sets, outputs, square / freedom if freedom else None)
 
 
@@ -137,14 +137,14 @@ def _write_strip(
         swept.append(held)
     shape = (y1 - y0, x1 - x0)
     made = {n: np.empty((*w.shape[:-2], *shape), w.dtype) for n, w in writers.items()}
-    told = []
+    of_tiles = []
     for job in strip:
         _, (a, b) = fitted[0].source.ranges(job[0])
         part = {name: data[..., a - x0 : b - x0] for name, data in made.items()}
-        told.append(_maps_of_tile(fitted, swept, both, job, part))
+        of_tiles.append(_maps_of_tile(fitted, swept, both, job, part))
     for name, writer in writers.items():
         writer.write((*(0,) * (made[name].ndim - 2), y0, x0), made[name])
-    return told
+    return of_tiles
 
 
 def _maps_of_tile(

@@ -284,13 +284,13 @@ def _middle_rows(middle: Window) -> slice:
 
 def _temperature(tables: Mapping[str, Mapping[str, Any]]) -> str:
     """Temperature of the frames without light, if in their headers."""
-    told = [
+    known = [
         t
         for kind in ("dark", "bias")
         for t in tables.get(kind, {}).get("temperature_c", ())
         if t is not None
     ]
-    if not told:
+    if not known:
         return "temperature not in the headers"
-    low, high = min(told), max(told)
+    low, high = min(known), max(known)
     return f"at {low:.1f} °C" if high - low < 0.05 else f"at {low:.1f} to {high:.1f} °C"
