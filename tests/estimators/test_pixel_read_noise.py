@@ -118,6 +118,13 @@ def test_squares_of_normal_noise_are_those_about_the_mean(count: int) -> None:
 
 
 @pytest.mark.parametrize("count", [FEWEST, 20])
+def test_a_step_of_the_converter_is_no_hit(count: int) -> None:
+    stack = np.rint(frames(0.0, count) * (0.65 / 15) + 0.3)
+    squares = squares_without_hits(stack)
+    np.testing.assert_allclose(squares, ((stack - stack.mean(axis=0)) ** 2).sum(axis=0), rtol=1e-3)
+
+
+@pytest.mark.parametrize("count", [FEWEST, 20])
 def test_one_hit_leaves_the_squares_of_the_other_samples(count: int) -> None:
     stack = frames(0.0, count)
     others = np.var(stack[1:], axis=0, ddof=1) * (count - 1)

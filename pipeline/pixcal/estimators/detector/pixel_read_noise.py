@@ -91,7 +91,8 @@ def squares_without_hits(frames: F32) -> F64:
     """Sum of squares (y, x) of frames (t, y, x) about their mean, as without a single hit.
 
     A pixel that a particle hits in one frame is not noisy: a sample that is no normal number beside
-    the others of its pixel is left out, and their sum extrapolated. It takes `FEWEST` frames.
+    the others of its pixel, nor beside those of usual pixels (the others may have one code), is
+    left out, and their sum extrapolated. It takes `FEWEST` frames.
     """
     count, rest = len(frames), frames - frames.mean(axis=0)
     rest *= rest
@@ -101,7 +102,8 @@ def squares_without_hits(frames: F32) -> F64:
     # What a sample takes with it when it is left out: it displaces the mean as well.
     largest = rest.max(axis=0) * (count / (count - 1))
     variance = np.maximum(total - largest, 0) / (count - 2)
-    hit = largest > stdtrit(count - 2, 1 - HIT / 2) ** 2 * variance
+    usual = np.maximum(variance, np.median(variance))
+    hit = largest > stdtrit(count - 2, 1 - HIT / 2) ** 2 * usual
     return np.asarray(np.where(hit, variance * (count - 1), total))
 
 
