@@ -118,6 +118,13 @@ def test_where_it_shows_must_be_said(tmp_path: Path, written: str) -> None:
         known_effects([file])
 
 
+def test_it_cannot_act_before_the_light_of_the_bench(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(GLOW.read_text() + "\n    order = -2\n")
+    with pytest.raises(InputError, match=r"mine.py: .*order is below zero"):
+        known_effects([file])
+
+
 @pytest.mark.parametrize(
     ("starts", "reason"),
     [

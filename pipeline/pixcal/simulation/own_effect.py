@@ -59,7 +59,7 @@ def checked(effect: type[Effect], file: Path) -> type[Effect]:
     """The class, with steps that name the file on failure; InputError if it is invalid."""
     for name in (*STEPS, *OTHERS):
         if name in vars(effect):
-            setattr(effect, name, _told(vars(effect)[name], file, name in STEPS))
+            setattr(effect, name, _checked(vars(effect)[name], file, name in STEPS))
     try:
         _check(effect)
         for name, check in (("estimate", _check_estimate), ("starts", _check_starts)):
@@ -87,12 +87,14 @@ def _check(effect: type[Effect]) -> None:
     domains = getattr(effect, "domains", None)
     if not isinstance(domains, tuple) or not domains or not set(domains) <= set(DOMAINS):
         raise InputError(f"domains is missing or not a tuple; choose from {', '.join(DOMAINS)}")
+    if default.order < 0:
+        raise InputError("order is below zero: the light of the bench comes first")
     for name in ("halo", "frames_back"):
         if not 0 <= getattr(default, name) <= MAX_AROUND:
             raise InputError(f"{name} is not between 0 and {MAX_AROUND}")
 
 
-def _told(step: Callable[..., Any], file: Path, gives_back: bool) -> Callable[..., Any]:
+def _checked(step: Callable[..., Any], file: Path, gives_back: bool) -> Callable[..., Any]:
     """A method that raises InputError if it fails or returns a wrong result."""
 
     @functools.wraps(step)
