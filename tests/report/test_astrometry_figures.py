@@ -91,6 +91,10 @@ def test_any_result_becomes_a_picture(view: AstrometryView) -> None:
         assert len(drawn.convert("RGB").getcolors(1 << 24) or ()) > 50
 
 
+def test_the_picture_of_a_result_is_the_same_every_time() -> None:
+    assert len({png(astrometry_figure(a_view())) for _ in range(5)}) == 1
+
+
 def test_the_curves_are_floor_and_photons() -> None:
     view = a_view()
     figure = astrometry_figure(view)
