@@ -70,7 +70,7 @@ class BiasDrift(Effect):
     )
     absorbed_because = "the free intensity of each frame absorbs a level common to all pixels"
     frames_needed = ("dark",)
-    remedy = "subtract the level of each frame, from dark or overscan pixels"
+    remedy = "in each frame, subtract the level measured on dark or overscan pixels"
     sources = (
         "Rauscher 2015, PASP 127, 1144: pedestal drift of 4 e- rms at 5 e- of read noise",
         "M. Richmond, WIYN HDI technical note 6 (2014): level of the overscan changes by 5 to 20 "

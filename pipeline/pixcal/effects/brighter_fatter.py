@@ -45,8 +45,8 @@ class BrighterFatter(Effect):
     strengths = ("shift_px_per_e",)
     frames_needed = ("ladder", "baseline")
     remedy = (
-        "the conversion gain allows for it; bright spots grow with their level: correct "
-        "widths for it"
+        "already included in the measured gain; bright spots broaden with signal: correct "
+        "fitted widths"
     )
     quick = False
     sources = (

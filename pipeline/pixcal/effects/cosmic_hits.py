@@ -74,7 +74,7 @@ class CosmicHits(Effect):
     sources = (
         "Particle Data Group, Review of Particle Physics, Cosmic Rays: about one muon per cm^2 and "
         "minute through a horizontal detector at sea level",
-        "Groom 2002, Experimental Astronomy 14, 45: Compton electrons of radioactive decay hit "
+        "Groom 2002, Experimental Astronomy 14, 45: Compton electrons from radioactive decay hit "
         "astronomical CCDs as often as muons",
         "Bichsel 1988, Rev. Mod. Phys. 60, 663: energy loss and its fluctuations in thin silicon",
         "Moyal 1955, Phil. Mag. 46, 263: closed form of the distribution of the energy loss",

@@ -59,7 +59,7 @@ class FlatError(Effect):
     """
 
     name = "flat_error"
-    title = "flat that differs from the response in the fringe frames"
+    title = "flat field that does not match the fringe frames"
     acts_at = Stage.PIXEL
     order = 2
     domains = ("space",)

@@ -154,7 +154,7 @@ def _joined(found: dict[str, tuple[float, float]]) -> tuple[float, float]:
 
 
 def _of_fringes(found: FringeEvidence) -> F64 | None:
-    """Sums of `residual_sums` of a fringe set's residuals; None if too few."""
+    """`residual_sums` of a fringe set; None with too few frames or good pixels."""
     pixels = np.count_nonzero(found.good)
     if len(found.g) < _MIN_FRAMES or pixels < MIN_PIXELS:
         return None

@@ -65,7 +65,7 @@ class Ipc(Effect):
     domains = ("space", "noise")
     strengths = ("couplings",)
     frames_needed = ("dark", "flat", "baseline")
-    remedy = "the conversion gain allows for it; frames can be deconvolved with this kernel"
+    remedy = "already included in the measured gain; frames can be deconvolved with this kernel"
     quick = False
     sources = (
         "Rousset et al., section 5.1: period of four rows, 2-3 % vertical, 0.6 % horizontal, "

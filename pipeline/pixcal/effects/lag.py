@@ -40,7 +40,7 @@ class Lag(Effect):
     """
 
     name = "lag"
-    title = "charge left behind in the next frames"
+    title = "charge released in later frames"
     acts_at = Stage.CHARGE
     order = 3
     domains = ("time", "intensity")
@@ -230,7 +230,8 @@ class Lag(Effect):
             share, error, carried = found
             before = "charge of the frame before" if carried else "a clear"
             if not carried and all(len(s.adu) < _TELL_LAMP for s in evidence.ladder):
-                before += "; a lamp that warms up does the same to pairs: take three flats a level"
+                before += "; with flat pairs, a warming lamp looks the same: "
+                before += "take three flats per level"
             return Estimate(
                 cls(float(np.clip(share, 0, 0.5)), 0.0, 0.0, carried=carried),
                 {"share": error},

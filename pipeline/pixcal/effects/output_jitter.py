@@ -45,14 +45,14 @@ class OutputJitter(Effect):
     """
 
     name = "output_jitter"
-    title = "level of each output that varies from frame to frame"
+    title = "output offsets that vary from frame to frame"
     acts_at = Stage.READOUT
     order = 4
     domains = ("noise", "time")
     strengths = ("output_rms", "walk_e_h")
     left_because = "noise that is independent in each frame averages out"
     frames_needed = ("dark",)
-    remedy = "subtract the level of each output in each frame, from dark or overscan pixels"
+    remedy = "in each frame, subtract the level of each output measured on dark or overscan pixels"
     sources = (
         "Rauscher 2015, PASP 127, 1144: the outputs of an infrared array have noise of their own "
         "beside what they share",

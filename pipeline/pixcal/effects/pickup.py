@@ -47,7 +47,7 @@ class Pickup(Effect):
     """
 
     name = "pickup"
-    title = "electrical pick-up while a frame is read"
+    title = "electrical pick-up during readout"
     acts_at = Stage.READOUT
     order = 5
     domains = ("noise",)

@@ -50,7 +50,7 @@ class Quantisation(Effect):
     """
 
     name = "quantisation"
-    title = "coarse or uneven steps of the converter"
+    title = "coarse or uneven ADC steps"
     acts_at = Stage.CONVERTER
     order = 2
     domains = ("noise", "intensity")

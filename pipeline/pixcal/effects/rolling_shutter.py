@@ -41,7 +41,7 @@ class RollingShutter(Effect):
     """
 
     name = "rolling_shutter"
-    title = "rows exposed one after the other"
+    title = "rolling shutter"
     acts_at = Stage.LIGHT
     order = 9
     domains = ("time", "space")
@@ -83,7 +83,8 @@ class RollingShutter(Effect):
         unit="rad",
         low=-10,
         high=10,
-        doc="start of the modulator's range of 2 pi; default: the phase takes the shorter way",
+        doc="start of the modulator's range of 2 pi; default: the modulator moves by the shorter "
+        "path",
     )
 
     def check(self, bench: Bench) -> None:

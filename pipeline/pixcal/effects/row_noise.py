@@ -44,14 +44,14 @@ class RowNoise(Effect):
     """
 
     name = "row_noise"
-    title = "noise common to the pixels of a row or a column"
+    title = "row and column noise"
     acts_at = Stage.READOUT
     order = 2
     domains = ("noise", "time")
     strengths = ("row_rms", "flicker_rms", "interlace_rms", "column_rms", "alternate_rms")
     left_because = "noise that is independent in each frame averages out"
     frames_needed = ("dark",)
-    remedy = "subtract the level of each line in each frame, from dark or overscan pixels"
+    remedy = "in each frame, subtract the level of each line measured on dark or overscan pixels"
     sources = (
         "Rauscher 2015, PASP 127, 1144: infrared arrays of 5 e- read noise have 3 e- of correlated "
         "flicker noise, and 0.5 e- of noise of alternate columns",

@@ -141,7 +141,7 @@ _AXES = {
     "distance: rows, then columns": _Axis("lines apart", "{} apart", _LINES),
     "band, then two rows, two columns": _Axis("period", "periods of {}", _BANDS),
     "bin of frequency": _Axis(
-        "half-waves over the frames", "{} half-waves over the frames", _HALF_WAVES
+        "half-cycles over the set", "{} half-cycles over the set", _HALF_WAVES
     ),
     "cell of 4 × 4": _Axis("cell of the window", "cell {}", _CELLS),
     "contrast, light of each pair": _Axis("maps", "{}", ("contrast", "light") * 20),

@@ -109,7 +109,7 @@ def _as_what(diagnosis: Json | None, correction: Json | None, it_needs: str) -> 
     if any(c["on_map"]["action"] == "corrected" for c in diagnosis["causes"]):
         return " as fitted, NOT corrected for the effects below"
     if unknown := _unknown(diagnosis):
-        return f" as fitted. What {' and '.join(unknown)} does to the offsets is not known"
+        return f" as fitted. The effect of {' and '.join(unknown)} on the offsets is unknown"
     return f" as fitted. {it_needs} no correction"
 
 
@@ -144,8 +144,8 @@ def limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json |
     kept = max((e for s in sets for e in s["parameter_error_px"].values() if e), default=0.0)
     if kept > MATTERS * least:
         return (
-            f"Limited by noise, {noise}, which includes the error of the correction, up to "
-            f"{number(kept, 2)} px rms."
+            f"Limited by noise: {noise}, including up to {number(kept, 2)} px rms from the "
+            "correction."
         )
     return f"Limited by photon and read noise: {noise}. More frames reduce it."
 
@@ -183,7 +183,7 @@ def _action(
     because = f": {why}" if why else ""
     if action == "corrected":
         if not with_maps:
-            text = "'pixcal fit RUN --with-diagnosis' makes maps corrected for it"
+            text = "run 'pixcal fit RUN --with-diagnosis' for corrected maps"
         elif _settled(cause, correction, with_maps):
             text = "maps corrected"
         else:
@@ -200,7 +200,7 @@ def _to_distinguish(cause: Json) -> str:
     if not cause.get("would_decide"):
         return ""
     others = " or ".join(cause["not_told_apart_from"])
-    return f"; to distinguish it from {others}, retake with {', '.join(cause['would_decide'])}"
+    return f"; to distinguish it from {others}, also record {', '.join(cause['would_decide'])}"
 
 
 def unexplained(diagnosis: Json | None) -> tuple[tuple[str, ...], ...]:

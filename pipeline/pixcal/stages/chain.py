@@ -56,13 +56,13 @@ def run(
             with step("diagnose", out / "diagnose"):
                 diagnose.run(out, diagnose.Config(), runtime)
         except InputError as error:
-            note(f"diagnose: not possible: {error}")
+            note(f"diagnosis skipped: {error}")
             diagnosed = False
     if diagnosed and fringes:
         with step("corrected", out / "corrected"):
             refused = correct.attempt(out, of_fit, runtime)
         if refused is not None:
-            note(f"corrected: not possible, use the maps as fitted: {refused}")
+            note(f"no corrected maps (use the maps as fitted): {refused}")
     with step("report", out / "report"):
         report.run(out, options.Report(), runtime)
     return Done(fringes, diagnosed)
