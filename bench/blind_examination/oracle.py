@@ -26,9 +26,9 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.stages import ingest, reduce
 from pixcal.stages.diagnose.comparison import Trial, differing, shrinkage
-from pixcal.stages.diagnose.inquiry import REFERENCES
-from pixcal.stages.diagnose.look import look_at
-from pixcal.stages.diagnose.search import CONFIRM
+from pixcal.stages.diagnose.diagnosis_input import prepare_input
+from pixcal.stages.diagnose.search import CONFIRM_SIMULATIONS
+from pixcal.stages.diagnose.search_run import REFERENCES
 from pixcal.stages.diagnose.trial import Trials
 from pixcal.storage.manifest import read_json
 
@@ -55,17 +55,17 @@ def ask_oracle(
         ingest.run(acquisition, scratch / "run", ingest.Config(), runtime)
         reduce.run(scratch / "run", reduce.Config(), runtime)
         signatures = _signatures(diagnosed)
-        look = look_at(scratch / "run", runtime, lambda *_: signatures)
-        trials = Trials(look.windows, scratch, look.runtime, signatures)
+        inputs = prepare_input(scratch / "run", runtime, lambda *_: signatures)
+        trials = Trials(inputs.windows, scratch, inputs.runtime, signatures)
         true = effects_of(truth, bench)
         (nominal,) = trials.curves([()], REFERENCES, "nominal bench")
-        (with_effects,) = trials.curves([true], CONFIRM, "true effects")
+        (with_effects,) = trials.curves([true], CONFIRM_SIMULATIONS, "true effects")
         if isinstance(nominal, str) or isinstance(with_effects, str):
             raise InputError(
                 f"{acquisition}: {nominal if isinstance(nominal, str) else with_effects}"
             )
         reference = Reference.of(nominal)
-        data = reference.on_scale(look.measured)
+        data = reference.on_scale(inputs.measured)
         before, after = expect_nominal(reference), expect_with(reference, with_effects)
         start = Trial((), before, log_likelihood(data, before))
         end = Trial(true, after, log_likelihood(data, after))

@@ -21,7 +21,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.code import code_digest
 from pixcal.model.errors import ClusterError, DamagedError, PlanError
 from pixcal.stages import correct, diagnose, ingest, reduce
-from pixcal.stages.diagnose.look import ESTIMATE_BYTES, EVIDENCE_BYTES
+from pixcal.stages.diagnose.diagnosis_input import ESTIMATE_BYTES, EVIDENCE_BYTES
 from pixcal.storage.manifest import read_json, write_json
 
 PRODUCTS = "products"

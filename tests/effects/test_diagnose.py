@@ -25,8 +25,8 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.stages import correct, diagnose, fit, ingest, reduce, simulate
-from pixcal.stages.diagnose import inquiry, stage, trial, windows
-from pixcal.stages.diagnose.look import look_at
+from pixcal.stages.diagnose import search_run, stage, trial, windows
+from pixcal.stages.diagnose.diagnosis_input import prepare_input
 from pixcal.stages.diagnose.windows import chosen_windows, frames_of_half, split, whole_of
 from pixcal_cli.main import invoke
 
@@ -62,7 +62,7 @@ def with_lag(reduced: Callable[..., Path]) -> Path:
 @pytest.fixture
 def few_references(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests that do not ask what is chance: simulating takes most of the time."""
-    monkeypatch.setattr(inquiry, "REFERENCES", 6)
+    monkeypatch.setattr(search_run, "REFERENCES", 6)
 
 
 def diagnosed(run: Path, **options: Any) -> dict[str, Any]:
@@ -226,12 +226,12 @@ def test_a_saturated_step_of_the_ladder_is_left_out(reduced: Callable[..., Path]
     """Whether or not its level is declared; the rest is looked at as before."""
     steps = [{"exptime_s": t, "count": 20} for t in (0.01, 0.02, 0.03, 0.08)]
     short = {"frames.fringes.0.count": 60, "frames.fringes.1.count": 60}
-    look = look_at(reduced(None, short | {"frames.flats": steps}), SYNC)
-    again = measure(look.first.evidence(look.first.test, (), 3))
-    for found in (look.measured, again):
+    inputs = prepare_input(reduced(None, short | {"frames.flats": steps}), SYNC)
+    again = measure(inputs.first.evidence(inputs.first.test, (), 3))
+    for found in (inputs.measured, again):
         for name in ("flat_ladder", "photon_transfer"):
             assert len(found[name, DETECTOR].value) == 3
-    assert np.ptp(look.measured["flat_ladder", DETECTOR].value) < 1e-3
+    assert np.ptp(inputs.measured["flat_ladder", DETECTOR].value) < 1e-3
 
 
 def test_a_part_of_a_large_detector_is_enough_without_fringes(
@@ -241,10 +241,10 @@ def test_a_part_of_a_large_detector_is_enough_without_fringes(
     monkeypatch.setattr(windows, "SIDE", 40)
     monkeypatch.setattr(windows, "SAMPLES", 400_000)
     run = reduced(None, {"detector.shape": [131, 127], "frames.fringes": []})
-    look = look_at(run, SYNC)
-    assert len(look.windows) == 4
-    again = measure(look.first.evidence(look.first.test, (), 3))
-    assert look.measured.keys() <= again.keys()
+    inputs = prepare_input(run, SYNC)
+    assert len(inputs.windows) == 4
+    again = measure(inputs.first.evidence(inputs.first.test, (), 3))
+    assert inputs.measured.keys() <= again.keys()
 
 
 @pytest.mark.long
@@ -262,19 +262,19 @@ def test_a_corner_without_light_is_left_out(
     other = run.parent / "other"
     ingest.run(acquisition, other, ingest.Config(), SYNC)
     reduce.run(other, reduce.Config(), SYNC)
-    look = look_at(other, SYNC)
-    (left,) = look.facts.left_out
+    inputs = prepare_input(other, SYNC)
+    (left,) = inputs.facts.left_out
     assert left["window"] == ((9, 49), (9, 49))
     assert left["reason"]
-    assert len(look.facts.tried_on["windows"]) == len(look.windows) == 3
+    assert len(inputs.facts.tried_on["windows"]) == len(inputs.windows) == 3
     # Nothing of the one that failed gets into those after it.
-    levels = [w.bench.measured.sets[0].light.mean() for w in look.windows]
+    levels = [w.bench.measured.sets[0].light.mean() for w in inputs.windows]
     assert min(levels) > 0.5 * max(levels) > 1000
 
 
 def test_frames_too_few_to_part_are_named(reduced: Callable[..., Path]) -> None:
     changes = {"frames.bias": 3, "frames.fringes.0.count": 60, "frames.fringes.1.count": 60}
-    assert look_at(reduced(None, changes), SYNC).facts.shared == ("bias",)
+    assert prepare_input(reduced(None, changes), SYNC).facts.shared == ("bias",)
 
 
 OWN = '''
@@ -493,7 +493,7 @@ def test_what_an_effect_takes_from_the_fringes_is_not_taken_twice(
     """The bench was measured with the effect in it: with the effect it looks as it was measured."""
     changes = {"frames.fringes.0.count": 60, "frames.fringes.1.count": 60}
     run = reduced({effect.name: to_plain(effect)}, changes)
-    window = look_at(run, SYNC).first
+    window = prepare_input(run, SYNC).first
 
     def seen(on: tuple[Effect, ...]) -> dict[str, tuple[float, float, float]]:
         evidence = window.evidence(window.test, on, 3)
@@ -521,7 +521,7 @@ def test_every_acquisition_is_held_against_random_numbers_of_its_own(
     """Of its frames; a fault of chance in sixteen simulations is not that of all nights."""
     short = {"frames.fringes.0.count": 60, "frames.fringes.1.count": 60}
     first, again, other = (
-        look_at(reduced(None, short | {"seed": seed}), SYNC).first for seed in (3, 3, 4)
+        prepare_input(reduced(None, short | {"seed": seed}), SYNC).first for seed in (3, 3, 4)
     )
     assert first.seed == again.seed != other.seed
 
@@ -543,18 +543,18 @@ def test_windows_are_exposed_together(
     monkeypatch.setattr(windows, "LARGEST", 40)
     monkeypatch.setattr(windows, "SIDE", 30)
     changes = {"frames.fringes.0.count": 60, "frames.fringes.1.count": 60}
-    look = look_at(reduced(None, changes | {"detector.shape": [85, 89]}), SYNC)
-    assert len(look.windows) == 4
-    assert len({window.seed for window in look.windows}) == 1
+    inputs = prepare_input(reduced(None, changes | {"detector.shape": [85, 89]}), SYNC)
+    assert len(inputs.windows) == 4
+    assert len({window.seed for window in inputs.windows}) == 1
     for number in (0, 1):
-        phi = np.array([w.bench.measured.sets[number].phi for w in look.windows])
+        phi = np.array([w.bench.measured.sets[number].phi for w in inputs.windows])
         steps = np.angle(np.exp(1j * (phi - phi[:, :1])))
         # The fit knows a phase to a few mrad.
         assert np.abs(np.angle(np.exp(1j * (steps - steps[0])))).max() < 0.02
-    trials = trial.Trials(look.windows, tmp_path, SYNC)
+    trials = trial.Trials(inputs.windows, tmp_path, SYNC)
     trials.curves([()], 2, "nominal bench")
     simulated = [[trials.of_window(n, (), 2)[seed] for n in range(4)] for seed in (0, 1)]
-    for of_windows in (look.each, *simulated):
+    for of_windows in (inputs.each, *simulated):
         for name in ("vertical", "horizontal"):
             noise = np.array([c["residual_noise", name].value for c in of_windows])
             assert np.ptp(noise) > 0

@@ -14,7 +14,7 @@ from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
 from pixcal.model.options import Sweep
 from pixcal.stages import ingest, reduce, simulate
-from pixcal.stages.diagnose.parts import NO_BATCHES, Raw, run_in_memory, take
+from pixcal.stages.diagnose.parts import NO_BATCHES, RawFrames, run_in_memory, take
 from pixcal.stages.diagnose.parts import evidence_of as evidence_of_part
 from pixcal.stages.diagnose.windows import whole_of
 from pixcal.stages.evidence import evidence_of
@@ -31,7 +31,9 @@ ROUNDED = ("delta", "sigma", "free", "theta", "k", "free_covariance")
 
 
 @pytest.fixture(scope="module")
-def raw(tmp_path_factory: pytest.TempPathFactory, make_effect_bench: Callable[..., Bench]) -> Raw:
+def raw(
+    tmp_path_factory: pytest.TempPathFactory, make_effect_bench: Callable[..., Bench]
+) -> RawFrames:
     """Frames of a window of more than one chunk that is no multiple of any."""
     changes = {"frames.fringes.0.count": 71, "frames.fringes.1.count": 67}
     bench = make_effect_bench(changes | {"detector.shape": [133, 61]})
@@ -49,7 +51,7 @@ def raw(tmp_path_factory: pytest.TempPathFactory, make_effect_bench: Callable[..
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("sweep", [Sweep(), NO_BATCHES], ids=["with batches", "without"])
 def test_frames_in_memory_are_reduced_and_fitted_as_those_in_files(
-    raw: Raw, sweep: Sweep, tmp_path: Path
+    raw: RawFrames, sweep: Sweep, tmp_path: Path
 ) -> None:
     expected = evidence_on_disk(raw, tmp_path)
     run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction, sweep)
@@ -73,7 +75,7 @@ def test_frames_in_memory_are_reduced_and_fitted_as_those_in_files(
                 np.testing.assert_array_equal(one, other, err_msg=field)
 
 
-def test_halves_that_come_with_an_evidence_are_those_of_its_samples(raw: Raw) -> None:
+def test_halves_that_come_with_an_evidence_are_those_of_its_samples(raw: RawFrames) -> None:
     run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction)
     for one in evidence_of(run, within=((7, 5), (150, 80))).fringes.values():
         assert (one.origin, one.window) == ((7, 5), (150, 80))
@@ -85,7 +87,9 @@ def test_halves_that_come_with_an_evidence_are_those_of_its_samples(raw: Raw) ->
                 np.testing.assert_allclose(value, expected, rtol=1e-4, atol=1e-7)
 
 
-def test_nothing_is_written(raw: Raw, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_written(
+    raw: RawFrames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Nor are the frames copied: those that are read are those that were given."""
     monkeypatch.chdir(tmp_path)
     run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction)
@@ -93,7 +97,7 @@ def test_nothing_is_written(raw: Raw, tmp_path: Path, monkeypatch: pytest.Monkey
     assert (run / "ingest" / "raw.zarr" / "bias").array.values is raw.arrays["bias"]
 
 
-def test_a_part_is_reduced_with_the_black_of_the_whole_run(raw: Raw) -> None:
+def test_a_part_is_reduced_with_the_black_of_the_whole_run(raw: RawFrames) -> None:
     """Few frames tell a cut-off, or noise of darks that is off the curve, less surely."""
     whole = Black({"bias": CutOff(3.0, 0.01, 2.0)}, without_dark=True)
     _, ny, nx = raw.arrays["bias"].shape

@@ -13,15 +13,16 @@ from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
-from pixcal.stages.diagnose.comparison import (
-    MIN_LOGLIK_GAIN,
-    Comparison,
-    differing,
-    gap_interval,
-    shrinkage,
+from pixcal.stages.diagnose.comparison import Comparison, differing, gap_interval, shrinkage
+from pixcal.stages.diagnose.rejection import doubtful
+from pixcal.stages.diagnose.search import (
+    CONFIRM_SIMULATIONS,
+    MAX_CAUSES,
+    SCREEN_SIMULATIONS,
+    SIMULATIONS,
+    Search,
 )
-from pixcal.stages.diagnose.rejection import MIN_LOGLIK_GAIN_WEAK, doubtful
-from pixcal.stages.diagnose.search import CONFIRM, MAX_CAUSES, SCREEN, SIMULATIONS, Search
+from pixcal.stages.diagnose.thresholds import MIN_LOGLIK_GAIN, MIN_LOGLIK_GAIN_WEAK
 
 KEYS: tuple[Key, ...] = (
     ("harmonics", "a"),
@@ -432,7 +433,7 @@ def test_candidates_without_promise_are_simulated_once() -> None:
     data = REFERENCE.on_scale(curves((), 500, {"left": 0.03}))
     named = {c.name: c for c in (candidate("left", 0.03), candidate("right", 0.03))}
     assert Search(REFERENCE, data, noted, lambda *_: {}).run(named).accepted == ("left",)
-    assert rounds == [(1, {"left", "right"}), (SCREEN, {"left"})]
+    assert rounds == [(1, {"left", "right"}), (SCREEN_SIMULATIONS, {"left"})]
     assert named["right"].alone is not None
 
 
@@ -578,14 +579,14 @@ def test_each_cause_is_weighed_alone_by_as_many_simulations_as_all_together() ->
     )
     assert set(found.accepted) == set(sizes)
     for name in sizes:
-        assert benches[frozenset({name})] == CONFIRM
+        assert benches[frozenset({name})] == CONFIRM_SIMULATIONS
 
 
 def test_what_opens_elsewhere_widens_the_interval_of_what_is_left() -> None:
     """A stand-in that does what the data do not show."""
     data = REFERENCE.on_scale(curves((), 500, {"left": 0.03}))
     benches = [(candidate("mimic", 0.03).estimate.effect,)]  # type: ignore[union-attr]
-    (made,) = simulate(benches, CONFIRM, "", ())
+    (made,) = simulate(benches, CONFIRM_SIMULATIONS, "", ())
     assert not isinstance(made, str)
     tried = Comparison(REFERENCE, data)
     trial = tried.trial(benches[0], made)
@@ -604,7 +605,9 @@ def test_where_fewer_effects_are_refused_all_stay(monkeypatch: pytest.MonkeyPatc
         benches: Sequence[Sequence[Effect]], seeds: int, label: str, asked: Sequence[str]
     ) -> list[list[dict[Key, Curve]] | str]:
         return [
-            "not by itself" if [e.name for e in bench] == ["right"] and seeds > SCREEN else made
+            "not by itself"
+            if [e.name for e in bench] == ["right"] and seeds > SCREEN_SIMULATIONS
+            else made
             for bench, made in zip(benches, plain(benches, seeds, label, asked), strict=True)
         ]
 

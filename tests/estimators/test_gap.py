@@ -18,7 +18,7 @@ from pixcal.estimators.test_statistics.gap import (
     log_likelihood,
     remaining,
 )
-from pixcal.stages.diagnose.comparison import MIN_LOGLIK_GAIN
+from pixcal.stages.diagnose.thresholds import MIN_LOGLIK_GAIN
 
 LINEAR: Key = ("harmonics", "a")
 POWER: Key = ("contrast_of_frames", "a")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import gamma
 
-from pixcal.estimators.test_statistics.look import FringeSetData, pattern_sizes
+from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData, pattern_sizes
 from pixcal.estimators.test_statistics.patterns import (
     highest_ordinate,
     smooth_patterns,

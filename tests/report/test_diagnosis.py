@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from pixcal.estimators.test_statistics import DETECTOR, known_statistics
-from pixcal.estimators.test_statistics.look import STEPS
+from pixcal.estimators.test_statistics.fringe_set_data import STEPS
 from pixcal.estimators.test_statistics.noise import OUTLIERS
 from pixcal.report import diagnosis_maps as maps
 from pixcal.report import diagnosis_words

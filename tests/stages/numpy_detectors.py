@@ -16,9 +16,9 @@ from pixcal.estimators.test_statistics.gap import Difference, compare
 from pixcal.model.acquisition import SCHEMA, Acquisition
 from pixcal.model.config import parse
 from pixcal.stages import reduce
-from pixcal.stages.diagnose.measuring import nominal_bench
+from pixcal.stages.diagnose.measure_nominal import nominal_bench
 from pixcal.stages.diagnose.nominal import NominalBench
-from pixcal.stages.diagnose.parts import Raw, evidence_of, select
+from pixcal.stages.diagnose.parts import RawFrames, evidence_of, select
 from pixcal.stages.diagnose.windows import Split, split, whole_of
 from pixcal.storage.manifest import read_json
 
@@ -101,7 +101,7 @@ class Detector:
 def reduced(detector: Detector, seed: int, folder: Path) -> tuple[Evidence, dict[str, Any]]:
     """Evidence of a recording, and its ``reduce.json``."""
     arrays, tables = detector.frames(seed)
-    raw = Raw(detector.described(), arrays, tables, reduce.Config())
+    raw = RawFrames(detector.described(), arrays, tables, reduce.Config())
     evidence = evidence_on_disk(raw, folder)
     report: dict[str, Any] = read_json(folder / "reduce" / "reduce.json")
     return evidence, report
@@ -129,12 +129,12 @@ def held_against_nominal(
     acquisition, part = detector.described(**declared), whole_of(detector.shape)
     own = split(tables, detector.shape[0] * detector.shape[1], full_flats)
 
-    def look(raw: Raw) -> Evidence:
+    def look(raw: RawFrames) -> Evidence:
         return evidence_of(raw, part, detector.shape)
 
     halves = [
         look(
-            Raw(
+            RawFrames(
                 acquisition,
                 {name: array[half[name]] for name, array in arrays.items()},
                 select(tables, half),

@@ -6,14 +6,14 @@ from pixcal.engine.run import Runtime
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.config import to_plain
 from pixcal.stages import fit, reduce
-from pixcal.stages.diagnose.parts import Raw
+from pixcal.stages.diagnose.parts import RawFrames
 from pixcal.stages.evidence import load_evidence
 from pixcal.storage.artefact import build
 from pixcal.storage.cube import create_array
 from pixcal.storage.manifest import write_json
 
 
-def evidence_on_disk(raw: Raw, folder: Path) -> Evidence:
+def evidence_on_disk(raw: RawFrames, folder: Path) -> Evidence:
     """Reduce and fit frames in a run directory, and load what they tell."""
     runtime = Runtime(cluster="sync")
     with build(folder, "ingest", 1, {}, {}) as made:

@@ -49,7 +49,7 @@ from pixcal.model.acquisition import load_acquisition
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError, PlanError
 from pixcal.stages import correct, diagnose, ingest, reduce
-from pixcal.stages.diagnose import look
+from pixcal.stages.diagnose import diagnosis_input
 from pixcal.storage.artefact import build
 from pixcal.storage.formats import STAGES
 from pixcal.storage.manifest import write_json
@@ -387,7 +387,12 @@ def test_each_case_gets_the_memory_that_it_asks_for(
     over, each = share("cases", "standard", 10, runtime)
     assert over.workers == at_once
     half, sets = 128 * 128 * 300, 3
-    make_plan("diagnose", look.ESTIMATE_BYTES * half, look.EVIDENCE_BYTES * half * sets, each)
+    make_plan(
+        "diagnose",
+        diagnosis_input.ESTIMATE_BYTES * half,
+        diagnosis_input.EVIDENCE_BYTES * half * sets,
+        each,
+    )
     with pytest.raises(PlanError, match="cases"):
         share("cases", "standard", 10, replace(runtime, memory=1 << 30))
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pixcal.stages.diagnose.measuring import excess_scatter
+from pixcal.stages.diagnose.measure_nominal import excess_scatter
 
 SHAPE, K, ERROR = (67, 53), 0.7, 1e-3
 

@@ -15,10 +15,10 @@ from pixcal.estimators.detector.flat_ladder import ladder as ladder_of
 from pixcal.estimators.detector.flat_ladder import level_before
 from pixcal.estimators.detector.transfer_curve import transfer_curve
 from pixcal.estimators.test_statistics import DETECTOR, measure
-from pixcal.estimators.test_statistics.look import STEPS
+from pixcal.estimators.test_statistics.fringe_set_data import STEPS
 from pixcal.model.arrays import F64
 from pixcal.stages import reduce
-from pixcal.stages.diagnose.parts import Raw, evidence_of
+from pixcal.stages.diagnose.parts import RawFrames, evidence_of
 from pixcal.stages.diagnose.windows import split, whole_of
 from pixcal.stages.reduce.flat_survey import FlatSurvey
 
@@ -322,7 +322,7 @@ def test_gain_is_told_by_noise_and_response_by_levels(gain: float, quadratic: fl
     )
     arrays, tables = camera.frames(7)
     declared = replace(camera, gain=2.3).described()
-    raw = Raw(declared, arrays, tables, reduce.Config())
+    raw = RawFrames(declared, arrays, tables, reduce.Config())
     evidence = evidence_of(raw, whole_of(camera.shape), camera.shape)
     of_gain, response = GainError.estimate(evidence), Nonlinearity.estimate(evidence)
     assert of_gain is not None

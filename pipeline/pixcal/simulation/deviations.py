@@ -19,7 +19,7 @@ from scipy.ndimage import median_filter
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.estimators.maps.structure import flattened, without_outliers
-from pixcal.estimators.test_statistics.look import FringeSetData, neighbour_sums
+from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData, neighbour_sums
 from pixcal.kernels.robust import SIGMA_OF_MAD, robust_sigma
 from pixcal.model.arrays import F32, F64, Indices, Mask
 

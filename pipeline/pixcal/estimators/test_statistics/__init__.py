@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.test_statistics.look import FringeSetData
+from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData
 from pixcal.model.arrays import F64
 
 # replaces the name of a set where a curve is of the detector or of several sets

@@ -11,7 +11,7 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack, once
 from pixcal.estimators.test_statistics import Curve, family, statistic
-from pixcal.estimators.test_statistics.look import ADJACENT, STEPS, neighbour_sums
+from pixcal.estimators.test_statistics.fringe_set_data import ADJACENT, STEPS, neighbour_sums
 from pixcal.kernels.line_means import without_line_means
 from pixcal.kernels.sample_sums import frame_means
 from pixcal.model.arrays import F32, F64, Mask

@@ -7,7 +7,7 @@ import numpy as np
 from pixcal.estimators.detector.flat_ladder import MIN_STEPS, ladder, straight_line
 from pixcal.estimators.diagnosis.evidence import Evidence, once
 from pixcal.estimators.test_statistics import Curve, statistic
-from pixcal.estimators.test_statistics.look import CODES, FringeSetData
+from pixcal.estimators.test_statistics.fringe_set_data import CODES, FringeSetData
 from pixcal.model.arrays import F64
 
 of_intensity = partial(statistic, "intensity")
@@ -19,7 +19,7 @@ CLASSES = (4, 16, 64)
 @of_intensity("harmonics of the fringes", "amplitude / α", x="harmonic (cosine, sine)")
 def harmonics(data: FringeSetData) -> Curve:
     """Two to four times the phase in the residuals, over the fringe amplitude."""
-    found, good = data.found, data.good
+    found, good = data.fringes, data.good
     alpha = float(np.median(np.hypot(found.theta[1], found.theta[2])[good]))
     phi, psi = found.phi, data.psi[good]
     orders = (2, 3, 4)

@@ -9,7 +9,7 @@ from scipy.ndimage import maximum_filter
 from pixcal.estimators.detector.pixel_read_noise import FEWEST, squares_without_hits
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics import Curve, family, statistic
-from pixcal.estimators.test_statistics.look import (
+from pixcal.estimators.test_statistics.fringe_set_data import (
     ADJACENT,
     OUTLIERS,
     STEPS,
@@ -82,7 +82,7 @@ def far_neighbours(data: FringeSetData) -> Curve:
 def neighbours_by_row(data: FringeSetData) -> Curve:
     """Correlation with the pixel below and to the right, for each row of four."""
     sums, count = (of[[STEPS.index((1, 0)), STEPS.index((0, 1))]] for of in data.neighbours)
-    row = (np.arange(data.good.shape[0]) + data.found.origin[0]) % 4
+    row = (np.arange(data.good.shape[0]) + data.fringes.origin[0]) % 4
     value = np.stack(
         [_mean_product(sums[:, row == n], count[:, row == n]) for n in range(4)], axis=1
     )
@@ -93,7 +93,7 @@ def neighbours_by_row(data: FringeSetData) -> Curve:
 def neighbours_by_level(data: FringeSetData) -> Curve:
     """Covariance over shot noise in bright samples less that in dark ones."""
     (bright, dark), count = neighbour_sums_by_level(
-        data.residual, data.found.model, data.good, STEPS[:ADJACENT], data.thinned
+        data.residual, data.fringes.model, data.good, STEPS[:ADJACENT], data.thinned
     )
     return Curve.numbered(2 * _mean_product(bright - dark, count))
 

@@ -10,7 +10,7 @@ from scipy.fft import rfft2
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics import Curve, family, statistic
 from pixcal.estimators.test_statistics.detector_frames import differences, repeated
-from pixcal.estimators.test_statistics.look import FringeSetData, pattern_sizes
+from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData, pattern_sizes
 from pixcal.estimators.test_statistics.time import DISTINCT
 from pixcal.kernels.significance import sigmas_of_largest
 from pixcal.model.arrays import F32, F64, Mask
@@ -113,7 +113,7 @@ def smooth_patterns_of(kind: str, evidence: Evidence) -> Curve | None:
 @statistic("time", "smooth patterns that follow the phase", "strongest", unit="σ")
 def smooth_patterns_by_phase(data: FringeSetData) -> Curve | None:
     """Size of the strongest pattern that follows two and three times the frame's phase."""
-    phi = data.found.phi
+    phi = data.fringes.phi
     # The pixels' fit absorbs patterns that follow the phase itself.
     taken = np.linalg.qr(np.stack([np.ones_like(phi), np.cos(phi), np.sin(phi)], axis=1))[0]
     turns = np.stack([f(n * phi) for n in (2, 3) for f in (np.cos, np.sin)], axis=1)

@@ -17,7 +17,7 @@ from pixcal.estimators.maps.structure import (
     repeats,
 )
 from pixcal.estimators.test_statistics import Curve, family, statistic
-from pixcal.estimators.test_statistics.look import FringeSetData, by_cell
+from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData, by_cell
 from pixcal.model.arrays import F64, Mask
 
 of_space = partial(statistic, "space")
@@ -54,7 +54,7 @@ def apart(sets: Sequence[FringeSetData]) -> Curve:
     """Mean square of the difference of the offsets along one axis, by two baselines."""
     values = []
     for one, other in combinations(sets, 2):
-        a, b = np.array(one.found.k), np.array(other.found.k)
+        a, b = np.array(one.fringes.k), np.array(other.fringes.k)
         cosine = float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
         if abs(cosine) > SAME:
             other_map = np.sign(cosine) * other.maps["offset"]

@@ -9,7 +9,7 @@ from scipy.fft import dct
 from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker, level_before, light_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics import Curve, family, statistic
-from pixcal.estimators.test_statistics.look import FringeSetData
+from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData
 from pixcal.kernels.frame_order import follows
 from pixcal.kernels.sample_sums import frame_means
 from pixcal.model.arrays import F64
@@ -52,7 +52,7 @@ def power_of(series: F64) -> Curve:
 @of_time("signal carried over from other frames", "share of the signal", x="frames before")
 def frames_before(data: FringeSetData) -> Curve:
     """Share of another frame's fringes in the residuals, after what the pixels' own fits absorb."""
-    g, theta = data.found.g, data.theta
+    g, theta = data.fringes.g, data.theta
     noise = np.sqrt(data.variance)[:, None]
     basis = np.linalg.qr(g)[0]
     along = noise * (data.residual.reshape(len(g), -1) @ theta.T)
@@ -61,7 +61,7 @@ def frames_before(data: FringeSetData) -> Curve:
     for lag in LAGS:
         other = np.roll(g, lag, axis=0)
         other -= basis @ (basis.T @ other)
-        other[~follows(data.found.frame, lag)] = 0
+        other[~follows(data.fringes.frame, lag)] = 0
         size = np.einsum("ti,ij,tj->", other, square, other)
         values.append(float(np.vdot(other, along) / size))
     return Curve(np.array(LAGS, float), np.array(values))
@@ -74,11 +74,11 @@ def frames_before(data: FringeSetData) -> Curve:
 )
 def contrast_by_step(data: FringeSetData) -> Curve:
     """Slope of the contrast against the cosine of the step."""
-    contrast, phi = data.frames["contrast"], data.found.phi
+    contrast, phi = data.frames["contrast"], data.fringes.phi
     slow = np.stack([np.ones(len(phi)), np.linspace(-1, 1, len(phi))], axis=1)
     values = []
     for lag in LAGS[:3]:
-        own = np.flatnonzero(follows(data.found.frame, lag))
+        own = np.flatnonzero(follows(data.fringes.frame, lag))
         terms = np.column_stack([slow[own], np.cos(phi[own] - phi[own - lag])])
         values.append(float(np.linalg.lstsq(terms, contrast[own], rcond=DISTINCT)[0][-1]))
     return Curve(np.array(LAGS[:3], float), np.array(values))
@@ -87,7 +87,7 @@ def contrast_by_step(data: FringeSetData) -> Curve:
 @of_time("contrast and intensity against phase", "relative amplitude", x="term")
 def frames_by_phase(data: FringeSetData) -> Curve:
     """Amplitudes of contrast and intensity at one, two and three times the frame's phase."""
-    phi = data.found.phi
+    phi = data.fringes.phi
     turns = [f(n * phi) for n in (1, 2, 3) for f in (np.cos, np.sin)]
     terms = np.stack([np.ones(len(phi)), *turns], axis=1)
     values = [
@@ -106,7 +106,7 @@ def frames_by_phase(data: FringeSetData) -> Curve:
 )
 def allan_of_batches(data: FringeSetData) -> Curve | None:
     """Allan variance of the pixels' offsets, over lengths of one, two and four batches."""
-    found = data.found
+    found = data.fringes
     size = len(found.g) // BATCHES
     if size < 8:
         return None

@@ -31,7 +31,7 @@ from pixcal.stages.correct.correct_maps import correct_sweep, sides_of
 from pixcal.stages.correct.gain import Maps, measure_gain, worsened
 from pixcal.stages.correct.sweep_to_correct import RestoredSet, Swept
 from pixcal.stages.correct.uncertainty import parameter_errors
-from pixcal.stages.diagnose.look import ESTIMATE_BYTES, EVIDENCE_BYTES
+from pixcal.stages.diagnose.diagnosis_input import ESTIMATE_BYTES, EVIDENCE_BYTES
 from pixcal.stages.diagnose.windows import chosen_windows
 from pixcal.stages.evidence import Part, load_evidence
 from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set

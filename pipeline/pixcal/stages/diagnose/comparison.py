@@ -24,13 +24,10 @@ from pixcal.estimators.test_statistics.gap import (
     remaining,
 )
 from pixcal.model.arrays import F64
+from pixcal.stages.diagnose.thresholds import LAW_ERROR, MIN_LOGLIK_GAIN, STAYS
 from pixcal.stages.diagnose.trial import Curves, Effects
 
-MIN_LOGLIK_GAIN = 5.0  # least rise of the log-likelihood of held-out data for an effect
 DRAWS = 200
-# residual share of the largest difference above which it is not explained. The share was at most
-# 0.38 on 107 benches with one or two known effects, 0.5 to 1 on four with an unknown effect
-STAYS = 0.5
 
 
 @dataclass(frozen=True)
@@ -98,11 +95,6 @@ def differing(nominal: Trial, final: Trial, data: Mapping[Key, F64]) -> set[Key]
     where |= {key for key, gain in gains.items() if gain > MIN_LOGLIK_GAIN / 2}
     # If each of many curves favours a cause only slightly, the one that favours it most counts.
     return where or {max(gains, key=lambda key: gains[key])}
-
-
-# relative error of an effect's law: a second cause needs evidence that another law of the first
-# would not produce
-LAW_ERROR = 0.25
 
 
 class Comparison:

@@ -16,7 +16,7 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import plain_bench
 from pixcal.stages.diagnose.nominal import SetTruth
-from pixcal.stages.diagnose.parts import Half, Table
+from pixcal.stages.diagnose.parts import FrameSubset, Table
 from pixcal.stages.evidence import DAY_S, begin_mjd, groups
 
 _LATE = 0.05  # fraction of a period above which a frame counts as late
@@ -86,7 +86,7 @@ def recordings_of(
     acquisition: Acquisition,
     tables: Mapping[str, Table],
     evidence: Sequence[Evidence],
-    halves: Sequence[Half],
+    halves: Sequence[FrameSubset],
 ) -> tuple[list[Recording], list[tuple[str, Indices]], dict[int, F64]]:
     """Recordings, places of their frames, and light of each flat: e- for unit response, or NaN."""
     start = _start(tables)
@@ -168,7 +168,7 @@ def _start(tables: Mapping[str, Table]) -> dict[str, float]:
 
 def _light(
     evidence: Sequence[Evidence],
-    halves: Sequence[Half],
+    halves: Sequence[FrameSubset],
     name: str,
     numbers: Indices,
     exposure_and_step: tuple[float, int],

@@ -10,7 +10,7 @@ from typing import Any
 
 from pixcal.model.acquisition import Acquisition
 from pixcal.simulation.effect import Effect
-from pixcal.stages.diagnose.parts import Half, Table
+from pixcal.stages.diagnose.parts import FrameSubset, Table
 
 # first frame, last frame and count, by array
 Frames = dict[str, tuple[int, int, int]]
@@ -22,7 +22,7 @@ MORE = "more frames of the same kind"
 FRINGES = "fringes"  # for effects that other frames do not show
 
 
-def frames_of(half: Half) -> Frames:
+def frames_of(half: FrameSubset) -> Frames:
     """Frames of a half, by array."""
     return {name: (int(own[0]), int(own[-1]), len(own)) for name, own in half.items()}
 

@@ -31,7 +31,7 @@ from pixcal.stages import reduce
 from pixcal.stages.diagnose.fitted_set import FittedSet, IntensityBeforeEffects
 from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_change
-from pixcal.stages.diagnose.parts import Half, Raw, Table, select
+from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, Table, select
 from pixcal.stages.reduce.black_cut_off import Black
 
 _GAIN, _NOISE, _DARK = 101, 102, 103  # keys of random numbers
@@ -115,7 +115,9 @@ class NominalBench:
     places: tuple[tuple[str, Indices], ...]
     black: Black | None = None  # known of the camera from the whole run
 
-    def simulate(self, half: Half, effects: Sequence[Effect], seed: int, *, window: int = 0) -> Raw:
+    def simulate(
+        self, half: FrameSubset, effects: Sequence[Effect], seed: int, *, window: int = 0
+    ) -> RawFrames:
         """Simulate a half of the acquisition's frames with this bench and given effects.
 
         Effects are undone on the measured maps, which contain them, before they act. ``seed``: of
@@ -163,7 +165,9 @@ class NominalBench:
             for frame, samples in camera.expose(own, wanted.tolist()):
                 at = int(np.searchsorted(half[name], numbers[frame]))
                 arrays[name][at] = samples - np.float32(self.pedestal)
-        return Raw(self.acquisition, arrays, select(self.tables, half), self.reduction, self.black)
+        return RawFrames(
+            self.acquisition, arrays, select(self.tables, half), self.reduction, self.black
+        )
 
     def _of_measured_k(
         self, measured: Measured, bench: Bench, effects: Sequence[Effect]

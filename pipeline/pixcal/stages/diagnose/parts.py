@@ -35,13 +35,13 @@ Frames = NDArray[Any]
 Table = Mapping[str, list[Any]]
 # a subset of frames: their numbers (t,), ascending, by the name of the array, such as
 # ``bias`` or ``fringes/vertical``
-Half = Mapping[str, Indices]
-HERE = Runtime(cluster="sync", quiet=True)
+FrameSubset = Mapping[str, Indices]
+SERIAL_RUNTIME = Runtime(cluster="sync", quiet=True)
 NO_BATCHES = Sweep(batch_frames=1 << 40)
 
 
 @dataclass(frozen=True)
-class Raw:
+class RawFrames:
     """Frames of a part of the window, in ADU."""
 
     acquisition: Acquisition
@@ -62,20 +62,20 @@ class Raw:
 def take(
     ingested: Ingested,
     acquisition: Acquisition,
-    half: Half,
+    half: FrameSubset,
     part: Part,
     reduction: reduce.Config,
     black: Black | None = None,
-) -> Raw:
+) -> RawFrames:
     """Read a part of a run's frames."""
     arrays = {}
     for name, frames in half.items():
         array = ingested.arrays[name]
         arrays[name] = np.concatenate([array.read(run, *part) for run in runs(frames)])
-    return Raw(acquisition, arrays, select(ingested.tables, half), reduction, black)
+    return RawFrames(acquisition, arrays, select(ingested.tables, half), reduction, black)
 
 
-def select(tables: Mapping[str, Table], half: Half) -> dict[str, Table]:
+def select(tables: Mapping[str, Table], half: FrameSubset) -> dict[str, Table]:
     """Rows of the tables that belong to a half, with the numbers of the frames."""
     found: dict[str, Table] = {}
     for name, frames in half.items():
@@ -88,7 +88,7 @@ def select(tables: Mapping[str, Table], half: Half) -> dict[str, Table]:
     return found
 
 
-def evidence_of(raw: Raw, part: Part, window: tuple[int, int]) -> Evidence:
+def evidence_of(raw: RawFrames, part: Part, window: tuple[int, int]) -> Evidence:
     """Reduce and fit a part of a window, with straight fringes."""
     run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction, black=raw.black)
     return evidence.evidence_of(run, black=raw.black, within=((part[0][0], part[1][0]), window))
@@ -112,11 +112,11 @@ def run_in_memory(
     write_json(run / "ingest" / "acquisition.json", to_plain(acquisition))
     write_json(run / "ingest" / "frames.json", tables)
     reduced = MemoryBuild(run / "reduce")
-    found = reduce_frames(reduced, Ingested(run / "ingest", black), reduction, HERE)
+    found = reduce_frames(reduced, Ingested(run / "ingest", black), reduction, SERIAL_RUNTIME)
     write_json(run / "reduce" / "reduce.json", found.noise(reduction))
     if acquisition.frames.fringes:
         cubes = run / "reduce" / "reduced.zarr"
-        facts = sweep_sets(MemoryBuild(run / "sweep"), cubes, acquisition, sweep, HERE)
+        facts = sweep_sets(MemoryBuild(run / "sweep"), cubes, acquisition, sweep, SERIAL_RUNTIME)
         fitted = fit_sets(run / "sweep", cubes, facts, acquisition, "paraxial")
         write_offsets(run / "fit" / "fit.zarr", fitted)
         vectors = {f.name: dict(zip(("kx", "ky"), f.vector, strict=True)) for f in fitted}

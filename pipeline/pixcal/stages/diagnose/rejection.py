@@ -12,14 +12,16 @@ from itertools import combinations
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.candidates import Candidate
-from pixcal.stages.diagnose.comparison import LAW_ERROR, MIN_LOGLIK_GAIN, Comparison, Trial
-
-# least rise of the log-likelihood of the held-out frames by a candidate of low significance
-MIN_LOGLIK_GAIN_WEAK = 12.0
-OPEN = 0.15  # residual gap above which an unknown cause is assumed
-LITTLE = 0.1  # fraction of the gap that a doubtful cause must close,
-BESIDE_OPEN = 0.25  # and every cause, as a fraction of the residual gap
-TOGETHER = 0.5  # fraction that all candidates must close for a search beyond the first round
+from pixcal.stages.diagnose.comparison import Comparison, Trial
+from pixcal.stages.diagnose.thresholds import (
+    LAW_ERROR,
+    MAX_RESIDUAL_GAP,
+    MIN_GAP_CLOSED,
+    MIN_JOINT_GAP_CLOSED,
+    MIN_LOGLIK_GAIN,
+    MIN_LOGLIK_GAIN_WEAK,
+    MIN_SHARE_OF_RESIDUAL,
+)
 
 UNTRIED = ("not decided", "not tested", "cannot be simulated")  # how such reasons begin
 
@@ -42,7 +44,7 @@ def needed_gain(candidate: Candidate) -> float:
     return MIN_LOGLIK_GAIN if candidate.significance >= SIGNIFICANT else MIN_LOGLIK_GAIN_WEAK
 
 
-def too_little(gain: float, candidate: Candidate) -> str:
+def gain_too_small(gain: float, candidate: Candidate) -> str:
     """Why a candidate that was tried is rejected."""
     if candidate.in_maps_alone and gain < MIN_LOGLIK_GAIN:
         return "the maps of the held-out frames show no more of it than true offsets can by chance"
@@ -65,7 +67,7 @@ def redundant(
     return least, "the other causes explain the data as well without it"
 
 
-def stands_in(closed: float, still_open: float) -> str:
+def possible_proxy(closed: float, still_open: float) -> str:
     """Why a cause is rejected that closes little of a large gap."""
     return (
         f"closes only {_weighted(closed)} while {still_open:.0%} of it stays open; it may be a "
@@ -82,8 +84,9 @@ def all_close_little(
 ) -> dict[str, float]:
     """Fraction of the gap that each candidate closes alone; empty unless all close little.
 
-    So it is if together they close less than `TOGETHER`, and each less than `BESIDE_OPEN` of what
-    is left then. If the fractions add up, `doubtful` would reject any set of these candidates.
+    So it is if together they close less than `MIN_JOINT_GAP_CLOSED`, and each less than
+    `MIN_SHARE_OF_RESIDUAL` of what is left then. If the fractions add up, `doubtful` would reject
+    any set of these candidates.
     ``alone``: names of candidates, and benches with this one only.
     """
     if not comparison.differs(comparison.nominal):
@@ -93,8 +96,10 @@ def all_close_little(
     closed: dict[str, float] = {}
     for name, trial in trials:
         closed[name] = max(1 - comparison.residual(trial, where), closed.get(name, 0.0))
-    little = all(one < BESIDE_OPEN * (1 - TOGETHER) for one in closed.values())
-    return closed if little and sum(closed.values()) < TOGETHER else {}
+    little = all(
+        one < MIN_SHARE_OF_RESIDUAL * (1 - MIN_JOINT_GAP_CLOSED) for one in closed.values()
+    )
+    return closed if little and sum(closed.values()) < MIN_JOINT_GAP_CLOSED else {}
 
 
 def doubtful(
@@ -117,14 +122,17 @@ def doubtful(
         if candidates[name].share < 1 - LAW_ERROR or candidates[name].significance < SIGNIFICANT
     }
     needed = {
-        name: max(BESIDE_OPEN * open_still, LITTLE if open_still > OPEN or name in imitated else 0)
+        name: max(
+            MIN_SHARE_OF_RESIDUAL * open_still,
+            MIN_GAP_CLOSED if open_still > MAX_RESIDUAL_GAP or name in imitated else 0,
+        )
         for name in closed
     }
     among = [name for name in closed if closed[name] < needed[name]]
     alone = [candidates[name].alone for name in closed]
     # Causes that only compensate each other.
-    if open_still > OPEN and all(
-        one is not None and comparison.residual(one, where) > 1 - LITTLE for one in alone
+    if open_still > MAX_RESIDUAL_GAP and all(
+        one is not None and comparison.residual(one, where) > 1 - MIN_GAP_CLOSED for one in alone
     ):
         among = list(closed)
     least = min(among, key=lambda name: closed[name], default=None)
@@ -136,8 +144,8 @@ def doubtful(
         return least, "the largest difference remains; it may be a proxy for an unknown cause"
     if least is None:
         return None
-    if open_still > OPEN or least not in imitated:
-        return least, stands_in(closed[least], open_still)
+    if open_still > MAX_RESIDUAL_GAP or least not in imitated:
+        return least, possible_proxy(closed[least], open_still)
     sigmas, mimicked = candidates[least].significance, 1 - candidates[least].share
     why = f"the other causes produce {mimicked:.0%} of its significance"
     if sigmas < SIGNIFICANT:

@@ -26,13 +26,11 @@ from pixcal.simulation.effect import DOMAINS
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
 from pixcal.stages.diagnose.comparison import Shrinkage, Trial, differing, gap_interval, shrinkage
 from pixcal.stages.diagnose.frames_used import FRINGES, FramesUsed, recommend_frames
+from pixcal.stages.diagnose.thresholds import EXPLAINED, MAX_RESIDUAL_SHARE, MAX_RESIDUAL_SIGMA
 
 Json = dict[str, Any]
 
 SCHEMA = "pixcal/diagnosis/1"
-EXPLAINED = 0.15  # largest residual gap that is called explained,
-LEFT = 0.25  # and largest residual share of any one statistic that deviates by more than
-STILL = 6.0  # standard deviations: less can come from the simulation of the effects
 # statistics reported in bench units even if they do not differ
 ALWAYS = ("allan_of_batches", "offset_by_place", "residual_noise")
 MIN_P_VALUE = 1e-12  # smallest reported: the shape of the tails beyond is unknown
@@ -148,12 +146,13 @@ class _Description:
 
     @cached_property
     def staying(self) -> set[Key]:
-        """Curves that deviate with all causes, and keep more than `LEFT` of their deviation."""
+        """Curves that still deviate with all causes, and keep over `MAX_RESIDUAL_SHARE` of it."""
         left, after = self.final.significant.left, self.final.after
         return {
             key
             for key in flagged(after)
-            if left.get(key, 1.0) > LEFT and sigmas_of(after[key].log_chance) > STILL
+            if left.get(key, 1.0) > MAX_RESIDUAL_SHARE
+            and sigmas_of(after[key].log_chance) > MAX_RESIDUAL_SIGMA
         }
 
     def _cause(self, name: str) -> Json:
@@ -198,7 +197,7 @@ class _Description:
             "sigmas": rounded(estimate.significance),
             "why": estimate.why,
             "remedy": effect.remedy or "find and fix it on the bench",
-            "given_away_by": self._telling(found.without[name]),
+            "given_away_by": self._strongest_evidence(found.without[name]),
             "not_told_apart_from": list(alike),
             "would_decide": recommend_frames(self.facts.missing_frames, kinds) if alike else [],
         }
@@ -211,7 +210,7 @@ class _Description:
                 groups.setdefault(" or ".join(candidate.needs), []).append(candidate.name)
         return groups
 
-    def _telling(self, without: Trial) -> list[dict[str, str]]:
+    def _strongest_evidence(self, without: Trial) -> list[dict[str, str]]:
         """Statistics whose likelihood an effect raises most, best first."""
         gains = likelier(self.data, without.expected, self.found.final.expected)
         best = sorted(gains, key=lambda k: -gains[k])[:SHOWN]

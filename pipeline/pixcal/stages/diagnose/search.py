@@ -23,35 +23,38 @@ from pixcal.stages.diagnose.candidates import (
     SearchResult,
     likeliest,
 )
-from pixcal.stages.diagnose.comparison import MIN_LOGLIK_GAIN, Comparison, Trial
+from pixcal.stages.diagnose.comparison import Comparison, Trial
 from pixcal.stages.diagnose.rejection import (
-    MIN_LOGLIK_GAIN_WEAK,
-    TOGETHER,
     all_close_little,
     doubtful,
     exchanges,
     explained_by_other_law,
+    gain_too_small,
     needed_gain,
+    possible_proxy,
     redundant,
     similar_to,
-    stands_in,
-    too_little,
+)
+from pixcal.stages.diagnose.thresholds import (
+    MIN_JOINT_GAP_CLOSED,
+    MIN_LOGLIK_GAIN,
+    MIN_LOGLIK_GAIN_WEAK,
+    MIN_SIGMA_IN_GAP,
+    MIN_SIGMA_WEAK,
+    SIMILAR,
 )
 from pixcal.stages.diagnose.trial import Curves, Effects
 
-# least significance of an estimate when there is a gap, instead of `SIGNIFICANT`,
-MIN_SIGMA_IN_GAP = 1.5
-MIN_SIGMA_WEAK = 1.0  # and when no candidate is significant: even a weak one may be true
-SCREEN = 3  # simulations of a candidate,
-CONFIRM = 8  # and of the accepted causes
+SCREEN_SIMULATIONS = 3  # simulations of a candidate,
+CONFIRM_SIMULATIONS = 8  # and of the accepted causes
 PROMISING = 0.25  # share of the best gain above which a candidate is simulated more than once,
-KNOWN_TO = 3.0  # largest significance credited after one simulation: its scatter is unknown
+# largest significance credited after one simulation: its scatter is unknown
+MAX_SINGLE_SIMULATION_SIGMA = 3.0
 MAX_CAUSES = 5  # most causes that are accepted
-AS_GOOD = 0.1  # relative difference from the best gain within which candidates are equal
+TIE_MARGIN = 0.1  # relative difference from the best gain within which candidates are equal
 # most simulations of a search (two causes take about 80); number of samples that limits them if
 # each has many; least number even then. Never the time: results must not depend on the machine.
 SIMULATIONS, SEARCH_SAMPLES, LEAST_SIMULATIONS = 300, 3_000_000_000, 100
-SIMILAR = 0.7  # largest fraction of a candidate's significance that other effects may produce
 
 
 def affordable(samples: int) -> int:
@@ -99,7 +102,7 @@ class Search:
         if len(self._causes.effects) == MAX_CAUSES:
             for candidate in remaining.values():
                 candidate.reason = f"not tested: the search stops after {MAX_CAUSES} causes"
-        return self._each_weighed()
+        return self._prune_causes()
 
     def _accept_all(self) -> None:
         while len(self._causes.effects) < MAX_CAUSES and self._accept_one():
@@ -145,7 +148,7 @@ class Search:
             return False
         for name, share in closed.items():
             candidate = self._candidates[name]
-            candidate.reason = candidate.reason or stands_in(share, 1 - share)
+            candidate.reason = candidate.reason or possible_proxy(share, 1 - share)
         return True
 
     def _close_much_together(self, effects: Effects) -> bool:
@@ -157,7 +160,7 @@ class Search:
             return False
         trial = self.comparison.trial(effects, curves)
         left = self.comparison.residual(trial, self.comparison.gap_of(trial))
-        return left < 1 - TOGETHER
+        return left < 1 - MIN_JOINT_GAP_CLOSED
 
     def _leave_explained(self, cause: str) -> None:
         """Leave out candidates whose significance comes mostly from the causes."""
@@ -171,12 +174,16 @@ class Search:
         causes, remaining, candidates = self._causes, self._remaining, self._candidates
         options = exchanges(causes.effects, candidates)
         count = len(causes.effects) + 1
-        left = self._most - sum(self._made.values()) - CONFIRM * (1 + count * (count + 1) // 2)
+        left = (
+            self._most
+            - sum(self._made.values())
+            - CONFIRM_SIMULATIONS * (1 + count * (count + 1) // 2)
+        )
         if not options or len(options) + 1 > left or not self.comparison.differs(causes.current):
             return False
         benches = [tuple(one.effects.values()) for one in options]
         # Choose by one simulation of each, then by a few, before the choice is confirmed.
-        for seeds, needed in ((1, 0.0), (SCREEN, MIN_LOGLIK_GAIN_WEAK)):
+        for seeds, needed in ((1, 0.0), (SCREEN_SIMULATIONS, MIN_LOGLIK_GAIN_WEAK)):
             tried = self._simulate([causes.bench, *benches], seeds, "exchanged", ())
             likely = [
                 -np.inf if isinstance(c, str) else self.comparison.trial(b, c).log_likelihood
@@ -219,7 +226,7 @@ class Search:
             gains |= enough
             laws |= {name: replays[name] for name in enough}
         for name in gains.keys() - enough.keys():
-            candidates[name].reason = too_little(gains[name], candidates[name])
+            candidates[name].reason = gain_too_small(gains[name], candidates[name])
         if not enough:
             return gains, None, ""
         best = self._best(enough)
@@ -234,10 +241,10 @@ class Search:
         """The candidate with the largest gain; among equals, one that is described by its law."""
         # A curve measured at many levels can imitate another effect.
         most = max(gains.values())
-        equals = {n: g for n, g in gains.items() if g >= (1 - AS_GOOD) * most}
+        equals = {n: g for n, g in gains.items() if g >= (1 - TIE_MARGIN) * most}
         if len(equals) > 1:
             curves = [(n, law) for n in equals if (law := self._candidates[n].law) is not None]
-            by_law = self._added(curves, SCREEN, "laws", drop=False)
+            by_law = self._added(curves, SCREEN_SIMULATIONS, "laws", drop=False)
             equals |= {one.name: one.gain for one in by_law}
         return max(equals, key=lambda n: equals[n])
 
@@ -265,11 +272,14 @@ class Search:
         """Leave out the weakest candidates if simulations do not suffice for all."""
         causes, remaining, sizes = self._causes, self._remaining, self._sizes()
         count = len(causes.effects) + 1
-        weighed = count * (2 * CONFIRM + SCREEN) + count * (count - 1) // 2 * CONFIRM
-        left = self._most - sum(self._made.values()) - CONFIRM - weighed
+        weighed = (
+            count * (2 * CONFIRM_SIMULATIONS + SCREEN_SIMULATIONS)
+            + count * (count - 1) // 2 * CONFIRM_SIMULATIONS
+        )
+        left = self._most - sum(self._made.values()) - CONFIRM_SIMULATIONS - weighed
         for name in sorted(sizes, key=lambda n: -sizes[n]):
             candidate = remaining[name]
-            left -= SCREEN * (len(candidate.variants(causes.shares.get(name, 1.0))) + 1)
+            left -= SCREEN_SIMULATIONS * (len(candidate.variants(causes.shares.get(name, 1.0))) + 1)
             if left < 0:
                 candidate.reason = (
                     f"not decided: this search may use {self._most} simulations, and too few are "
@@ -310,12 +320,14 @@ class Search:
             for one in once
             if one.gain >= least or (one.name in hopeful and one in laws.values())
         ]
-        tried = self._added([(o.name, o.effect) for o in promising], SCREEN, "candidates")
+        tried = self._added(
+            [(o.name, o.effect) for o in promising], SCREEN_SIMULATIONS, "candidates"
+        )
         if all(one.gain < needed_gain(remaining[one.name]) for one in tried):
             # Some may have been refused in the meantime, with other seeds.
             rest = [one for one in once if one not in promising and one.name in remaining]
             others = [(one.name, one.effect) for one in rest if one.gain > 0]
-            tried += self._added(others, SCREEN, "candidates")
+            tried += self._added(others, SCREEN_SIMULATIONS, "candidates")
             tried += [one for one in rest if one.gain <= 0 and one.name in remaining]
         replays = [o for o in tried if o.effect == remaining[o.name].replay]
         return likeliest(o for o in tried if o not in replays), likeliest(replays)
@@ -343,7 +355,7 @@ class Search:
                 continue
             sure = candidates[name].significance
             if simulations == 1:
-                sure = min(sure, KNOWN_TO)
+                sure = min(sure, MAX_SINGLE_SIMULATION_SIGMA)
             trial = self.comparison.trial(bench, curves, sure, beside)
             trial = self.comparison.allowing_for_laws(trial, causes.current)
             gain = trial.log_likelihood - start.log_likelihood
@@ -360,13 +372,13 @@ class Search:
         return made
 
     def _confirmed(
-        self, effects: Effects, simulations: int = CONFIRM, asked: Sequence[str] = ()
+        self, effects: Effects, simulations: int = CONFIRM_SIMULATIONS, asked: Sequence[str] = ()
     ) -> Trial | str:
         """A bench with the given effects, or why it cannot be simulated."""
         (curves,) = self._simulate([effects], simulations, "confirm", asked)
         return curves if isinstance(curves, str) else self.comparison.trial(effects, curves)
 
-    def _start(self, effects: Effects, simulations: int = CONFIRM) -> Trial:
+    def _start(self, effects: Effects, simulations: int = CONFIRM_SIMULATIONS) -> Trial:
         """A bench with the given effects; the nominal one if there are none or they are refused."""
         # A bench that was simulated with more effects is hardly ever refused with fewer.
         nominal = self.comparison.nominal
@@ -383,7 +395,7 @@ class Search:
             for name, c in self._remaining.items()
         }
 
-    def _each_weighed(self) -> SearchResult:
+    def _prune_causes(self) -> SearchResult:
         """Leave each cause out in turn, and reject redundant and doubtful ones."""
         candidates, effects, current = self._candidates, self._causes.effects, self._causes.current
         while True:
@@ -400,7 +412,7 @@ class Search:
                 break
             _reject(name, reason, effects, candidates)
             current = fewer
-        while (replayed := self._needless(effects, current)) is not None:
+        while (replayed := self._replaceable_by_replay(effects, current)) is not None:
             name, by, current = replayed
             _reject(name, explained_by_other_law(by), effects, candidates)
             effects |= {one: e for one in effects for e in current.effects if e.name == one}
@@ -422,7 +434,7 @@ class Search:
             self._by_laws(effects),
         )
 
-    def _needless(
+    def _replaceable_by_replay(
         self, effects: Mapping[str, Effect], current: Trial
     ) -> tuple[str, str, Trial] | None:
         """A cause made redundant by another of the same step and domains; the bench without it."""
@@ -435,7 +447,7 @@ class Search:
                 if n != name and e.acts_at == own.acts_at and set(e.domains) >= set(own.domains)
                 if (replay := candidates[n].replay) is not None and replay != e
             }
-            if not replays or sum(self._made.values()) + CONFIRM > self._most:
+            if not replays or sum(self._made.values()) + CONFIRM_SIMULATIONS > self._most:
                 continue
             rest = tuple(replays.get(n, e) for n, e in effects.items() if n != name)
             trial = self._confirmed(rest)
@@ -451,9 +463,10 @@ class Search:
         trials = {}
         for name, effect in effects.items():
             law = self._candidates[name].by_law(effect)
-            trial = None if law is None or law == effect else self._confirmed((law,), SCREEN)
-            if isinstance(trial, Trial):
-                trials[name] = trial
+            if law is not None and law != effect:
+                trial = self._confirmed((law,), SCREEN_SIMULATIONS)
+                if isinstance(trial, Trial):
+                    trials[name] = trial
         return trials
 
     def _each_left_out(self, effects: Mapping[str, Effect]) -> dict[str, Trial]:
@@ -463,7 +476,7 @@ class Search:
             for name in (effects if len(effects) > 1 else ())
         }
         # Simulate all in parallel; the next line finds the results.
-        self._simulate(list(benches.values()), CONFIRM, "each cause left out", ())
+        self._simulate(list(benches.values()), CONFIRM_SIMULATIONS, "each cause left out", ())
         return {name: self._start(benches.get(name, ())) for name in effects}
 
 

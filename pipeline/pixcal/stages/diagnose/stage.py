@@ -24,8 +24,8 @@ from pixcal.model.errors import InputError
 from pixcal.model.options import Diagnose as Config
 from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.fitted_set import FittedSet
-from pixcal.stages.diagnose.inquiry import inquire, places
 from pixcal.stages.diagnose.result import describe, rounded
+from pixcal.stages.diagnose.search_run import places, run_search
 from pixcal.stages.diagnose.trial import Effects
 from pixcal.stages.treatment import Treatment, fitted_shapes, treatment_of_kind
 from pixcal.storage.artefact import Build
@@ -56,12 +56,12 @@ def _diagnose(
     """Write ``diagnosis.json`` and ``curves.json``."""
     made.scratch.mkdir(exist_ok=True)
     keep_arrays()
-    own = inquire(run_dir, kinds, base, made.scratch, runtime)
+    own = run_search(run_dir, kinds, base, made.scratch, runtime)
     diagnosis, curves = describe(
-        own.found, own.data, own.look.measured, own.reference, own.look.facts, places(own)
+        own.found, own.data, own.inputs.measured, own.reference, own.inputs.facts, places(own)
     )
     named = {effect.name: effect for effect in own.found.final.effects}
-    fits = [fit for window in own.look.windows for fit in window.bench.fits]
+    fits = [fit for window in own.inputs.windows for fit in window.bench.fits]
     for cause in diagnosis["causes"]:
         cause["on_map"] = on_map(named[cause["effect"]], fits, run_dir)
     write_json(made.folder / "diagnosis.json", diagnosis)

@@ -21,7 +21,7 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.simulation.effect import Again, Effect, Estimate
 from pixcal.stages.diagnose.nominal import NominalBench
-from pixcal.stages.diagnose.parts import Half, evidence_of
+from pixcal.stages.diagnose.parts import FrameSubset, evidence_of
 from pixcal.stages.evidence import Part
 from pixcal.storage.manifest import digest, read_json, write_json
 
@@ -43,15 +43,17 @@ class Window:
 
     part: Part  # rows and columns
     bench: NominalBench  # measured in this window
-    learn: Half  # learn, test: frames to which effects are fitted, and held-out frames
-    test: Half
+    learn: FrameSubset  # learn, test: frames to which effects are fitted, and held-out frames
+    test: FrameSubset
     whole: tuple[int, int]  # rows and columns of the detector's window
     # added to the seeds of simulations: each acquisition is compared with different random numbers,
     # so that chance does not act alike on all of them
     seed: int = 0
     full: frozenset[Level] = frozenset()  # flats that saturate
 
-    def evidence(self, half: Half, effects: Effects, seed: int, *, number: int = 0) -> Evidence:
+    def evidence(
+        self, half: FrameSubset, effects: Effects, seed: int, *, number: int = 0
+    ) -> Evidence:
         """Evidence of a simulated half of the frames with effects (`NominalBench.simulate`)."""
         own = self.seed + seed
         raw = self.bench.simulate(half, effects, own, window=number)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixcal.model.arrays import Indices
-from pixcal.stages.diagnose.parts import Half, Table
+from pixcal.stages.diagnose.parts import FrameSubset, Table
 from pixcal.stages.evidence import Part, groups
 
 SIDE = 128  # side (pixels) of a window on a large detector: the width of a chunk of the cube
@@ -92,8 +92,8 @@ def whole_of(shape: tuple[int, int]) -> Part:
 class Split:
     """Frames to which effects are fitted (``learn``), and held-out frames (``test``)."""
 
-    learn: Half
-    test: Half
+    learn: FrameSubset
+    test: FrameSubset
 
 
 def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = ()) -> Split:

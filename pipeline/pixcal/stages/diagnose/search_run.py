@@ -19,10 +19,15 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Again, Effect, Estimate
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
+from pixcal.stages.diagnose.diagnosis_input import DiagnosisInput, prepare_input
 from pixcal.stages.diagnose.frames_used import FRINGES, MORE, FramesUsed
-from pixcal.stages.diagnose.look import DiagnosisInput, look_at
 from pixcal.stages.diagnose.result import by_domain
-from pixcal.stages.diagnose.search import CONFIRM, SCREEN, Search, affordable
+from pixcal.stages.diagnose.search import (
+    CONFIRM_SIMULATIONS,
+    SCREEN_SIMULATIONS,
+    Search,
+    affordable,
+)
 from pixcal.stages.diagnose.trial import (
     OF_ESTIMATE,
     Curves,
@@ -39,18 +44,18 @@ R = TypeVar("R")
 
 REFERENCES = 16  # simulations of the nominal bench
 LEARN_SEED = 900_000
-CLEAR = 20.0  # significance above which a slow estimate is no test statistic
+MAX_SLOW_SIGNIFICANCE = 20.0  # significance above which a slow estimate is no test statistic
 # significance over that of the strongest candidate below which a score test, which takes a fifth of
 # a simulation, is none: the strongest effect is likely to produce it
-FAINT = 0.05
+MIN_RELATIVE_SIGNIFICANCE = 0.05
 
 
 @dataclass(frozen=True)
-class Inquiry:
+class SearchRun:
     """A search and its inputs."""
 
     base: Effects  # effects that the nominal bench includes
-    look: DiagnosisInput
+    inputs: DiagnosisInput
     trials: Trials
     reference: Reference
     data: Mapping[Key, F64]  # curves of the data on the reference's scales
@@ -58,9 +63,9 @@ class Inquiry:
     found: SearchResult
 
 
-def inquire(
+def run_search(
     run_dir: Path, kinds: Mapping[str, type[Effect]], base: Effects, scratch: Path, runtime: Runtime
-) -> Inquiry:
+) -> SearchRun:
     """Analyse a reduced run, simulate its nominal bench, and search for causes among ``kinds``.
 
     ``base``: effects that the nominal bench includes. ``scratch``: keeps simulations to resume.
@@ -76,30 +81,32 @@ def inquire(
         signatures = marginal_candidates(candidates, kinds, slow=bool(evidence.fringes))
         return signatures
 
-    look = look_at(run_dir, runtime, on_evidence)
+    inputs = prepare_input(run_dir, runtime, on_evidence)
     for name, candidate in candidates.items():
         if candidate.estimate is None and not candidate.reason:
-            candidate.needs = _needs(kinds[name], look.facts)
+            candidate.needs = _needs(kinds[name], inputs.facts)
             candidate.reason = (
                 f"these frames give no estimate; {' or '.join(candidate.needs)} would help"
             )
     estimates = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
     quick = tuple(s for s in signatures if kinds[s.name].quick)
-    trials = Trials(look.windows, scratch, look.runtime, quick, estimates, SCREEN)
-    reference, data = _nominal(trials, look, base, run_dir)
+    trials = Trials(inputs.windows, scratch, inputs.runtime, quick, estimates, SCREEN_SIMULATIONS)
+    reference, data = _nominal(trials, inputs, base, run_dir)
     differences = compare(data, expect_nominal(reference))
     if needs_slow(signatures, quick, differences):
-        trials = Trials(look.windows, scratch, look.runtime, signatures, estimates, SCREEN)
-        reference, data = _nominal(trials, look, base, run_dir)
+        trials = Trials(
+            inputs.windows, scratch, inputs.runtime, signatures, estimates, SCREEN_SIMULATIONS
+        )
+        reference, data = _nominal(trials, inputs, base, run_dir)
 
-    services = _SearchServices(look, base, kinds, candidates, trials)
+    services = _SearchServices(inputs, base, kinds, candidates, trials)
     most = affordable(trials.samples)
     search = Search(reference, data, services.simulate, services.again, most)
-    return Inquiry(base, look, trials, reference, data, search, search.run(candidates))
+    return SearchRun(base, inputs, trials, reference, data, search, search.run(candidates))
 
 
 def _nominal(
-    trials: Trials, look: DiagnosisInput, base: Effects, run_dir: Path
+    trials: Trials, inputs: DiagnosisInput, base: Effects, run_dir: Path
 ) -> tuple[Reference, dict[Key, F64]]:
     """Null distribution from the nominal bench, and the curves of the data on its scales."""
     (nominal,) = trials.curves([base], REFERENCES, "nominal bench")
@@ -107,14 +114,14 @@ def _nominal(
         where = "--nominal" if base else f"{run_dir}: its nominal bench"
         raise InputError(f"{where}: {nominal}")
     reference = Reference.of(nominal)
-    return reference, reference.on_scale(look.measured)
+    return reference, reference.on_scale(inputs.measured)
 
 
 @dataclass(frozen=True)
 class _SearchServices:
     """Services for a search: simulations, and estimates on simulations of the fitted frames."""
 
-    look: DiagnosisInput
+    inputs: DiagnosisInput
     base: Effects
     kinds: Mapping[str, type[Effect]]
     candidates: Mapping[str, Candidate]
@@ -131,16 +138,16 @@ class _SearchServices:
             one = Runtime(cluster="sync")
             self.answers[benches[0], tuple(asked)] = self._estimated(benches[0], asked, one)
 
-        beside = answer if asked and self.look.room else None
+        beside = answer if asked and self.inputs.room else None
         return self.trials.curves([(*self.base, *b) for b in benches], seeds, label, beside)
 
     def again(self, on: Effects, names: Sequence[str]) -> dict[str, float]:
         """Significance of candidates on simulations of the fitted frames with given effects."""
         answer = self.answers.pop((on, tuple(names)), None)
-        return self._estimated(on, names, self.look.few) if answer is None else answer
+        return self._estimated(on, names, self.inputs.few) if answer is None else answer
 
     def _estimated(self, on: Effects, names: Sequence[str], few: Runtime) -> dict[str, float]:
-        window, every = self.look.first, self.candidates.values()
+        window, every = self.inputs.first, self.candidates.values()
         laws = {c.replay: c.estimate.effect for c in every if c.replay and c.estimate}
         try:
             by_law = tuple(laws.get(effect, effect) for effect in on)
@@ -152,20 +159,22 @@ class _SearchServices:
         return {name: size for name, size in found.items() if size is not None}
 
 
-def places(made: Inquiry) -> list[dict[str, Any]]:
+def places(made: SearchRun) -> list[dict[str, Any]]:
     """Deviations of each window alone; empty if one window covers the detector."""
-    look, trials = made.look, made.trials
-    if len(look.windows) == 1 and look.windows[0].part == whole_of(look.windows[0].whole):
+    inputs, trials = made.inputs, made.trials
+    if len(inputs.windows) == 1 and inputs.windows[0].part == whole_of(inputs.windows[0].whole):
         return []
     places = []
-    for number, window in enumerate(look.windows):
+    for number, window in enumerate(inputs.windows):
         own = Reference.of(trials.of_window(number, made.base, REFERENCES))
-        data = own.on_scale(look.each[number])
+        data = own.on_scale(inputs.each[number])
         nominal = compare(data, expect_nominal(own))
         final = nominal
         if made.found.accepted:
             bench = (*made.base, *made.found.final.effects)
-            final = compare(data, expect_with(own, trials.of_window(number, bench, CONFIRM)))
+            final = compare(
+                data, expect_with(own, trials.of_window(number, bench, CONFIRM_SIMULATIONS))
+            )
         places.append({"window": to_plain(window.part), "domains": by_domain(nominal, final)})
     return places
 
@@ -228,8 +237,8 @@ def marginal_candidates(
         estimate.again or kinds[name]
         for name, estimate in sorted(seen.items())
         if estimate.significance >= SIGNIFICANT
-        and (estimate.again is None or estimate.significance >= FAINT * most)
-        and (kinds[name].quick or (slow and estimate.significance == most < CLEAR))
+        and (estimate.again is None or estimate.significance >= MIN_RELATIVE_SIGNIFICANCE * most)
+        and (kinds[name].quick or (slow and estimate.significance == most < MAX_SLOW_SIGNIFICANCE))
     )
 
 

@@ -10,7 +10,7 @@ from pixcal.estimators.detector.amplifiers import relative_gain
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.maps.structure import flattened, smooth_surface
-from pixcal.estimators.test_statistics.look import FringeSetData
+from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData
 from pixcal.estimators.test_statistics.noise import jumping
 from pixcal.kernels.processes import ramp_step
 from pixcal.kernels.robust import median_and_sigma, robust_sigma
@@ -25,11 +25,11 @@ from pixcal.stages.diagnose.fitted_set import FittedSet, contrast_surface, light
 from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain
 from pixcal.stages.diagnose.nominal import Measured, NominalBench, SetTruth, uncoupled
-from pixcal.stages.diagnose.parts import Half, Table
+from pixcal.stages.diagnose.parts import FrameSubset, Table
 from pixcal.stages.reduce.black_cut_off import Black
 from pixcal.stages.reduce.calibration import FLAT_FLOOR
 
-NO_TEST = 10.0  # reduced chi-square of the photon transfer above which its gain is not used
+MAX_GAIN_CHI2 = 10.0  # reduced chi-square of the photon transfer above which its gain is not used
 CORE = 5.0  # robust standard deviations within which the scatter of the dark signal may be noise
 _MOST_UNLIT = 0.5  # largest share of unlit pixels for which the lit ones set the light of flats
 
@@ -38,7 +38,7 @@ def nominal_bench(
     acquisition: Acquisition,
     tables: Mapping[str, Table],
     evidence: Sequence[Evidence],
-    halves: Sequence[Half],
+    halves: Sequence[FrameSubset],
     whole: tuple[int, int],
     reduction: reduce.Config,
     dtypes: Mapping[str, np.dtype[Any]],
@@ -94,7 +94,7 @@ def nominal_bench(
 
 
 def _pixel_noise(
-    evidence: Sequence[Evidence], halves: Sequence[Half], good: Mask
+    evidence: Sequence[Evidence], halves: Sequence[FrameSubset], good: Mask
 ) -> PixelNoise | None:
     """Read noise of each pixel; None where rounding hides it."""
     one = evidence[0]
@@ -108,7 +108,7 @@ def _pixel_noise(
     return PixelNoise.of(bias, good, 1 - (one.amplifier_noise / one.read_noise) ** 2, noisy)
 
 
-def parted(name: str, halves: Sequence[Half]) -> bool:
+def parted(name: str, halves: Sequence[FrameSubset]) -> bool:
     """Whether the parts hold different frames of an array."""
     first, *others = (set(h.get(name, ())) for h in halves)
     return not any(first & other for other in others)
@@ -209,7 +209,7 @@ def excess_scatter(found: Sequence[FringeEvidence], good: Mask) -> float:
     return most
 
 
-def _dark_rate(evidence: Sequence[Evidence], halves: Sequence[Half]) -> F32:
+def _dark_rate(evidence: Sequence[Evidence], halves: Sequence[FrameSubset]) -> F32:
     """Dark signal, e-/s, without the part of its scatter that is noise: simulations add it."""
     rate = _mean([uncoupled(e.dark_rate, np.random.default_rng(0)) for e in evidence])
     own = parted("bias", halves) and parted("dark", halves)
@@ -284,7 +284,7 @@ def _gain(evidence: Sequence[Evidence], flat: F64, good: Mask, with_flats: bool)
         tuple(
             (value / used, error / used)
             for used, value, error, chi2 in found
-            if np.isfinite(value) and error > 0 and chi2 < NO_TEST
+            if np.isfinite(value) and error > 0 and chi2 < MAX_GAIN_CHI2
         ),
         tuple(sorted({lag for e in evidence for lag in e.neighbours})),
     )

@@ -35,20 +35,20 @@ OUTLIERS = (5.0, 7.0, 10.0)  # standard deviations beyond which residuals are co
 class FringeSetData:
     """A fringe set of the evidence, and quantities that several statistics need."""
 
-    found: FringeEvidence
+    fringes: FringeEvidence
     evidence: Evidence
 
     @property
     def good(self) -> Mask:
         """Pixels (y, x) used."""
-        return self.found.good
+        return self.fringes.good
 
     @cached_property
     def _calm(self) -> tuple[F32, F32, F64, F64]:
-        found, maps = self.found, (self.found.shot_factor, self.found.read_variance)
+        fringes, maps = self.fringes, (self.fringes.shot_factor, self.fringes.read_variance)
         shot, read = (noise.astype(np.float32) for noise in maps)
         limits = np.array(OUTLIERS)
-        return calm_residuals(found.electrons, found.model, shot, read, self.good, WILD, limits)
+        return calm_residuals(fringes.electrons, fringes.model, shot, read, self.good, WILD, limits)
 
     @property
     def residual(self) -> F32:
@@ -73,13 +73,13 @@ class FringeSetData:
     @cached_property
     def theta(self) -> F32:
         """Maps (3, pixel) of the fit for all pixels; zero in those that are not good."""
-        theta = np.where(self.good, self.found.theta, 0).astype(np.float32)
+        theta = np.where(self.good, self.fringes.theta, 0).astype(np.float32)
         return np.asarray(theta.reshape(3, -1))
 
     @cached_property
     def by_level(self) -> tuple[F64, F64]:
         """Mean residual (e-) and mean square over the noise, in bins of the level (bin,)."""
-        model = self.found.model
+        model = self.fringes.model
         some = model[:: max(1, len(model) // 40), self.good][:, ::SPARSE]
         low, high = (float(level) for level in np.quantile(some, (0.005, 0.995)))
         sums = np.zeros((LEVELS, 3))
@@ -107,7 +107,7 @@ class FringeSetData:
     @cached_property
     def remainders(self) -> Indices | None:
         """How often codes of good pixels have each remainder mod `CODES`; None for real numbers."""
-        codes: NDArray[Any] = self.found.adu
+        codes: NDArray[Any] = self.fringes.adu
         if codes.dtype.kind not in "iu":
             return None
         every = max(1, len(codes) // 100)
@@ -117,19 +117,19 @@ class FringeSetData:
     @cached_property
     def psi(self) -> F64:
         """Phase (y, x) of the pixels, rad."""
-        return np.asarray(np.arctan2(self.found.theta[1], self.found.theta[2]))
+        return np.asarray(np.arctan2(self.fringes.theta[1], self.fringes.theta[2]))
 
     @cached_property
     def maps(self) -> dict[str, F64]:
         """Offset (px), relative contrast and light (y, x), about zero; NaN if bad or at an edge."""
-        theta, good = self.found.theta, np.zeros_like(self.good)
+        theta, good = self.fringes.theta, np.zeros_like(self.good)
         inside = (slice(EDGE, -EDGE), slice(EDGE, -EDGE))
         good[inside] = self.good[inside]
         iota = np.where(good, theta[0], np.nan)
         contrast = np.where(good, np.hypot(theta[1], theta[2]), np.nan) / iota
         light = iota / smooth_surface(iota, good)
         return {
-            "offset": without_outliers(np.where(good, self.found.delta, np.nan)),
+            "offset": without_outliers(np.where(good, self.fringes.delta, np.nan)),
             "contrast": without_outliers(contrast / np.nanmedian(contrast) - 1),
             "light": without_outliers(light - 1),
         }
@@ -166,10 +166,10 @@ class FringeSetData:
     @cached_property
     def frames(self) -> dict[str, F64]:
         """Per frame (t,): relative intensity and contrast; phase along and across, rad."""
-        b, a_cos, a_sin, dkx, dky = self.found.free.T
+        b, a_cos, a_sin, dkx, dky = self.fringes.free.T
         contrast = np.hypot(a_cos, a_sin) / b
         ny, nx = self.good.shape
-        kx, ky = self.found.k
+        kx, ky = self.fringes.k
         size = float(np.hypot(kx, ky))
         span = float(np.hypot(kx * nx, ky * ny)) / size
         return {

@@ -13,8 +13,8 @@ from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.frames_used import FramesUsed, frames_of, missing_frames
-from pixcal.stages.diagnose.measuring import nominal_bench
-from pixcal.stages.diagnose.parts import Half, Raw, evidence_of, take
+from pixcal.stages.diagnose.measure_nominal import nominal_bench
+from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, evidence_of, take
 from pixcal.stages.diagnose.trial import Curves, Signature, Window, averaged, measured_curves
 from pixcal.stages.diagnose.windows import chosen_windows, frames_of_half, split
 from pixcal.stages.evidence import Part
@@ -48,7 +48,7 @@ class DiagnosisInput:
     room: bool = False
 
 
-def look_at(
+def prepare_input(
     run_dir: Path,
     runtime: Runtime,
     on_evidence: Callable[[Evidence, Evidence, Runtime], Sequence[Signature]] = lambda *_: (),
@@ -141,7 +141,7 @@ def _acquisition(run_dir: Path, ingested: Ingested) -> Acquisition:
     )
 
 
-def _memory(half: Half, pixels: int, runtime: Runtime) -> tuple[Runtime, Runtime, bool]:
+def _memory(half: FrameSubset, pixels: int, runtime: Runtime) -> tuple[Runtime, Runtime, bool]:
     """Workers for simulations and for estimates; whether an estimate fits beside simulations."""
     largest, evidence = _samples(half, pixels)
     frames = sum(len(frames) for name, frames in half.items() if "/" not in name)
@@ -162,13 +162,13 @@ def _evidence(
     run_dir: Path,
     part: Part,
     shape: tuple[int, int],
-    raws: Sequence[Raw],
+    raws: Sequence[RawFrames],
     runtime: Runtime,
     number: int,
 ) -> list[Evidence]:
     """Evidence of both halves of the frames of a window, reduced and fitted."""
 
-    def of_half(item: tuple[str, Raw]) -> Evidence:
+    def of_half(item: tuple[str, RawFrames]) -> Evidence:
         which, raw = item
         try:
             return evidence_of(raw, part, shape)
@@ -179,14 +179,14 @@ def _evidence(
     return run_tasks(of_half, halves, runtime.here, label=f"window {number}")
 
 
-def _samples(half: Half, pixels: int) -> tuple[int, int]:
+def _samples(half: FrameSubset, pixels: int) -> tuple[int, int]:
     """Samples of a window: in the largest fringe set and in all; without fringes in all frames."""
     counts = [len(frames) for name, frames in half.items() if "/" in name]
     counts = counts or [sum(map(len, half.values()))]
     return pixels * max(counts), pixels * sum(counts)
 
 
-def _enough(half: Half) -> None:
+def _enough(half: FrameSubset) -> None:
     for name, frames in half.items():
         if "/" in name and len(frames) < FEWEST_FRAMES:
             raise InputError(
