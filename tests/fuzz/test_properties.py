@@ -19,7 +19,8 @@ from pixcal.model.acquisition import Acquisition, load_acquisition
 from pixcal.model.bench import Bench, load_bench
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
-from pixcal.storage.fits_in import FrameFile, SampleFormat, inspect
+from pixcal.storage.fits_in import inspect
+from pixcal.storage.frame_file import FrameFile, SampleFormat
 from pixcal.storage.frames import tabulate
 from pixcal.storage.sources import SourceFile
 from pixcal_cli.click_options import memory_size, region

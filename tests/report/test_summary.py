@@ -1,177 +1,160 @@
-"""Maps reduced to what a figure shows: plain NumPy on the whole map says the same."""
+"""The verdict: numbers as they are, and worries where there is cause."""
+
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from pixcal.report.summary import (
-    SAMPLE,
-    ArraySource,
-    RatioSource,
-    bands,
-    block_mean,
-    block_side,
-    detail,
-    spectrum,
-    summarise,
-    summarise_flags,
-)
+from pixcal.report.contents import Contents, MapContents, SetContents
+from pixcal.report.page import fill
+from pixcal.report.summary import ArraySource, summarise, summarise_flags
+from pixcal.report.verdict import cards, findings, headline
+
+WHITE = {"slope": -0.499, "slope_err": 0.004, "knee_frames": None, "frames": [1], "warnings": []}
 
 
-def holed(shape: tuple[int, int], seed: int = 0) -> NDArray[np.float32]:
-    rng = np.random.default_rng(seed)
-    values = (7 + rng.normal(size=shape)).astype(np.float32)
-    values[rng.random(shape) < 0.1] = np.nan
-    return values
-
-
-def slow_block_mean(values: NDArray[np.float32], side: int) -> NDArray[np.float64]:
-    rows = range(0, values.shape[0], side)
-    columns = range(0, values.shape[1], side)
-    out = np.full((len(rows), len(columns)), np.nan)
-    for i, y in enumerate(rows):
-        for j, x in enumerate(columns):
-            block = values[y : y + side, x : x + side]
-            if np.isfinite(block).any():
-                out[i, j] = block[np.isfinite(block)].mean(dtype=float)
-    return out
-
-
-@pytest.mark.parametrize("side", [1, 2, 5, 7, 200])
-def test_block_means_leave_nan_out_and_keep_the_edges(side: int) -> None:
-    values = holed((67, 131))
-    values[10:15, 20:25] = np.nan
-    np.testing.assert_allclose(
-        block_mean(values, side), slow_block_mean(values, side), rtol=1e-6, equal_nan=True
+def contents(
+    facts: dict[str, Any] | None = None,
+    allan: dict[str, Any] | None = None,
+    *,
+    masked: int = 0,
+    consistency: float | None = None,
+    warnings: tuple[str, ...] = (),
+) -> Contents:
+    shape = (20, 30)
+    flags = np.zeros(shape, np.uint8)
+    flags.ravel()[:masked] = 1
+    delta = np.random.default_rng(0).normal(0, 6e-3, shape)
+    chosen = {
+        "frames": 600,
+        "sigma_median_px": 2e-4,
+        "crb_median_px": 2e-4,
+        "sigma_scale": 1.0,
+        "batch_period_s": 0.14,
+    } | (facts or {})
+    one = summarise(ArraySource(np.ones(shape)))
+    series = dict.fromkeys(("time", "B", "A", "phi", "dkx", "dky"), np.zeros(3))
+    summary = summarise_flags(ArraySource(flags))
+    fringes = SetContents("s", chosen, one, one, one, summary, series, allan or dict(WHITE))
+    sigma = summarise(ArraySource(np.full(shape, 2e-4)))
+    return Contents(
+        acquisition={
+            "detector": {"pitch_um": 5.0},
+            "frames": {"flat": ["f"], "fringes": [{"name": "s"}]},
+        },
+        stages=(),
+        fit={"sets_chi2_reduced": consistency},
+        offsets=(MapContents("delta_x", summarise(ArraySource(delta)), sigma, None),),
+        sets=(fringes,),
+        flags=summary,
+        warnings=warnings,
     )
 
 
-def test_a_block_without_a_good_pixel_is_nan_not_zero() -> None:
-    values = np.ones((6, 6))
-    values[:3, :3] = np.nan
-    assert np.isnan(block_mean(values, 3)[0, 0])
-    assert (block_mean(values, 3).ravel()[1:] == 1).all()
+def level_of(found: Contents, words: str) -> str:
+    (finding,) = (f for f in findings(found) if words in f.text)
+    return finding.level
+
+
+def test_a_good_run_has_nothing_to_check() -> None:
+    assert {f.level for f in findings(contents())} == {"good"}
+    assert {c.level for c in cards(contents())} == {"good"}
+
+
+def test_precision_is_given_in_pixels_and_nanometres() -> None:
+    assert headline(contents()) == "The median pixel is calibrated in δx to 2.0 × 10⁻⁴ px (1.0 nm)."
+
+
+@pytest.mark.parametrize(("ratio", "level"), [(1.0, "good"), (1.3, "check"), (2.0, "bad")])
+def test_the_bound(ratio: float, level: str) -> None:
+    found = contents({"sigma_median_px": ratio * 2e-4})
+    assert level_of(found, "Cramér–Rao") == level
+
+
+@pytest.mark.parametrize(("scale", "level"), [(1.05, "check"), (0.9, "check"), (1.5, "bad")])
+def test_scaled_errors_are_pointed_out(scale: float, level: str) -> None:
+    assert level_of(contents({"sigma_scale": scale}), "errors were multiplied") == level
+
+
+def test_scaled_errors_are_not_pointed_out_without_need() -> None:
+    texts = [f.text for f in findings(contents({"sigma_scale": 1.01}))]
+    assert not any("multiplied" in text for text in texts)
 
 
 @pytest.mark.parametrize(
-    ("shape", "side"), [((400, 400), 1), ((401, 3), 2), ((5456, 8320), 21), ((1, 1), 1)]
+    ("changes", "level", "words"),
+    [
+        ({}, "good", "square root of the number of frames"),
+        ({"slope": -0.4}, "check", "slope −0.4000 ± 0.0040, not −0.5"),
+        ({"knee_frames": 13_000.0}, "check", "beyond 13\u202f000 frames"),
+    ],
 )
-def test_blocks_are_as_small_as_the_figure_allows(shape: tuple[int, int], side: int) -> None:
-    assert block_side(shape) == side
+def test_the_allan_deviation(changes: dict[str, Any], level: str, words: str) -> None:
+    found = contents(allan=WHITE | changes)
+    assert level_of(found, words) == level
+    (card,) = (c for c in cards(found) if "Allan" in c.title)
+    assert card.level == level
 
 
-@pytest.mark.parametrize(("shape", "most"), [((67, 131), 400), ((67, 131), 13), ((389, 53), 30)])
-def test_a_summary_read_by_bands_is_that_of_the_whole(shape: tuple[int, int], most: int) -> None:
-    values = holed(shape)
-    made = summarise(ArraySource(values), most)
-    wide = values.astype(float)
-    np.testing.assert_allclose(made.image, slow_block_mean(values, made.block), rtol=1e-6)
-    for axis, profile in ((0, made.columns), (1, made.rows)):
-        np.testing.assert_allclose(profile.mean, np.nanmean(wide, axis), rtol=1e-12)
-        np.testing.assert_allclose(profile.scatter, np.nanstd(wide, axis), rtol=1e-9)
-        assert (profile.count == np.isfinite(wide).sum(axis)).all()
-    assert np.isfinite(wide).sum() == len(made.sample)
-    assert made.mean == pytest.approx(np.nanmean(wide), rel=1e-12)
-    assert made.std == pytest.approx(np.nanstd(wide), rel=1e-9)
-    assert made.median == pytest.approx(np.nanmedian(values), rel=1e-6)
+@pytest.mark.parametrize(("masked", "level"), [(0, "good"), (20, "check"), (300, "bad")])
+def test_masked_pixels(masked: int, level: str) -> None:
+    (card,) = (c for c in cards(contents(masked=masked)) if c.title == "masked pixels")
+    assert card.level == level
+    assert card.detail == f"{masked} of 600"
 
 
-def test_small_differences_on_a_large_level_do_not_cancel() -> None:
-    values = 30_000 + 1e-2 * np.random.default_rng(1).normal(size=(80, 90))
-    assert summarise(ArraySource(values)).std == pytest.approx(values.std(), rel=1e-6)
+@pytest.mark.parametrize(
+    ("facts", "words"),
+    [
+        ({"fringe_vector_moves": True}, "fringe vector varies"),
+        (
+            {"model": "hyperbolic", "geometry": {"centre_x_mm": 79.0, "centre_x_nominal_mm": 0.0}},
+            "79.0 mm from their nominal position along x",
+        ),
+    ],
+)
+def test_what_the_fit_says_of_the_bench(facts: dict[str, Any], words: str) -> None:
+    assert level_of(contents(facts), words) == "check"
 
 
-def test_bands_cover_every_row_once_on_borders_of_blocks() -> None:
-    values = np.arange(1000 * 3).reshape(1000, 3)
-    read = list(bands(ArraySource(values), 21))
-    assert all(y0 % 21 == 0 for y0, _ in read)
-    np.testing.assert_array_equal(np.concatenate([v for _, v in read]), values)
+@pytest.mark.parametrize(("chi2", "level"), [(1.01, "good"), (3.0, "bad")])
+def test_sets_that_do_not_agree(chi2: float, level: str) -> None:
+    assert level_of(contents(consistency=chi2), "measure the same offsets") == level
 
 
-def test_the_sample_of_a_large_map_is_bounded_and_visits_all_columns() -> None:
-    ny, nx = 1500, 1400
-    columns = np.broadcast_to(np.arange(nx, dtype=np.float32), (ny, nx))
-    sample = summarise(ArraySource(columns)).sample
-    assert SAMPLE / 3 < len(sample) <= SAMPLE
-    assert len(np.unique(sample)) == nx
-    assert np.bincount(sample.astype(int)).std() < 1
+def test_the_way_to_the_precision_wanted() -> None:
+    # (2e-4 / 5e-5)² = 16 times 600 frames of 0.14 s.
+    assert level_of(contents(), "needs 9\u202f600 frames (22.4 min") == "good"
+    assert (
+        level_of(contents({"sigma_median_px": 4e-5}), "reaches the target of 5 × 10⁻⁵ px") == "good"
+    )
 
 
-def test_a_map_without_good_pixels_is_no_error() -> None:
-    made = summarise(ArraySource(np.full((9, 11), np.nan, np.float32)))
-    assert len(made.sample) == 0
-    assert np.isnan([made.mean, made.std, made.median, made.robust_std]).all()
-    assert np.isnan(made.image).all()
+def test_warnings_are_sentences_and_worries_come_first() -> None:
+    found = findings(contents({"sigma_scale": 1.5}, warnings=("the lamp flickers",)))
+    assert [f.level for f in found] == sorted(
+        (f.level for f in found), key=("bad", "check", "good").index
+    )
+    assert "The lamp flickers." in [f.text for f in found]
 
 
-def test_a_ratio_is_nan_where_there_is_no_light() -> None:
-    below = np.array([[2.0, 0.0, -1.0, np.nan]], np.float32)
-    ratio = RatioSource(ArraySource(np.ones_like(below)), ArraySource(below)).read((0, 1), (0, 4))
-    np.testing.assert_array_equal(ratio, [[0.5, np.nan, np.nan, np.nan]])
+def test_a_finding_on_several_sets_is_one_sentence() -> None:
+    one = contents({"sigma_median_px": 2.6e-4, "fringe_vector_moves": True})
+    other = contents({"sigma_median_px": 2.8e-4, "fringe_vector_moves": True})
+    both = replace(one, sets=(one.sets[0], replace(other.sets[0], name="other")))
+    texts = [f.text for f in findings(both)]
+    assert (
+        "All sets: the fringe vector varies from frame to frame; it was fitted in each frame."
+    ) in texts
+    (bound,) = (text for text in texts if "Cramér–Rao" in text)
+    assert bound.endswith("1.300 for s and 1.400 for other.")
+    assert len(texts) == len(findings(one))
 
 
-@pytest.mark.parametrize("shape", [(67, 131), (300, 517)])
-def test_white_noise_has_a_flat_spectrum_at_the_level_of_its_errors(shape: tuple[int, int]) -> None:
-    rng = np.random.default_rng(3)
-    sigma = 1e-3 * np.linspace(1, 2, shape[1]) * np.ones(shape)
-    delta = sigma * rng.normal(size=shape)
-    delta[rng.random(shape) < 0.2] = np.nan
-    made = spectrum(ArraySource(delta), ArraySource(sigma))
-    assert made is not None
-    ring, power = made.radial()
-    ratio = power[ring > 0.1] / made.white
-    assert ratio.mean() == pytest.approx(1.0, abs=0.05)
-    assert abs(np.polyfit(ring[ring > 0.1], ratio, 1)[0]) < 0.5
-
-
-def test_the_mean_power_is_the_variance() -> None:
-    delta = np.random.default_rng(4).normal(0, 2.0, (128, 128))
-    made = spectrum(ArraySource(delta), ArraySource(np.ones_like(delta)))
-    assert made is not None
-    assert made.power.mean() == pytest.approx(4.0, rel=0.1)
-
-
-@pytest.mark.parametrize("shape", [(67, 131), (300, 517)])
-def test_a_fringe_stands_at_its_frequency(shape: tuple[int, int]) -> None:
-    rng = np.random.default_rng(5)
-    fy, fx = 0.11, 0.23
-    y, x = np.mgrid[: shape[0], : shape[1]]
-    delta = np.sin(2 * np.pi * (fy * y + fx * x)) + 0.1 * rng.normal(size=shape)
-    made = spectrum(ArraySource(delta), ArraySource(np.full(shape, 0.1)))
-    assert made is not None
-    rows, columns = made.frequencies
-    i, j = np.unravel_index(made.power.argmax(), made.power.shape)
-    found = np.array([rows[i], columns[j]]) * np.sign(columns[j])
-    np.testing.assert_allclose(found, (fy, fx), atol=0.6 / min(made.power.shape))
-
-
-def test_no_good_pixel_has_no_spectrum() -> None:
-    nothing = ArraySource(np.full((20, 30), np.nan))
-    assert spectrum(nothing, nothing) is None
-
-
-def test_the_detail_is_the_middle_pixel_by_pixel() -> None:
-    values = holed((501, 233))
-    made = detail(ArraySource(values), ArraySource(-values))
-    y0, x0 = made.start
-    assert made.delta.block == 1
-    for shown, whole in ((made.delta, values), (made.sigma, -values)):
-        np.testing.assert_array_equal(shown.image, whole[y0 : y0 + 96, x0 : x0 + 96])
-    assert abs(y0 + 48 - 250.5) <= 0.5
-    assert abs(x0 + 48 - 116.5) <= 0.5
-
-
-@pytest.mark.parametrize("most", [400, 13])
-def test_flags_are_counted_and_shown(most: int) -> None:
-    rng = np.random.default_rng(6)
-    values = (rng.random((67, 131)) < 0.01).astype(np.uint8) * rng.integers(1, 128, (67, 131))
-    values = values.astype(np.uint8)
-    made = summarise_flags(ArraySource(values), most)
-    assert made.masked == (values != 0).sum()
-    for bit in range(8):
-        assert made.counts[1 << bit] == (values >> bit & 1).sum()
-    side = made.block
-    for i, j in np.ndindex(made.image.shape):
-        block = values[i * side : (i + 1) * side, j * side : (j + 1) * side]
-        assert made.image[i, j] == np.bitwise_or.reduce(block, axis=None)
-        assert made.share[i, j] == pytest.approx((block != 0).mean())
+def test_corrected_maps_are_shown_beside_those_of_the_fit() -> None:
+    run = contents()
+    assert "corrected" not in fill("maps", run)
+    shown = fill("maps", replace(run, corrected=run.offsets))
+    assert shown.index("Map of δx.") < shown.index("Map of δx, corrected.")
+    assert shown.count("this is the map to use") == 1

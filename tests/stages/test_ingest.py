@@ -23,7 +23,7 @@ from pixcal.engine.run import Runtime
 from pixcal.model.errors import InputError, PlanError
 from pixcal.stages.ingest import stage as ingest
 from pixcal.stages.reduce.ingested import Ingested
-from pixcal.storage import fits_rows, frames
+from pixcal.storage import frame_decoding, frames
 from pixcal.storage.cube import ArrayWriter
 from pixcal.storage.sources import SourceFile
 
@@ -212,7 +212,9 @@ def test_every_frame_is_read_once(
     folder = describe(tmp_path / "acq")
     save_frames(folder / "v", noise((70, 300, 20)), name)
     read_bytes, unpacked = [], []
-    monkeypatch.setattr(fits_rows, "_read_exactly", counted(fits_rows._read_exactly, read_bytes))
+    monkeypatch.setattr(
+        frame_decoding, "_read_exactly", counted(frame_decoding._read_exactly, read_bytes)
+    )
     monkeypatch.setattr(ingest, "unpack", counted(ingest.unpack, unpacked))
     ingest.run(folder, tmp_path / "run", ingest.Config(), SYNC)
     assert sum(call[2].nbytes for call in read_bytes) == 70 * 300 * 20 * 2
@@ -385,7 +387,7 @@ def test_file_written_to_while_read_is_not_noted_as_done(
     acquisition: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Put back with its own time, the file looks as ever: what was read of it must be forgotten."""
-    file, read_exactly = acquisition / "v/f3.fits", fits_rows._read_exactly
+    file, read_exactly = acquisition / "v/f3.fits", frame_decoding._read_exactly
     body, facts = file.read_bytes(), file.stat()
 
     def disturbed(handle: Any, start: int, raw: NDArray[Any], path: Path) -> None:
@@ -394,7 +396,7 @@ def test_file_written_to_while_read_is_not_noted_as_done(
         read_exactly(handle, start, raw, path)
 
     with monkeypatch.context() as patch:
-        patch.setattr(fits_rows, "_read_exactly", disturbed)
+        patch.setattr(frame_decoding, "_read_exactly", disturbed)
         with pytest.raises(InputError, match=r"v/f3\.fits: changed while it was being read"):
             ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
     (journal,) = (tmp_path / "run").glob(".partial/*/journal.jsonl")

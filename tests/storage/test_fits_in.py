@@ -11,8 +11,9 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from pixcal.model.errors import InputError
-from pixcal.storage.fits_in import FrameFile, inspect
-from pixcal.storage.fits_rows import BAND, by_fact, read_rows, unpack
+from pixcal.storage.fits_in import inspect
+from pixcal.storage.frame_decoding import BAND, by_fact, read_rows, unpack
+from pixcal.storage.frame_file import FrameFile
 from pixcal.storage.sources import SourceFile
 
 EXTREMES = {
@@ -335,7 +336,7 @@ UNPACK = """
 import re, sys
 from pathlib import Path
 from pixcal.storage.fits_in import inspect
-from pixcal.storage.fits_rows import unpack, unpack_bytes
+from pixcal.storage.frame_decoding import unpack, unpack_bytes
 from pixcal.storage.sources import SourceFile
 def peak():
     # VmHWM, not ru_maxrss, which begins at the peak of the process that started this one.

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pixcal.storage.fits_in import FrameFile, SampleFormat
+from pixcal.storage.frame_file import FrameFile, SampleFormat
 from pixcal.storage.frames import columns, natural_key, tabulate
 from pixcal.storage.sources import SourceFile
 

@@ -1,295 +1,309 @@
-"""Reduce maps of any size to the contents of a figure, in one pass over bands of rows.
+"""Summary of the run: the precision reached, and the warnings."""
 
-A map of 46 Mpix does not fit on a page: it is shown as means of n × n pixels. Profiles and counts
-use all pixels; spectra use windows spread over the map.
-"""
-
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from math import gcd
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pixcal.kernels.robust import median_and_sigma
-from pixcal.model.arrays import F32, F64, I64, U8, Mask, Source
+from pixcal.report.contents import Contents, DiagnosisContents, SetContents
+from pixcal.report.diagnosis_words import level, listed, residual_gap
+from pixcal.report.text import NAMES, NO_OFFSETS, duration, number, share, unit, with_error
 
-SHOWN_PIXELS = 400  # most blocks along the longer side of a map on the page
-SAMPLE = 1_000_000  # most pixels of a histogram
-BAND_ROWS = 128  # rows read at a time: one row of chunks
-SEGMENT = 256  # longest side of the windows whose power spectra are averaged
-DETAIL = 96  # side of the window that is shown pixel by pixel when the whole map cannot be
+TARGET_PX = 5e-5  # target precision of a calibration (paper, section 4.2)
 
+# offset of the fibres that a laboratory would notice: twice its 2 cm (paper, section 5.2)
+FAR_MM = 40.0
 
-@dataclass(frozen=True)
-class ArraySource:
-    """A map in memory as a `Source`."""
-
-    values: NDArray[Any]
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Rows and columns."""
-        return self.values.shape
-
-    def read(self, *ranges: tuple[int, int]) -> NDArray[Any]:
-        """A block."""
-        return self.values[tuple(slice(*r) for r in ranges)]
+GOOD, CHECK, BAD = SEVERITY = ("good", "check", "bad")
 
 
-@dataclass(frozen=True)
-class RatioSource:
-    """One map over another; NaN where the divisor is not positive."""
+class Card(NamedTuple):
+    """One key number and its reference."""
 
-    above: Source
-    below: Source
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Rows and columns."""
-        return self.above.shape
-
-    def read(self, *ranges: tuple[int, int]) -> F32:
-        """A block."""
-        return _ratio(self.above.read(*ranges), self.below.read(*ranges)).astype(np.float32)
+    title: str
+    value: str
+    detail: str
+    level: str
 
 
-@dataclass(frozen=True)
-class Profile:
-    """Means of a map along one axis."""
+class Finding(NamedTuple):
+    """One sentence and its severity (``good``, ``check`` or ``bad``)."""
 
-    mean: F64  # (n,) NaN where no pixel is good
-    scatter: F64  # (n,) standard deviation of the pixels that were averaged
-    count: I64  # (n,) number of averaged pixels
+    level: str
+    text: str
 
 
-@dataclass(frozen=True)
-class MapSummary:
-    """Contents of a figure of a map."""
-
-    shape: tuple[int, int]  # of the map, pixels
-    block: int  # side of the blocks of pixels that `image` averages
-    image: F32  # (y, x) mean of the finite pixels of each block; NaN where there are none
-    # columns, rows: mean of each column (over y) and of each row (over x), in whole resolution
-    columns: Profile
-    rows: Profile
-    sample: F32  # (n,) finite pixels at regular steps: all of them up to `SAMPLE`
-    mean: float  # mean, std: of all finite pixels
-    std: float
-
-    @property
-    def median(self) -> float:
-        """Median of the sample; NaN where there is none."""
-        return float(np.median(self.sample)) if len(self.sample) else float("nan")
-
-    @property
-    def robust_std(self) -> float:
-        """Standard deviation by the median absolute deviation, which few outliers do not move."""
-        return median_and_sigma(self.sample)[1]
+def headline(contents: Contents) -> str:
+    """One sentence on the whole run."""
+    if not contents.sets:
+        if not contents.has_fringes:
+            return detector_headline(contents.detector.facts)
+        return (
+            "No offsets were measured: the fit has not been run. This page shows the results of "
+            "the detector frames."
+        )
+    parts = []
+    for offset in contents.offsets:
+        sigma = offset.sigma.median
+        if np.isfinite(sigma):
+            nm = sigma * contents.pitch_um * 1e3
+            parts.append(f"{NAMES[offset.name]} to {number(sigma, 2)} px ({number(nm, 2)} nm)")
+    if not parts:
+        return NO_OFFSETS
+    return f"The median pixel is calibrated in {' and '.join(parts)}."
 
 
-def block_side(shape: tuple[int, ...], most: int = SHOWN_PIXELS) -> int:
-    """Side of the square blocks that leave at most ``most`` along the longer axis."""
-    return max(1, -(-max(shape) // most))
+def detector_headline(facts: dict[str, Any]) -> str:
+    """Gain, read noise and full well in a sentence, measured where they could be."""
+    figures = facts.get("figures_of_merit") or {}
+    parts = []
+    for key, entry, name, of in (
+        ("conversion_gain", "gain_e_per_adu", "gain", "e⁻/ADU"),
+        ("read_noise", "read_noise_e", "read noise", "e⁻"),
+        ("full_well", "", "full well", "e⁻"),
+    ):
+        known = facts.get(entry, {})
+        if key in figures and not figures[key]["note"]:
+            value, error = figures[key]["value"], figures[key]["error"]
+            parts.append(f"{name} {with_error(value, error)} {of}")
+        elif known.get("measured") is not None:
+            parts.append(f"{name} {with_error(known['measured'], known.get('error'))} {of}")
+        elif known.get("used") is not None:
+            parts.append(f"{name} {number(known['used'], 4)} {of} (declared)")
+    return f"The detector: {', '.join(parts)}." if parts else "The detector was not measured."
 
 
-def block_mean(values: NDArray[Any], side: int) -> F32:
-    """Means (float32) of side × side pixels, smaller at the far edges, of finite values (y, x)."""
-    total, count = _block_sums(values, np.isfinite(values), side)
-    return _ratio(total, count).astype(np.float32)
+def cards(contents: Contents) -> Iterator[Card]:
+    """Numbers for the top of the page."""
+    for offset in contents.offsets:
+        sigma, spread = offset.sigma.median, number(offset.delta.robust_std, 3)
+        yield Card(
+            f"median σ of {NAMES[offset.name]}, as fitted",
+            f"{number(sigma, 3)} px",
+            f"{number(sigma * contents.pitch_um * 1e3, 3)} nm; rms of the offsets: {spread} px",
+            GOOD if np.isfinite(sigma) else BAD,
+        )
+    if contents.sets:
+        yield _bound_card(contents.sets)
+    measured = {s.name: s.allan for s in contents.sets if s.allan}
+    slopes = {name: allan for name, allan in measured.items() if allan.get("slope") is not None}
+    if slopes:
+        yield _allan_card(slopes)
+    if not contents.has_fringes:
+        yield from _detector_cards(contents.detector.facts)
+    if contents.diagnosis is not None:
+        yield _diagnosis_card(contents.diagnosis)
+    yield _mask_card(contents)
 
 
-def _block_sums(values: NDArray[Any], good: Mask, side: int) -> tuple[F64, F64]:
-    edges = [np.arange(0, n, side) for n in values.shape]
-
-    def sums(data: NDArray[Any]) -> F64:
-        across = np.add.reduceat(data, edges[1], axis=1, dtype=float)
-        return np.asarray(np.add.reduceat(across, edges[0], axis=0))
-
-    return sums(np.where(good, values, 0)), sums(good)
-
-
-def _ratio(above: NDArray[Any], below: NDArray[Any]) -> F64:
-    empty = np.full(above.shape, np.nan)
-    return np.asarray(np.divide(above, below, out=empty, where=below > 0))
-
-
-def bands(source: Source, side: int = 1) -> Iterator[tuple[int, NDArray[Any]]]:
-    """First row and values of bands of rows whose height is a multiple of ``side``."""
-    ny, nx = source.shape
-    height = side * max(1, BAND_ROWS // side)
-    for y0 in range(0, ny, height):
-        yield y0, source.read((y0, min(y0 + height, ny)), (0, nx))
+def _detector_cards(facts: dict[str, Any]) -> Iterator[Card]:
+    """Key numbers of a data sheet."""
+    figures = facts.get("figures_of_merit") or {}
+    for key in (
+        "conversion_gain",
+        "read_noise",
+        "full_well",
+        "dynamic_range",
+        "dsnu",
+        "prnu",
+        "dark_current",
+    ):
+        if key in figures:
+            f = figures[key]
+            value = f"{with_error(f['value'], f['error'])} {unit(f['unit'])}"
+            yield Card(f["title"], value, unit(f["note"]), GOOD)
 
 
-def summarise(source: Source, most: int = SHOWN_PIXELS) -> MapSummary:
-    """Summarise a map in at most ``most`` blocks a side; non-finite values are masked."""
-    ny, nx = source.shape
-    side = block_side((ny, nx), most)
-    step = _sample_step(ny * nx, nx)
-    image, samples = [], []
-    columns = np.zeros((3, nx))
-    rows = np.zeros((3, ny))
-    # Sums are relative to a first value, to avoid cancellation of nearly equal pixels.
-    origin: float | None = None
-    for y0, values in bands(source, side):
-        good = np.isfinite(values)
-        if origin is None and good.any():
-            origin = float(np.median(values[good]))
-        rest = np.where(good, values, origin or 0.0).astype(float) - (origin or 0.0)
-        total, count = _block_sums(rest, good, side)
-        image.append(_ratio(total, count) + (origin or 0.0))
-        columns += [good.sum(axis=0), rest.sum(axis=0), (rest**2).sum(axis=0)]
-        rows[:, y0 : y0 + len(values)] = [good.sum(axis=1), rest.sum(axis=1), (rest**2).sum(axis=1)]
-        picked = values.ravel()[-(y0 * nx) % step :: step]
-        samples.append(picked[np.isfinite(picked)].astype(np.float32))
-    count, total, square = columns.sum(axis=1)
-    mean = total / count if count else np.nan
-    variance = square / count - mean**2 if count else np.nan
-    return MapSummary(
-        shape=(ny, nx),
-        block=side,
-        image=np.concatenate(image).astype(np.float32),
-        columns=_profile(columns, origin or 0.0),
-        rows=_profile(rows, origin or 0.0),
-        sample=np.concatenate(samples),
-        mean=float(mean + (origin or 0.0)),
-        std=float(np.sqrt(np.maximum(variance, 0.0))),
+def _diagnosis_card(diagnosis: DiagnosisContents) -> Card:
+    verdict, gap = diagnosis.facts["verdict"], diagnosis.facts["gap"]
+    causes = ", ".join(c["effect"] for c in diagnosis.facts["causes"])
+    detail = "no significant difference" if verdict == "no gap" else f"The {residual_gap(gap)}"
+    if verdict == "no gap" and (
+        untested := sum(map(len, diagnosis.facts.get("not_tested", {}).values()))
+    ):
+        detail += f"; {untested} effects not tested for lack of frames"
+    return Card("diagnosis", verdict, f"{causes}. {detail}" if causes else detail, level(diagnosis))
+
+
+def _bound_card(sets: Sequence[SetContents]) -> Card:
+    ratios = {
+        s.name: _ratio(s.facts.get("sigma_median_px"), s.facts.get("crb_median_px")) for s in sets
+    }
+    return Card(
+        "σ / Cramér–Rao bound",
+        ", ".join(number(ratio, 4) for ratio in ratios.values()),
+        f"{', '.join(ratios)}; no unbiased estimate reaches less than 1",
+        max((_bound_level(ratio) for ratio in ratios.values()), key=SEVERITY.index),
     )
 
 
-def _sample_step(pixels: int, nx: int) -> int:
-    """Step through the pixels in reading order that visits all columns alike."""
-    step = -(-pixels // SAMPLE)
-    while gcd(step, nx) != 1:
-        step += 1
-    return step
-
-
-def _profile(sums: F64, origin: float) -> Profile:
-    count, total, square = sums
-    mean = _ratio(total, count)
-    with np.errstate(invalid="ignore"):
-        scatter = np.sqrt(np.maximum(_ratio(square, count) - mean**2, 0.0))
-    return Profile(mean + origin, scatter, count.astype(np.int64))
-
-
-@dataclass(frozen=True)
-class Spectrum:
-    """Power spectral density of a map."""
-
-    # (my, mx) px² per (cycle/px)², zero frequency in the middle; its mean is the map's variance
-    power: F64
-    white: float  # power expected from the map's errors alone, at every frequency
-    windows: int  # windows averaged
-
-    @property
-    def frequencies(self) -> tuple[F64, F64]:
-        """Frequencies along y and x, cycles/px."""
-        my, mx = self.power.shape
-        return np.fft.fftshift(np.fft.fftfreq(my)), np.fft.fftshift(np.fft.fftfreq(mx))
-
-    def radial(self) -> tuple[F64, F64]:
-        """Frequency and mean power of rings, up to half a cycle per pixel."""
-        fy, fx = self.frequencies
-        radius = np.hypot(fy[:, None], fx[None, :])
-        n = max(1, min(self.power.shape) // 2)
-        edges = np.linspace(0, 0.5, n + 1)
-        ring = np.digitize(radius.ravel(), edges) - 1
-        inside = (ring < n) & (radius.ravel() > 0)
-        count = np.bincount(ring[inside], minlength=n)
-        total = np.bincount(ring[inside], self.power.ravel()[inside], minlength=n)
-        middle = (edges[1:] + edges[:-1]) / 2
-        return middle[count > 0], total[count > 0] / count[count > 0]
-
-
-def spectrum(delta: Source, sigma: Source) -> Spectrum | None:
-    """Mean power spectrum of windows spread over a map (px, NaN masked); None without good pixels.
-
-    Each window is tapered (sine squared) and masked pixels count as zero, both of which the
-    normalisation takes into account; spectra of independent errors stay flat.
-    """
-    my, mx = (min(SEGMENT, n) for n in delta.shape)
-    taper = _taper(my)[:, None] * _taper(mx)[None, :]
-    power, white, norm, windows = np.zeros((my, mx)), 0.0, 0.0, 0
-    for y0 in _starts(delta.shape[0], my):
-        for x0 in _starts(delta.shape[1], mx):
-            place = (y0, y0 + my), (x0, x0 + mx)
-            values, error = delta.read(*place).astype(float), sigma.read(*place).astype(float)
-            good = np.isfinite(values) & np.isfinite(error)
-            weight = np.where(good, taper, 0.0)
-            if not weight.any():
-                continue
-            values, error = np.where(good, values, 0.0), np.where(good, error, 0.0)
-            values = weight * (values - (weight * values).sum() / weight.sum())
-            power += np.abs(np.fft.fft2(values)) ** 2
-            white += float((weight**2 * error**2).sum())
-            norm += float((weight**2).sum())
-            windows += 1
-    if not windows:
-        return None
-    return Spectrum(np.fft.fftshift(power) / norm, white / norm, windows)
-
-
-def _taper(n: int) -> F64:
-    return np.asarray(np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 2)
-
-
-def _starts(size: int, window: int) -> list[int]:
-    number = min(6, -(-size // window))
-    return [round(v) for v in np.linspace(0, size - window, number)]
-
-
-@dataclass(frozen=True)
-class Detail:
-    """The middle of a map, pixel by pixel."""
-
-    start: tuple[int, int]  # first row and column
-    delta: MapSummary
-    sigma: MapSummary
-
-
-def detail(delta: Source, sigma: Source) -> Detail:
-    """The middle of a map and of its errors."""
-    ny, nx = delta.shape
-    my, mx = min(DETAIL, ny), min(DETAIL, nx)
-    y0, x0 = (ny - my) // 2, (nx - mx) // 2
-    parts = (source.read((y0, y0 + my), (x0, x0 + mx)) for source in (delta, sigma))
-    return Detail((y0, x0), *(summarise(ArraySource(part), DETAIL) for part in parts))
-
-
-@dataclass(frozen=True)
-class FlagSummary:
-    """Contents of a figure of a map of flags."""
-
-    shape: tuple[int, int]
-    block: int
-    image: U8  # (y, x) flags of any pixel of each block
-    share: F32  # (y, x) share of each block's pixels that have any flag
-    masked: int  # pixels with any flag
-    counts: dict[int, int] = field(default_factory=dict)  # pixels that have each bit set
-
-
-def summarise_flags(source: Source, most: int = SHOWN_PIXELS) -> FlagSummary:
-    """Summarise a map of flags (uint8 bits)."""
-    ny, nx = source.shape
-    side = block_side((ny, nx), most)
-    columns = np.arange(0, nx, side)
-    image, share, by_value = [], [], np.zeros(256, np.int64)
-    for _, values in bands(source, side):
-        flags = values.astype(np.uint8)
-        across = np.bitwise_or.reduceat(flags, columns, axis=1)
-        image.append(np.bitwise_or.reduceat(across, np.arange(0, len(flags), side), axis=0))
-        share.append(block_mean((flags != 0).astype(float), side))
-        by_value += np.bincount(flags.ravel(), minlength=256)
-    value = np.arange(256)
-    counts = {1 << bit: int(by_value[(value >> bit & 1) == 1].sum()) for bit in range(8)}
-    return FlagSummary(
-        shape=(ny, nx),
-        block=side,
-        image=np.concatenate(image),
-        share=np.concatenate(share),
-        masked=int(by_value[1:].sum()),
-        counts=counts,
+def _allan_card(slopes: Mapping[str, Mapping[str, Any]]) -> Card:
+    knees = {name: s["knee_frames"] for name, s in slopes.items() if s.get("knee_frames")}
+    at = ", ".join(f"knee of {name} at {number(round(k))} frames" for name, k in knees.items())
+    white = all(_slope_is_white(s) for s in slopes.values())
+    return Card(
+        "Allan slope",
+        ", ".join(with_error(s["slope"], s.get("slope_err")) for s in slopes.values()),
+        f"{', '.join(slopes)}; white noise: −0.5; {at or 'no knee'}",
+        GOOD if white and not knees else CHECK,
     )
+
+
+def _slope_is_white(measured: Mapping[str, Any]) -> bool:
+    error = measured.get("slope_err") or 0.0
+    return bool(abs(measured["slope"] + 0.5) <= max(3 * error, 0.02))
+
+
+def _mask_card(contents: Contents) -> Card:
+    flags = contents.flags or contents.detector.flags
+    if flags is None:
+        return Card("masked pixels", "–", "not measured", CHECK)
+    whole = flags.shape[0] * flags.shape[1]
+    shown, part = f"{number(flags.masked)} of {number(whole)}", flags.masked / whole
+    return Card("masked pixels", share(flags.masked, whole), shown, _level(part, 0.01, 0.1))
+
+
+def findings(contents: Contents) -> list[Finding]:
+    """Findings, the most serious first."""
+    made = [(CHECK, text) for text in contents.warnings]
+    if contents.has_fringes and not contents.sets:
+        made.append((CHECK, "the fit has not been run: there are no maps of offsets yet"))
+    made += _of_sets(contents.sets)
+    consistency = (contents.fit or {}).get("sets_chi2_reduced")
+    if consistency is not None:
+        words = "fringe sets that measure the same offsets"
+        chi2 = f"reduced χ² {number(consistency)}"
+        if consistency < 1.2:
+            made.append((GOOD, f"{words} agree: {chi2}"))
+        else:
+            effect = "an effect that depends on the fringe vector is present"
+            made.append((BAD, f"{words} do not agree: {chi2}; {effect}"))
+    ranked = sorted(made, key=lambda f: -SEVERITY.index(f[0]))
+    # With a capital letter and a full stop.
+    return [Finding(level, text[:1].upper() + text[1:].rstrip(".") + ".") for level, text in ranked]
+
+
+# severity, sentence with a `{}` for each value, and the values
+Said = Iterator[tuple[str, str, *tuple[str, ...]]]
+
+
+def _of_sets(sets: Sequence[SetContents]) -> Iterator[tuple[str, str]]:
+    """Findings on all fringe sets, each sentence once."""
+    said: dict[tuple[str, str], dict[str, tuple[str, ...]]] = {}
+    for s in sets:
+        for severity, text, *values in _of_set(s.facts, s.allan):
+            said.setdefault((severity, text), {})[s.name] = tuple(values)
+    for (severity, text), by_set in said.items():
+        columns = list(zip(*by_set.values(), strict=True))
+        alike = all(len(set(column)) == 1 for column in columns)
+        for n, column in enumerate(columns):
+            each = [f"{v} for {name}" for name, v in zip(by_set, column, strict=True)]
+            columns[n] = column if alike else (listed(each),)
+        text = text.format(*(column[0] for column in columns)) if columns else text
+        names = "all sets" if len(by_set) == len(sets) > 1 else f"set {', '.join(by_set)}"
+        yield severity, f"{names}: {text}" if alike else text
+
+
+def _of_set(facts: dict[str, Any], allan: dict[str, Any] | None) -> Said:
+    ratio = _ratio(facts.get("sigma_median_px"), facts.get("crb_median_px"))
+    if ratio is not None:
+        text = "errors over the Cramér–Rao bound of the same frames: {}"
+        yield _bound_level(ratio), text, number(ratio, 4)
+    scale = facts.get("sigma_scale")
+    if scale is not None and abs(scale - 1) > 0.02:
+        yield (
+            _level(abs(scale - 1), 0.02, 0.3),
+            "variance of the residuals relative to the declared noise: {}. All errors were "
+            "multiplied by its square root, {}. Gain or read noise may be wrong, or the model "
+            "incomplete",
+            number(scale**2, 4),
+            number(scale, 4),
+        )
+    if facts.get("period_note"):
+        yield CHECK, facts["period_note"]
+    if facts.get("fringe_vector_moves"):
+        yield CHECK, "the fringe vector varies from frame to frame; it was fitted in each frame"
+    if facts.get("model") == "hyperbolic":
+        yield from _of_geometry(facts)
+    if facts.get("batch_note") and allan is None:
+        yield CHECK, facts["batch_note"]
+    yield from _of_allan(allan)
+    yield from _of_target(facts)
+
+
+def _of_geometry(facts: dict[str, Any]) -> Said:
+    """Why the fringes are hyperbolic, and whether the fitted bench geometry is plausible."""
+    if facts.get("evidence"):
+        yield GOOD, "the fringes were fitted as hyperbolic: {}", facts["evidence"]
+    else:
+        yield GOOD, "the fringes were fitted as hyperbolic"
+    geometry = facts.get("geometry", {})
+    for axis in ("x", "y"):
+        centre = geometry.get(f"centre_{axis}_mm")
+        nominal = geometry.get(f"centre_{axis}_nominal_mm")
+        if centre is None or nominal is None or abs(centre - nominal) <= FAR_MM:
+            continue
+        yield (
+            CHECK,
+            f"the fit places the fibres {{}} from their nominal position along {axis}. If the "
+            "bench is better aligned, the fit took smooth structure of the detector (such as "
+            "stitching) for curvature of the fringes. Compare with --model paraxial",
+            f"{number(abs(centre - nominal))} mm",
+        )
+
+
+def _of_allan(measured: dict[str, Any] | None) -> Said:
+    if measured is None:
+        yield CHECK, "the Allan deviation has not been measured"
+        return
+    for text in measured.get("warnings") or ():
+        yield CHECK, f"Allan deviation: {text}"
+    if measured.get("slope") is None:
+        return
+    law = "with the square root of the number of frames"
+    if (knee := measured.get("knee_frames")) is not None:
+        yield (
+            CHECK,
+            f"beyond {{}} the Allan deviation no longer falls {law}: the bench or the detector "
+            "drifts",
+            f"{number(round(knee))} frames",
+        )
+    elif _slope_is_white(measured):
+        yield GOOD, f"the Allan deviation falls {law}, over all averaging lengths"
+    else:
+        slope = with_error(measured["slope"], measured.get("slope_err"))
+        yield CHECK, "the Allan deviation falls with slope {}, not −0.5", slope
+
+
+def _of_target(facts: dict[str, Any]) -> Said:
+    """Frames needed for the target precision, if photon noise is the limit."""
+    sigma, frames = facts.get("sigma_median_px"), facts.get("frames")
+    target = f"{number(TARGET_PX, 1)} px"
+    if not sigma or not frames:
+        return
+    if sigma <= TARGET_PX:
+        yield GOOD, f"reaches the target of {target}"
+        return
+    needed = frames * (sigma / TARGET_PX) ** 2
+    pace = facts.get("batch_period_s")
+    time = f" ({duration(needed * pace)} at this rate)" if pace else ""
+    yield (
+        GOOD,
+        f"the target of {target} needs {{}}, if the square-root law holds that long",
+        f"{number(needed, 2)} frames{time}",
+    )
+
+
+def _ratio(above: float | None, below: float | None) -> float | None:
+    return above / below if above is not None and below else None
+
+
+def _bound_level(ratio: float | None) -> str:
+    """Severity of errors over their bound; below it the declared noise is too large."""
+    return CHECK if ratio is not None and ratio < 0.98 else _level(ratio, 1.1, 1.5)
+
+
+def _level(value: float | None, good: float, tolerable: float) -> str:
+    if value is None or not np.isfinite(value):
+        return CHECK
+    return GOOD if value <= good else CHECK if value <= tolerable else BAD

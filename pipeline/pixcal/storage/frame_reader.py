@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from pixcal.model.errors import InputError
 from pixcal.storage.cube import ArrayReader
-from pixcal.storage.fits_in import FrameFile, SampleFormat
-from pixcal.storage.fits_rows import BAND, read_rows
+from pixcal.storage.frame_decoding import BAND, read_rows
+from pixcal.storage.frame_file import FrameFile, SampleFormat
 from pixcal.storage.sources import SourceFile
 
 _CACHED = 1 << 20

@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 from pixcal.model.errors import InputError
 from pixcal.storage import fits_in
-from pixcal.storage.fits_in import FrameFile
-from pixcal.storage.pictures import inspect_picture, is_picture
+from pixcal.storage.frame_file import FrameFile
 from pixcal.storage.sources import HEADERS, SourceFile
+from pixcal.storage.tiff_png import inspect_picture, is_picture
 
 
 def inspect(source: SourceFile) -> FrameFile:

@@ -16,8 +16,8 @@ from pixcal.stages.fit.maps import write_maps
 from pixcal.stages.fit.sweep import load_run
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import ArrayReader
-from pixcal.storage.fits_facts import date_of
 from pixcal.storage.formats import STAGES
+from pixcal.storage.header_values import date_of
 from pixcal.storage.manifest import Manifest, read_json, write_json
 from pixcal.storage.products import Card, is_whole, write_map
 from pixcal.storage.stage import make, require, working

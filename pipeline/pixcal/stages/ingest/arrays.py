@@ -18,9 +18,9 @@ from pixcal.model.errors import DamagedError
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import ArrayWriter, create_array, create_group
 from pixcal.storage.cube_place import cubes_of
-from pixcal.storage.fits_in import FrameFile, SampleFormat
-from pixcal.storage.fits_rows import BAND, FACTS
 from pixcal.storage.folder import DISK_FULL
+from pixcal.storage.frame_decoding import BAND, FACTS
+from pixcal.storage.frame_file import FrameFile, SampleFormat
 from pixcal.storage.frame_reader import Columns, described
 from pixcal.storage.frames import tabulate
 from pixcal.storage.manifest import Manifest, damaged_files, digest, file_digest, read_json
@@ -48,7 +48,8 @@ def _finish(writer: ArrayWriter) -> str:
 class Writers:
     """Writers of an array of frames."""
 
-    catalogue: ArrayWriter  # (time, band, fact): what `pixcal.storage.fits_rows.read_rows` returns
+    # (time, band, fact): what `pixcal.storage.frame_decoding.read_rows` returns
+    catalogue: ArrayWriter
     samples: ArrayWriter | None  # (time, y, x) in ADU, if they are copied
     shape: tuple[int, ...]  # shape, dtype: of the frames
     dtype: str

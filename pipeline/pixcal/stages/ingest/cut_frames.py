@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pixcal.model.arrays import F64
-from pixcal.storage.fits_rows import BAND
+from pixcal.storage.frame_decoding import BAND
 from pixcal.storage.frames import Frame
 
 _NAMED = 3
@@ -18,7 +18,7 @@ def cut_from(array: str, facts: Mapping[str, F64], rows: int) -> list[int | None
     Noise makes an exactly constant last row unlikely. It is no evidence if most frames have one, or
     nearly: rows may be dark on a camera whose noise is cut off at zero or below one code. Saturated
     rows are no evidence either. ``array``: ``bias``, ``dark``, ``flat``, ``fringes/<set>``.
-    ``facts``: `pixcal.storage.fits_rows.FACTS` by name, (time, band). ``rows``: of a frame.
+    ``facts``: `pixcal.storage.frame_decoding.FACTS` by name, (time, band). ``rows``: of a frame.
     """
     share = facts["share"][:, -1]
     if np.quantile(share, 0.5, method="lower") >= 0.5:

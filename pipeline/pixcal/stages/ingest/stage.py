@@ -33,10 +33,17 @@ from pixcal.stages.steps import run_steps
 from pixcal.storage.artefact import Build, discard
 from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.cube_place import base_of, chosen_base, cubes_of
-from pixcal.storage.fits_in import FrameFile
-from pixcal.storage.fits_rows import BAND, by_fact, read_rows, rows_at_once, unpack, unpack_bytes
 from pixcal.storage.folder import transit_bytes
 from pixcal.storage.formats import STAGES
+from pixcal.storage.frame_decoding import (
+    BAND,
+    by_fact,
+    read_rows,
+    rows_at_once,
+    unpack,
+    unpack_bytes,
+)
+from pixcal.storage.frame_file import FrameFile
 from pixcal.storage.frame_reader import describe
 from pixcal.storage.frames import Frame, columns, inspect, tabulate
 from pixcal.storage.lock import lock

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from pixcal.model.arrays import F32, F64
 from pixcal.model.errors import InputError
 from pixcal.storage.cube import CHUNK
-from pixcal.storage.fits_in import FrameFile, SampleFormat, damaged_gzip
-from pixcal.storage.pictures import picture_bytes, unpack_picture
+from pixcal.storage.fits_in import damaged_gzip
+from pixcal.storage.frame_file import FrameFile, SampleFormat
 from pixcal.storage.sources import SourceFile, unreadable
+from pixcal.storage.tiff_png import picture_bytes, unpack_picture
 
 BAND = CHUNK[1]  # rows with a common checksum: those of a chunk
 

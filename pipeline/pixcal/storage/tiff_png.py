@@ -14,8 +14,8 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from pixcal.model.errors import InputError
-from pixcal.storage.fits_facts import Header, exposure_s, temperature_c, time_stamp_mjd
-from pixcal.storage.fits_in import FrameFile, SampleFormat
+from pixcal.storage.frame_file import FrameFile, SampleFormat
+from pixcal.storage.header_values import Header, exposure_s, temperature_c, time_stamp_mjd
 from pixcal.storage.sources import SourceFile
 
 # PNG; TIFF and BigTIFF in both byte orders.
