@@ -22,8 +22,8 @@ from pixcal.report.diagnosis_figures import Bar, curves_figure, gap_figure
 from pixcal.report.diagnosis_words import percent, place, places, with_interval
 from pixcal.report.drawing import png
 from pixcal.report.page import fill, render
+from pixcal.report.summary import cards
 from pixcal.report.tables import provenance
-from pixcal.report.verdict import cards
 from pixcal.storage.manifest import Manifest
 
 NOTICED = 3.7

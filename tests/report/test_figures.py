@@ -15,7 +15,7 @@ from pixcal.report import detector_figures, map_figures, map_panels, set_figures
 from pixcal.report.colours import DIVERGING, MASKED, PALETTE, SEQUENTIAL
 from pixcal.report.contents import MapContents, SetContents
 from pixcal.report.drawing import png, span_scale, symmetric_scale, unit_for
-from pixcal.report.summary import (
+from pixcal.report.map_summary import (
     ArraySource,
     MapSummary,
     Spectrum,

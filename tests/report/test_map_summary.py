@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pixcal.report.summary import (
+from pixcal.report.map_summary import (
     SAMPLE,
     ArraySource,
     RatioSource,

@@ -97,7 +97,7 @@ class OffsetMap:
         # Here: matplotlib takes longer to import than all else.
         from pixcal.report.drawing import png
         from pixcal.report.map_figures import offsets
-        from pixcal.report.summary import ArraySource, summarise
+        from pixcal.report.map_summary import ArraySource, summarise
 
         delta, sigma = (summarise(ArraySource(values)) for values in (self.delta, self.sigma))
         return Picture(png(offsets(self.name, delta, sigma)))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pixcal.model.arrays import F64
-from pixcal.report.summary import Detail, FlagSummary, MapSummary, Spectrum
+from pixcal.report.map_summary import Detail, FlagSummary, MapSummary, Spectrum
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class DiagnosisContents:
     # significance (sigma) above which a statistic differs; that of the curves is corrected for
     # the number of statistics
     noticed: float
-    settled: bool = False  # whether no cause requires action
+    nothing_to_do: bool = False  # whether no cause requires action
 
 
 @dataclass(frozen=True)

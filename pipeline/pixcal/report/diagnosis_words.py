@@ -47,7 +47,7 @@ def level(diagnosis: DiagnosisContents) -> str:
     verdict = diagnosis.facts["verdict"]
     if verdict == "unexplained":
         return "bad"
-    settled = verdict == "no gap" or (verdict == "explained" and diagnosis.settled)
+    settled = verdict == "no gap" or (verdict == "explained" and diagnosis.nothing_to_do)
     return "good" if settled else "check"
 
 

@@ -22,7 +22,7 @@ from PIL import Image
 
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.report.colours import DIVERGING, INK, PALETTE, SEQUENTIAL
-from pixcal.report.summary import MapSummary
+from pixcal.report.map_summary import MapSummary
 from pixcal.report.text import exact
 
 WIDE = 10.4  # width of a figure that takes the whole page, inches

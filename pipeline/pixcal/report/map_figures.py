@@ -25,7 +25,7 @@ from pixcal.report.drawing import (
     unit_for,
 )
 from pixcal.report.map_panels import folded
-from pixcal.report.summary import MapSummary, Profile, Spectrum
+from pixcal.report.map_summary import MapSummary, Profile, Spectrum
 from pixcal.report.text import SYMBOLS
 
 MEANS_DRAWN = 800  # most means of a profile that are drawn one by one

@@ -19,7 +19,7 @@ from pixcal.model.flags import PixelFlag
 from pixcal.report.colours import FLAGS, LEVELS, MARKS, MASKED, SEQUENTIAL, SEVERAL, UNFLAGGED
 from pixcal.report.contents import MapContents, SetContents
 from pixcal.report.drawing import block_note, covered, fit_box, span_scale, unit_for
-from pixcal.report.summary import FlagSummary, MapSummary, Spectrum
+from pixcal.report.map_summary import FlagSummary, MapSummary, Spectrum
 from pixcal.report.text import SYMBOLS, exact
 
 Ticks = list[tuple[float, str]]  # places (page px) and their numbers

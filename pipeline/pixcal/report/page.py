@@ -16,9 +16,9 @@ from pixcal.report import (
     map_figures,
     map_panels,
     set_figures,
+    summary,
     tables,
     text,
-    verdict,
 )
 from pixcal.report.contents import Contents
 from pixcal.report.drawing import png
@@ -74,7 +74,7 @@ def fill(template: str, contents: Contents, **values: Any) -> str:
         loader=PackageLoader("pixcal.report"), autoescape=True, undefined=StrictUndefined, **blocks
     )
     environment.filters["not_tested"] = text.not_tested
-    environment.filters |= vars(verdict) | vars(diagnosis_words) | vars(tables)
+    environment.filters |= vars(summary) | vars(diagnosis_words) | vars(tables)
     environment.globals |= {
         "draw": _draw,
         "figures": FIGURES,

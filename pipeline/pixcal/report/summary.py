@@ -184,7 +184,7 @@ def findings(contents: Contents) -> list[Finding]:
 
 
 # severity, sentence with a `{}` for each value, and the values
-Said = Iterator[tuple[str, str, *tuple[str, ...]]]
+FindingTemplate = tuple[str, str, *tuple[str, ...]]
 
 
 def _of_sets(sets: Sequence[SetContents]) -> Iterator[tuple[str, str]]:
@@ -204,7 +204,7 @@ def _of_sets(sets: Sequence[SetContents]) -> Iterator[tuple[str, str]]:
         yield severity, f"{names}: {text}" if alike else text
 
 
-def _of_set(facts: dict[str, Any], allan: dict[str, Any] | None) -> Said:
+def _of_set(facts: dict[str, Any], allan: dict[str, Any] | None) -> Iterator[FindingTemplate]:
     ratio = _ratio(facts.get("sigma_median_px"), facts.get("crb_median_px"))
     if ratio is not None:
         text = "errors over the Cramér–Rao bound of the same frames: {}"
@@ -231,7 +231,7 @@ def _of_set(facts: dict[str, Any], allan: dict[str, Any] | None) -> Said:
     yield from _of_target(facts)
 
 
-def _of_geometry(facts: dict[str, Any]) -> Said:
+def _of_geometry(facts: dict[str, Any]) -> Iterator[FindingTemplate]:
     """Why the fringes are hyperbolic, and whether the fitted bench geometry is plausible."""
     if facts.get("evidence"):
         yield GOOD, "the fringes were fitted as hyperbolic: {}", facts["evidence"]
@@ -252,7 +252,7 @@ def _of_geometry(facts: dict[str, Any]) -> Said:
         )
 
 
-def _of_allan(measured: dict[str, Any] | None) -> Said:
+def _of_allan(measured: dict[str, Any] | None) -> Iterator[FindingTemplate]:
     if measured is None:
         yield CHECK, "the Allan deviation has not been measured"
         return
@@ -275,7 +275,7 @@ def _of_allan(measured: dict[str, Any] | None) -> Said:
         yield CHECK, "the Allan deviation falls with slope {}, not −0.5", slope
 
 
-def _of_target(facts: dict[str, Any]) -> Said:
+def _of_target(facts: dict[str, Any]) -> Iterator[FindingTemplate]:
     """Frames needed for the target precision, if photon noise is the limit."""
     sigma, frames = facts.get("sigma_median_px"), facts.get("frames")
     target = f"{number(TARGET_PX, 1)} px"

@@ -6,7 +6,7 @@ from typing import Any
 
 from pixcal.model.flags import PixelFlag
 from pixcal.report.contents import Contents, SetContents
-from pixcal.report.summary import FlagSummary, MapSummary
+from pixcal.report.map_summary import FlagSummary, MapSummary
 from pixcal.report.text import (
     date_of_mjd,
     duration,

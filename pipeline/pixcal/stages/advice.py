@@ -15,7 +15,8 @@ from pixcal.storage.stage import require, without_fringes
 
 Json = Mapping[str, Any]
 
-MATTERS = 0.3  # share of SIGMA from which an error that SIGMA does not hold limits a map
+# share of SIGMA from which an error that SIGMA does not hold limits a map
+MIN_BIAS_OVER_SIGMA = 0.3
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Advice:
 
     sentences: tuple[str, ...]  # which maps to use, and what limits them; none without maps
     rows: tuple[tuple[str, ...], ...]  # a header, and a row for each cause; empty without any
-    settled: bool = True  # whether no cause asks for anything to be done
+    nothing_to_do: bool = True  # whether no cause asks for anything to be done
 
 
 def advice(run_dir: Path) -> Advice:
@@ -52,15 +53,15 @@ def advice(run_dir: Path) -> Advice:
     rows = (header, *rows) if rows else ()
     if not sigma:
         rows = tuple((*row[:3], *row[4:]) for row in rows)
-    settled = all(fringes and _settled(c, correction, bool(sigma)) for c in causes)
+    nothing_to_do = all(fringes and _nothing_to_do(c, correction, bool(sigma)) for c in causes)
     if not fit["outputs"]:
-        return Advice((), rows, settled)
+        return Advice((), rows, nothing_to_do)
     if not sigma:
-        return Advice((NO_OFFSETS,), rows, settled)
+        return Advice((NO_OFFSETS,), rows, nothing_to_do)
     names = [path.name for path in maps_to_use(run_dir).values()]
     it_needs = "They need" if len(names) > 1 else "It needs"
-    use = f"Use {' and '.join(names)}{_as_what(diagnosis, correction, it_needs)}."
-    return Advice((use, limit(sigma, diagnosis, correction)), rows, settled)
+    use = f"Use {' and '.join(names)}{_correction_clause(diagnosis, correction, it_needs)}."
+    return Advice((use, limit(sigma, diagnosis, correction)), rows, nothing_to_do)
 
 
 def maps_to_use(run_dir: Path) -> dict[str, Path]:
@@ -100,7 +101,7 @@ def _sigma(fit: Json, correction: Json | None) -> dict[str, float]:
     return {name: sigma for name, sigma in each.items() if sigma and math.isfinite(sigma)}
 
 
-def _as_what(diagnosis: Json | None, correction: Json | None, it_needs: str) -> str:
+def _correction_clause(diagnosis: Json | None, correction: Json | None, it_needs: str) -> str:
     if diagnosis is None:
         return " as fitted. No diagnosis was made, so biases are unknown"
     if correction is not None and correction["outputs"]:
@@ -131,7 +132,7 @@ def limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json |
         if not (made and cause["on_map"]["action"] == "corrected")
     }
     largest = max(biases, key=lambda name: biases[name], default="")
-    if biases.get(largest, 0.0) > MATTERS * least:
+    if biases.get(largest, 0.0) > MIN_BIAS_OVER_SIGMA * least:
         moved = f"{number(biases[largest], 2)} px rms"
         return f"Limited by {largest}, which moves offsets by {moved}; the noise is {noise}."
     if diagnosis is not None and diagnosis["verdict"] in ("unexplained", "partly explained"):
@@ -142,7 +143,7 @@ def limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json |
         return f"The noise is {noise}. {' and '.join(unknown)} may bias the maps."
     sets = made["sets"].values() if made else ()
     kept = max((e for s in sets for e in s["parameter_error_px"].values() if e), default=0.0)
-    if kept > MATTERS * least:
+    if kept > MIN_BIAS_OVER_SIGMA * least:
         return (
             f"Limited by noise: {noise}, including up to {number(kept, 2)} px rms from the "
             "correction."
@@ -165,7 +166,7 @@ def _treated(cause: Json, correction: Json | None) -> Json | None:
     return next((e for e in entries if e["effect"] == cause["effect"]), None)
 
 
-def _settled(cause: Json, correction: Json | None, with_maps: bool) -> bool:
+def _nothing_to_do(cause: Json, correction: Json | None, with_maps: bool) -> bool:
     """Whether nothing remains to be done about an effect."""
     action, treated = cause["on_map"]["action"], _treated(cause, correction)
     done = not with_maps or (treated is not None and treated["treatment"] in CORRECTED)
@@ -184,7 +185,7 @@ def _action(
     if action == "corrected":
         if not with_maps:
             text = "run 'pixcal fit RUN --with-diagnosis' for corrected maps"
-        elif _settled(cause, correction, with_maps):
+        elif _nothing_to_do(cause, correction, with_maps):
             text = "maps corrected"
         else:
             text = "NOT corrected: run 'pixcal fit RUN --with-diagnosis'"

@@ -12,7 +12,7 @@ from scipy.special import log_ndtr
 from pixcal.effects import effects
 from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.test_statistics.gap import CHANCE, sigmas_among, sigmas_of
+from pixcal.estimators.test_statistics.gap import FALSE_ALARM_RATE, sigmas_among, sigmas_of
 from pixcal.model.arrays import Source
 from pixcal.model.config import result_options
 from pixcal.model.options import Report as Config
@@ -24,8 +24,7 @@ from pixcal.report.contents import (
     MapContents,
     SetContents,
 )
-from pixcal.report.page import render
-from pixcal.report.summary import (
+from pixcal.report.map_summary import (
     BAND_ROWS,
     DETAIL,
     SAMPLE,
@@ -36,6 +35,7 @@ from pixcal.report.summary import (
     summarise,
     summarise_flags,
 )
+from pixcal.report.page import render
 from pixcal.stages.advice import advice, maps_to_use
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import ArrayReader
@@ -97,7 +97,7 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
         ),
         flags=results.get("flags/products"),
         diagnosis=(
-            _diagnosis(run_dir / "diagnose", settled=summary.settled)
+            _diagnosis(run_dir / "diagnose", nothing_to_do=summary.nothing_to_do)
             if "diagnose" in manifests
             else None
         ),
@@ -175,14 +175,15 @@ def _set(
 # The diagnosis
 
 
-def _diagnosis(folder: Path, *, settled: bool) -> DiagnosisContents:
+def _diagnosis(folder: Path, *, nothing_to_do: bool) -> DiagnosisContents:
     facts, curves = read_json(folder / "diagnosis.json"), read_json(folder / "curves.json")
     for curve in curves:
         # In the file the significance is that of the statistic by itself.
         for key in ("significance", "significance_after"):
             curve[key] = sigmas_among(float(log_ndtr(-curve[key])), facts["statistics"])
     titles = {name: kind.title for name, kind in effects().items()}
-    return DiagnosisContents(facts, curves, titles, sigmas_of(np.log(CHANCE)), settled)
+    limit = sigmas_of(np.log(FALSE_ALARM_RATE))
+    return DiagnosisContents(facts, curves, titles, limit, nothing_to_do)
 
 
 # Words and tables

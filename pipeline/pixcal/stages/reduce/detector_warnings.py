@@ -15,24 +15,24 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
     ``gain``: the used gain (e-/ADU). ``saturation``: level at which flats saturate (ADU), if not
     declared.
     """
-    found = []
+    warnings = []
     if saturation is not None:
-        found.append(
+        warnings.append(
             f"flats saturate at {saturation:.0f} ADU, where their samples pile up: "
             f"{(~summary.usable).sum()} of {len(summary.usable)} levels are left out of gain and "
             "linearity; declare detector.saturation_adu if it is another level"
         )
     if summary.gain is not None:
-        found += _of_gain(summary.gain, summary, gain)
+        warnings += _gain_warnings(summary.gain, summary, gain)
     if summary.full.any():
         assert summary.well is not None
-        found.append(
+        warnings.append(
             f"the wells are full at {summary.well[0]:.0f} ADU above bias: {summary.full.sum()} of "
             f"{len(summary.levels)} levels of flats reach that level, or nearly, and are left out "
             "of gain and linearity"
         )
     if summary.linearity is not None and summary.linearity.max_deviation > _LINEARITY:
-        found.append(
+        warnings.append(
             "the levels of the flats deviate by up to "
             f"{100 * summary.linearity.max_deviation:.2g} % from a straight line over exposure "
             "time: the response of all pixels, or the lamp, is not linear; no pixel is flagged for "
@@ -43,31 +43,31 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
     if measured is not None and summary.before_rounding is not None:
         value, error = measured
         if abs(value - noise) > max(3 * error, 0.1 * noise):
-            found.append(
+            warnings.append(
                 f"the read noise is {value:.4g} ± {error:.2g} e- "
                 f"({summary.before_rounding[0]:.4g} ADU), not the {noise:g} of "
                 "detector.read_noise_e: the measured one is used"
             )
-    return found
+    return warnings
 
 
-def _of_gain(fit: GainFit, summary: Summary, used: float) -> list[str]:
-    found, declared, step = [], summary.declared.gain_e_per_adu, summary.step
+def _gain_warnings(fit: GainFit, summary: Summary, used: float) -> list[str]:
+    warnings, declared, step = [], summary.declared.gain_e_per_adu, summary.step
     if fit.chi2_reduced > _ROUGH:
-        found.append(
+        warnings.append(
             "the points of the photon-transfer curve deviate from a smooth curve by more than "
             f"their noise (reduced chi-square {fit.chi2_reduced:.3g}); the error of the gain, "
             f"{100 * fit.error / fit.gain:.2g} %, includes this; possible causes: amplifiers of "
             "different gain, missing codes, or a flickering lamp"
         )
     if fit.step:
-        found.append(
+        warnings.append(
             f"the photon-transfer curve is not smooth above {fit.levels[1]:.0f} ADU, as in a "
             "camera that reads bright pixels at another gain (dual gain, HDR): the gain given is "
             "that below this level; gain and noise of brighter pixels are not measured"
         )
     if fit.without_dark:
-        found.append(
+        warnings.append(
             "frames without light differ in noise from the photon-transfer curve at level zero: "
             "the gain is that of the flats alone; possible causes: the camera clips its black "
             "level, or reads dark frames in another way"
@@ -75,18 +75,18 @@ def _of_gain(fit: GainFit, summary: Summary, used: float) -> list[str]:
     clear = [lag for lag, sigmas in fit.neighbours.items() if sigmas > SHARED]
     if clear:
         lags = ", ".join(f"({y}, {x})" for y, x in clear)
-        found.append(
+        warnings.append(
             "crosstalk: the noise of neighbours in the flats is correlated at (rows, columns) "
             f"{lags}; the gain includes it"
         )
     if fit.uneven:
-        found.append(
+        warnings.append(
             "parts of the flats vary in brightness from frame to frame, as rows of a rolling "
             "shutter do under a flickering lamp (mains, dimmed LED). This biases gain and "
             "diagnosis; take flats with a steady (DC) lamp, or exposures of many periods"
         )
     if fit.curved:
-        found.append(
+        warnings.append(
             "the photon-transfer curve is not straight: variance over level changes by "
             f"{100 * fit.curved:+.2g} % up to {fit.levels[1]:.0f} ADU; the gain is "
             "that at level zero; possible causes: a nonlinear response, or the brighter-fatter "
@@ -95,11 +95,11 @@ def _of_gain(fit: GainFit, summary: Summary, used: float) -> list[str]:
     value, error = fit.gain, fit.error
     if declared is None:
         return [
-            *found,
+            *warnings,
             f"no gain is declared: the flats give the gain used, {used:.4g} ± {error:.2g} e-/ADU",
         ]
     if abs(value - declared) > max(3 * error, 0.02 * declared):
-        found.append(
+        warnings.append(
             f"photon transfer gives a gain of {value:.4g} ± {error:.2g} e-/ADU, not the "
             f"{declared:g} of detector.gain_e_per_adu: "
             + (
@@ -114,4 +114,4 @@ def _of_gain(fit: GainFit, summary: Summary, used: float) -> list[str]:
                 else "the measured value is used"
             )
         )
-    return found
+    return warnings
