@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 import pixcal
 from pixcal import api
-from pixcal.estimators.fringe_fit.models import fringe_models
+from pixcal.estimators.fringe_fit.shapes import fringe_models
 from pixcal.stages import (
     allan,
     astrometry,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pixcal.estimators.fringe_fit.fringes import wrapped
-from pixcal.estimators.fringe_fit.models import Start, fringe_models
+from pixcal.estimators.fringe_fit.shapes import Start, fringe_models
 from pixcal.estimators.fringe_fit.tile_sums import tile_plane, unwrap
 from pixcal.kernels.optics import Geometry, fringe_vector, phase
 

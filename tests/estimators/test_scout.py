@@ -70,8 +70,8 @@ def test_error_is_at_the_bound_with_everything_free(bench):
 def test_turns_left_out_would_change_nothing_that_noise_does_not_hide(bench, monkeypatch, motion):
     found, turns = {}, {}
     refine = Scout._refine
-    for settled in (scouting.SETTLED, 0.0):
-        monkeypatch.setattr(scouting, "SETTLED", settled)
+    for settled in (scouting.CONVERGED, 0.0):
+        monkeypatch.setattr(scouting, "CONVERGED", settled)
         taken = []
         monkeypatch.setattr(Scout, "_refine", lambda *a, n=taken: n.append(1) or refine(*a))
         scout, codes = scout_of(bench(shape=(67, 83), frames=250, vector_noise=motion))

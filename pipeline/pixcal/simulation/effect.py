@@ -166,7 +166,7 @@ class Effect(ForwardModel):
     is_gain : bool
         Whether it scales all samples alike, which photon transfer measures.
     fit_model : str
-        Shape of the fringes (`pixcal.estimators.fringe_fit.models`) that absorbs it.
+        Shape of the fringes (`pixcal.estimators.fringe_fit.shapes`) that absorbs it.
     smooth_degree : int
         Degree of the surfaces that maps have for other reasons; used with ``starts``.
     """

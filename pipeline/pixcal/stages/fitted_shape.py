@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pixcal.estimators.fringe_fit.models import FringeShape
-from pixcal.estimators.fringe_fit.models.hyperbolic import Hyperbolic
-from pixcal.estimators.fringe_fit.models.paraxial import Paraxial
+from pixcal.estimators.fringe_fit.shapes import FringeShape
+from pixcal.estimators.fringe_fit.shapes.hyperbolic import Hyperbolic
+from pixcal.estimators.fringe_fit.shapes.paraxial import Paraxial
 from pixcal.kernels.optics import PARAMETERS, Geometry, paraxial_vector
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.errors import InputError

@@ -12,7 +12,7 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.storage.manifest import MANIFEST, read_json
 
-# the shape of fringes (`pixcal.estimators.fringe_fit.models`) beside straight ones
+# the shape of fringes (`pixcal.estimators.fringe_fit.shapes`) beside straight ones
 HYPERBOLIC = "hyperbolic"
 SUFFIX = "_corrected"  # of the names of the corrected products
 IN_CORRECTED = "in the corrected fit"

@@ -13,7 +13,7 @@ MAX_SIGMA_RAD = 0.2
 # light is never negative: fringes of a higher visibility have a wrong bias, and the variance of
 # their samples is unknown
 MAX_VISIBILITY = 1.05
-CHANCE = 6.0  # standard errors by which noise may exceed this limit
+NOISE_MARGIN_SIGMA = 6.0  # standard errors by which noise may exceed this limit
 
 
 def fit_flags(
@@ -45,7 +45,7 @@ def fit_flags(
         # Noise that raises an amplitude lowers its phase error: use the median visibility.
         usual = np.nanmedian((alpha / iota)[good]) if good.any() else np.float32(1.0)
         good &= sigma * alpha < MAX_SIGMA_RAD * usual * iota
-        good &= alpha < MAX_VISIBILITY * iota + CHANCE * sigma * alpha
+        good &= alpha < MAX_VISIBILITY * iota + NOISE_MARGIN_SIGMA * sigma * alpha
     flags[~good] |= np.uint8(PixelFlag.BAD_FIT)
     return flags
 

@@ -17,7 +17,7 @@ Phases = TypeVar("Phases", F32, F64)
 MIN_FRINGES = 1.5  # fewest fringes across a window for the search of a peak
 # fewest fringes for maps with correct errors: with 1.3 to 1.8 the gauge mistakes true offsets for
 # fringes, and errors were 2 to 4 times SIGMA (measured on 80 x 80 px)
-HONEST_FRINGES = 1.95
+MIN_FRINGES_FOR_MAPS = 1.95
 # shortest period along x and y: below 2 px fringes are aliased to wider ones of another direction,
 # and nominal vectors are accurate to some 10 %
 SHORTEST_PX = 2.2
@@ -149,10 +149,10 @@ def _refined(light: F64, start: F64) -> F64:
         f = along @ (light @ across.T.real + 1j * (light @ across.T.imag))
         first = np.stack([f[:, 0, 1], f[:, 1, 0]])
         second = np.array([[f[:, 0, 2], f[:, 1, 1]], [f[:, 1, 1], f[:, 2, 0]]])
-        bend = (first @ first.conj().T + second @ f[:, 0, 0].conj()).real
-        if np.linalg.eigvalsh(bend)[-1] >= 0:
+        curvature = (first @ first.conj().T + second @ f[:, 0, 0].conj()).real
+        if np.linalg.eigvalsh(curvature)[-1] >= 0:
             break
-        step = -np.linalg.solve(bend, (first @ f[:, 0, 0].conj()).real)
+        step = -np.linalg.solve(curvature, (first @ f[:, 0, 0].conj()).real)
         k = k + step
         if np.abs(step).max() < RESOLVED:
             break

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixcal.estimators.fringe_fit.gauge import FRINGE_MODES
-from pixcal.estimators.fringe_fit.models import FringeShape
+from pixcal.estimators.fringe_fit.shapes import FringeShape
 from pixcal.estimators.fringe_fit.tile_sums import (
     N_LOCAL,
     POWERS,

@@ -16,7 +16,7 @@ from scipy.linalg import eigh
 
 from pixcal.estimators.fringe_fit.fit_flags import excess_scatter, usual_chi2
 from pixcal.estimators.fringe_fit.fringes import (
-    HONEST_FRINGES,
+    MIN_FRINGES_FOR_MAPS,
     FrameParameters,
     find_fringe_vector,
     grid,
@@ -32,30 +32,31 @@ from pixcal.model.errors import InputError
 Pixels = Indices | slice
 # flat numbers of pixels of a tile, and their codes (t, p)
 Samples = tuple[Indices, U16]
-Each = Callable[[Callable[[int], Any], Sequence[int]], list[Any]]
+MapFunction = Callable[[Callable[[int], Any], Sequence[int]], list[Any]]
 
 # pixels used to solve frames: the frames' noise then adds some 2e-4 to a map's variance
 MAX_PIXELS = 20_000
 # interval of these pixels for the start, which only gives weights, and the point at which a moving
 # phase is linearised
-FEW = 4
+SUBSAMPLE = 4
 MIN_FRAMES = 6  # three unknowns per pixel, and as many again to test the fit
 # departure from the visibility of a tile's pixels, over the usual one, above which a pixel is
 # excluded; some 8 standard deviations
 OUTLIER_VISIBILITY = 12.0
-MANY = 3.0  # ratio of mean light to that of most pixels, or inverse, above which one is excluded
+# ratio of mean light to that of most pixels, or inverse, above which one is excluded
+MAX_LIGHT_RATIO = 3.0
 # largest median distance of the pixels' phases from smooth ones; random phases have 1.57
-FOLLOWS_RAD = 0.8
+MAX_PHASE_SCATTER_RAD = 0.8
 ITERATIONS, ITERATIONS_MOVING = 3, 8  # most iterations of pixels from frames, frames from pixels
 # Change of the frames by an iteration, over their errors, at which it ends. Each iteration halves
 # it, so that the remainder is below this share of the frames' noise, which is small itself.
-SETTLED = 0.02
+CONVERGED = 0.02
 # least power of the weakest of three components over the next, which is noise: frames of only two
 # phases have no third component, and noise would be mistaken for the fringes' shape
 ABOVE_NOISE = 1.5
 
 
-def in_turn(function: Callable[[int], Any], numbers: Sequence[int]) -> list[Any]:
+def serial_map(function: Callable[[int], Any], numbers: Sequence[int]) -> list[Any]:
     """Call a function with each of the numbers, one after the other."""
     return [function(n) for n in numbers]
 
@@ -71,7 +72,7 @@ class Scout:
     coding: Coding
     nominal: tuple[float, float]
     reference: tuple[float, float]
-    each: Each = field(default=in_turn, repr=False)
+    each: MapFunction = field(default=serial_map, repr=False)
     k: tuple[float, float] = (0.0, 0.0)  # fringe vector of the first tile, rad/px
     # moving, moving_significance: whether the fringe vector changes from frame to frame, and
     # the test's statistic
@@ -134,7 +135,7 @@ class Scout:
         matrix: F64 = np.zeros((3, 3))
         right: F64 = np.zeros((len(samples[0][1]), 3))
         for theta, (picked, codes) in zip(self.theta, samples, strict=True):
-            few = _scattered(len(picked), -(-len(picked) // FEW))
+            few = _scattered(len(picked), -(-len(picked) // SUBSAMPLE))
             design = theta.reshape(3, -1)[:, picked[few]]
             matrix = matrix + design @ design.T
             right = right + self._electrons(codes, few) @ design.T.astype(np.float32)
@@ -176,7 +177,7 @@ class Scout:
             level = np.concatenate([self._electrons(codes[n], p).mean(axis=0) for p in parts])
             level = level.reshape(tile.shape)
             usual = np.median(level[tile.good])
-            tile.good &= (level > usual / MANY) & (level < MANY * usual)
+            tile.good &= (level > usual / MAX_LIGHT_RATIO) & (level < MAX_LIGHT_RATIO * usual)
 
         self.each(drop, range(len(self.tiles)))
 
@@ -232,16 +233,16 @@ class Scout:
         away = np.abs(np.angle(phasor * smooth.map.conj()))[tile.good]
         (kx, ky), (ny, nx) = smooth.k, tile.shape
         turned = np.hypot((kx - self.k[0]) * nx, (ky - self.k[1]) * ny)
-        if not np.median(away) < FOLLOWS_RAD or turned > np.pi:
+        if not np.median(away) < MAX_PHASE_SCATTER_RAD or turned > np.pi:
             raise InputError(
                 "no fringes found in the pixels; check the frames, the bias frames, and which "
                 "files the set lists"
             )
         across = float(np.hypot(kx * nx, ky * ny)) / (2 * np.pi)
-        if across < HONEST_FRINGES:
+        if across < MIN_FRINGES_FOR_MAPS:
             raise InputError(
-                f"{across:.1f} fringes across {nx} x {ny} px: at least {HONEST_FRINGES:g} are "
-                "needed; use a longer baseline or a larger window"
+                f"{across:.1f} fringes across {nx} x {ny} px: at least {MIN_FRINGES_FOR_MAPS:g} "
+                "are needed; use a longer baseline or a larger window"
             )
 
     @staticmethod
@@ -258,7 +259,7 @@ class Scout:
             size = 5 if self.moving else 3
             change = np.hstack([frames.g - before.g, frames.dk - before.dk])[:, :size]
             square = np.einsum("ti,tij,tj->", change, normal[:, :size, :size], change)
-            if square < SETTLED**2 * size * len(change):
+            if square < CONVERGED**2 * size * len(change):
                 break
         return frames
 

@@ -17,8 +17,8 @@ from numpy.random import default_rng
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
-from pixcal.estimators.fringe_fit.models import FringeShape
-from pixcal.estimators.fringe_fit.models.paraxial import Paraxial
+from pixcal.estimators.fringe_fit.shapes import FringeShape
+from pixcal.estimators.fringe_fit.shapes.paraxial import Paraxial
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pixcal import __version__
-from pixcal.estimators.fringe_fit.fringes import HONEST_FRINGES
+from pixcal.estimators.fringe_fit.fringes import MIN_FRINGES_FOR_MAPS
 from pixcal.model.arrays import F64
 from pixcal.model.bench import Bench, SimulatedFrames, SimulatedSet, load_bench
 from pixcal.model.config import to_plain
@@ -220,10 +220,10 @@ def _warnings(bench: Bench, bound: JoinedBound) -> list[str]:
                 "fringes are aliased"
             )
         across = float(np.hypot(np.median(s.kx) * nx, np.median(s.ky) * ny) / (2 * np.pi))
-        if across < HONEST_FRINGES:
+        if across < MIN_FRINGES_FOR_MAPS:
             sentences.append(
                 f"{scan.name}: {across:.2g} fringes across the window; with fewer "
-                f"than {HONEST_FRINGES:g}, offsets and fringes cannot be separated"
+                f"than {MIN_FRINGES_FOR_MAPS:g}, offsets and fringes cannot be separated"
             )
     return sentences
 

@@ -18,7 +18,7 @@ from pixcal.estimators.fringe_fit.combine import (
     weighted_mean,
 )
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
-from pixcal.estimators.fringe_fit.models import FringeShape
+from pixcal.estimators.fringe_fit.shapes import FringeShape
 from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
 from pixcal.stages.fitted_shape import fitted_shape

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
-from pixcal.estimators.fringe_fit.models.hyperbolic import prior_errors
+from pixcal.estimators.fringe_fit.shapes.hyperbolic import prior_errors
 from pixcal.kernels.optics import PARAMETERS, Geometry, phase, phase_jacobian
 from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F64, Mask

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.estimators.fringe_fit.models import FringeShape, Polynomial, Start, fringe_models
 from pixcal.estimators.fringe_fit.modes import ModeBasis
+from pixcal.estimators.fringe_fit.shapes import FringeShape, Polynomial, Start, fringe_models
 from pixcal.estimators.fringe_fit.tile_sums import Carrier, TilePlane, TileSums, unwrap
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F64
@@ -21,13 +21,13 @@ MAX_STEPS = 8  # Gauss-Newton steps of a shape; it is nearly linear (physics not
 STEP_RAD = 1e-7  # iteration stops once a step changes phases by less, rms
 # fall in chi-square above which ``auto`` chooses hyperbolic fringes: one chance in a hundred for
 # three terms. A false choice costs three modes of the map; missed curvature stays in it entirely.
-EVIDENCE = 12.0
+MIN_CHI2_DROP = 12.0
 QUADRATIC = 3  # second-order terms, the leading ones of hyperbolic fringes
 # ratio of power at large to small scales above which the map has large-scale structure
-RED = 2.5
+LARGE_SCALE_RATIO = 2.5
 # fall then required of each term over that of spurious terms: the power of steps falls with the
 # order of the term, and two stitches reach 15
-EXCESS = 50.0
+MIN_DROP_OVER_SPURIOUS = 50.0
 # relative difference of the fringe period from nominal above which a note is added
 FAR_PERIOD = 0.15
 
@@ -163,14 +163,16 @@ def _choose(model: str, tiles: TileSums, start: Start) -> tuple[SetFit, str]:
     straight = _fit_shape(tiles, shapes["paraxial"], start)
     smooth = _fit_shape(tiles, Polynomial, start)
     most = (straight.square - smooth.square) / smooth.spread
-    if most < EVIDENCE:
+    if most < MIN_CHI2_DROP:
         return straight, f"no curvature: chi-square falls by {most:.0f} at most"
     exact = _fit_shape(tiles, shapes["hyperbolic"], start)
     gain = (straight.square - exact.square) / smooth.spread
     others = len(smooth.basis.names) - len(straight.basis.names) - QUADRATIC
     beyond = max(exact.square - smooth.square, 0.0) / smooth.spread / others
     background = max(1.0, beyond)
-    needed = QUADRATIC * EXCESS * background if background > RED else EVIDENCE
+    needed = MIN_CHI2_DROP
+    if background > LARGE_SCALE_RATIO:
+        needed = QUADRATIC * MIN_DROP_OVER_SPURIOUS * background
     reason = (
         f"hyperbolic fringes lower chi-square by {gain:.0f}; {needed:.0f} is required, because "
         f"large scales have {background:.1f} times the power of small ones"

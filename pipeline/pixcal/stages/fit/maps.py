@@ -35,7 +35,7 @@ SAME_AS_SWEPT = ("iota", "alpha", "chi2", "mask")  # maps identical to those of 
 # by names of the set ("" for combined maps) and of the array
 Writers = dict[tuple[str, str], ArrayWriter]
 # most errors that a tile contributes to the median, and about how many all tiles contribute
-TOLD, TOLD_IN_ALL = 4000, 4_000_000
+SAMPLED_ERRORS, MAX_SAMPLED_ERRORS = 4000, 4_000_000
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def _map_writer(place: Local, fitted: FittedSet, batches: int = 0) -> ArrayWrite
 
 
 @dataclass(frozen=True)
-class _Told:
+class _TileTotals:
     """Good pixels and sampled errors (px) of each set in a tile, and disagreement of the sets."""
 
     good: list[int]
@@ -124,7 +124,7 @@ Swept = Mapping[str, ArrayReader]  # readers of the maps of a set's sweep
 
 def _write_strip(
     fitted: list[FittedSet], writers: Writers, both: bool, strip: Sequence[Job]
-) -> list[_Told]:
+) -> list[_TileTotals]:
     """Write the maps of neighbouring tiles."""
     (y0, y1), (x0, x1) = span(fitted[0].source.shape, [at for at, _ in strip])
     swept: list[Swept] = []
@@ -153,7 +153,7 @@ def _maps_of_tile(
     both: bool,
     job: Job,
     made: dict[tuple[str, str], NDArray[Any]],
-) -> _Told:
+) -> _TileTotals:
     """Fill the maps of a tile, by the keys of their writers; return its share of the totals."""
     at, removed = job
     y, x = fitted[0].source.ranges(at)
@@ -177,9 +177,9 @@ def _maps_of_tile(
     made["", "mask"][...] = flags
     freedom = np.isfinite(delta).sum(axis=0) - len(values)
     goods = [np.isfinite(s) for s in sigma]
-    number = max(1, min(TOLD, TOLD_IN_ALL // len(fitted[0].planes)))
+    number = max(1, min(SAMPLED_ERRORS, MAX_SAMPLED_ERRORS // len(fitted[0].planes)))
     some = [_some(s[good].astype(np.float32), number) for s, good in zip(sigma, goods, strict=True)]
-    return _Told(
+    return _TileTotals(
         [int(good.sum()) for good in goods],
         some,
         float(chi2[~missing].sum()),

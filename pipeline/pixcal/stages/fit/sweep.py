@@ -19,7 +19,7 @@ from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, one_blas_thread, run_tasks
 from pixcal.estimators.fringe_fit.fit_flags import fit_flags, usual_chi2
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
-from pixcal.estimators.fringe_fit.scout import Scout, in_turn
+from pixcal.estimators.fringe_fit.scout import Scout, serial_map
 from pixcal.estimators.fringe_fit.sweep import (
     BOUND_PIXELS,
     FrameBatches,
@@ -345,7 +345,7 @@ def scout_set(
     with one_blas_thread():
         parts = [scout.prime([np.concatenate(tile) for tile in zip(*looks, strict=True)])]
     del looks
-    scout.each = in_turn
+    scout.each = serial_map
     if len(parts[0].g) < source.n_frames:
         # A chunk of each place and the memory of its solution.
         runtime = within_memory(what, 3 * len(places) * chunk_bytes, kept, runtime)

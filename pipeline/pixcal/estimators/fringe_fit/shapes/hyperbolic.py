@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from scipy.optimize import least_squares
 
-from pixcal.estimators.fringe_fit.models import FringeShape, Start
+from pixcal.estimators.fringe_fit.shapes import FringeShape, Start
 from pixcal.kernels.optics import PARAMETERS, Geometry, fringe_vector, phase, phase_jacobian
 from pixcal.model.arrays import F64
 

@@ -5,7 +5,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from pixcal.estimators.fringe_fit.models import FringeShape, Start
+from pixcal.estimators.fringe_fit.shapes import FringeShape, Start
 from pixcal.model.arrays import F64
 
 
