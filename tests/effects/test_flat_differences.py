@@ -7,7 +7,7 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics import DETECTOR, measure
-from pixcal.estimators.test_statistics.detector_frames import differences
+from pixcal.estimators.test_statistics.frame_differences import differences
 
 
 def with_sky(evidence: Evidence, slope: float) -> Evidence:

@@ -12,7 +12,7 @@ from pixcal.estimators.test_statistics.expectation import (
     scaled,
 )
 from pixcal.estimators.test_statistics.gap import (
-    CHANCE,
+    FALSE_ALARM_RATE,
     compare,
     flagged,
     log_likelihood,
@@ -90,7 +90,7 @@ def test_no_gap_is_found_where_there_is_none() -> None:
         )
     # Binomial of 100 at twice the chance: more than 7 once in a thousand.
     assert found <= 7
-    assert CHANCE <= 0.05
+    assert FALSE_ALARM_RATE <= 0.05
 
 
 def test_a_shift_is_a_gap_that_its_cause_closes_and_another_does_not() -> None:

@@ -38,7 +38,7 @@ def a_look(residual: F32, phi: np.ndarray) -> FringeSetData:
     given = SimpleNamespace(
         residual=residual,
         pattern_sizes=pattern_sizes(residual, GOOD),
-        found=SimpleNamespace(phi=phi),
+        fringes=SimpleNamespace(phi=phi),
     )
     return cast(FringeSetData, given)
 

@@ -7,7 +7,7 @@ from pixcal.effects.brighter_fatter import BrighterFatter
 from pixcal.effects.ipc import Ipc
 from pixcal.effects.lag import Lag
 from pixcal.effects.nonlinearity import Nonlinearity
-from pixcal.estimators.detector.traps import FittedLoss
+from pixcal.estimators.detector.lag_by_level import FittedLoss
 from pixcal.simulation.effect import FringeMaps
 from pixcal.stages.advice import limit, moved_by, size_of, unexplained
 from pixcal.stages.diagnose.fitted_set import FittedSet

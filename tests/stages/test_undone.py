@@ -9,7 +9,7 @@ from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.estimators.maps.corrected import phase_change
 from pixcal.kernels.boundaries import REACH, moved_charge
 from pixcal.simulation.effect import FringeMaps
-from pixcal.stages.diagnose.fitted_set import FitOfFrames, undone_on_samples
+from pixcal.stages.diagnose.fitted_set import FitOfFrames, corrected_on_samples
 
 SHAPE = (23, 31)
 BENT = Nonlinearity(-0.05, 0.02)
@@ -38,15 +38,15 @@ def test_harmonics_that_few_phases_bring_into_the_maps_are_undone(law):
     maps = FringeMaps(theta, (2 * np.pi / 9.3, 0.03))
     moved = third_harmonic(truth, theta, psi)
     assert abs(moved) > 3e-4
-    undone = undone_on_samples(BENT, maps, FitOfFrames.of(maps, g))
+    undone = corrected_on_samples(BENT, maps, FitOfFrames.of(maps, g))
     assert abs(third_harmonic(truth, undone.theta, psi)) < 0.1 * abs(moved)
 
 
 def test_of_phases_spread_evenly_harmonics_take_no_part():
     truth, (theta, g), psi = acquisition(2 * np.pi * np.arange(60) / 60)
     maps = FringeMaps(theta, (2 * np.pi / 9.3, 0.03))
-    fit, even = FitOfFrames.of(maps, g), undone_on_samples(BENT, maps)
-    np.testing.assert_allclose(undone_on_samples(BENT, maps, fit).theta, even.theta, atol=2.0)
+    fit, even = FitOfFrames.of(maps, g), corrected_on_samples(BENT, maps)
+    np.testing.assert_allclose(corrected_on_samples(BENT, maps, fit).theta, even.theta, atol=2.0)
     assert abs(third_harmonic(truth, even.theta, psi)) < 1e-5
 
 
@@ -78,7 +78,7 @@ def test_what_charge_moves_is_undone_up_to_the_edges_and_in_the_contrast():
     found, g = fit_jointly(moved[inside], truth, g)
     maps = FringeMaps(found, (2 * np.pi / 9.3, 0.03))
     fit = FitOfFrames.of(maps, g)
-    undone = undone_on_samples(effect, maps, fit, beyond=True).theta
+    undone = corrected_on_samples(effect, maps, fit, beyond=True).theta
     harmonic, left = third_harmonic(truth, found, psi[inside]), phase_change(truth, undone)
     assert abs(harmonic) > 3e-5
     assert abs(third_harmonic(truth, undone, psi[inside])) < 0.1 * abs(harmonic)
@@ -92,7 +92,7 @@ def test_what_charge_moves_is_undone_up_to_the_edges_and_in_the_contrast():
     assert loss < -2e-3
     assert abs(contrast(undone) - contrast(truth)) < 0.1 * abs(loss)
     # A correction undoes it on frames, which end at the edges, and adds what this leaves out.
-    closed = undone_on_samples(effect, maps, fit).theta
+    closed = corrected_on_samples(effect, maps, fit).theta
     apart = phase_change(closed, undone)
     assert np.abs(apart[:, :3]).max() > 10 * np.abs(apart - np.median(apart))[:, 14:-14].max()
     samples = effect.undo_samples(moved[inside].astype(np.float32)).astype(float)

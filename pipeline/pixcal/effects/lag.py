@@ -13,8 +13,8 @@ from pixcal.estimators.detector.frame_lag import (
     lag_of_flats,
     seen_share,
 )
+from pixcal.estimators.detector.lag_by_level import BANDS, LossFit, in_bands
 from pixcal.estimators.detector.noiseless_charge import missing_noise
-from pixcal.estimators.detector.traps import BANDS, LossFit, in_bands
 from pixcal.estimators.diagnosis.evidence import MAX_SAMPLES, Evidence, FringeEvidence, central_crop
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import sigmas_of_best
@@ -240,7 +240,7 @@ class Lag(Effect):
             )
         fringes = tuple(evidence.fringes.values())
         common = common_lag(
-            [f.free[:, :3] for f in fringes], [f.frame for f in fringes], cls._undone
+            [f.free[:, :3] for f in fringes], [f.frame for f in fringes], cls._without_lag
         )
         if common is None:
             return None
@@ -274,7 +274,7 @@ class Lag(Effect):
         )
 
     @classmethod
-    def _undone(cls, share: float, decay_frames: float, frames: F32) -> tuple[F32, F64]:
+    def _without_lag(cls, share: float, decay_frames: float, frames: F32) -> tuple[F32, F64]:
         """Frames without a lag, and the shares that appear 1, 2, ... frames later."""
         lag = cls(share, decay_frames)
         return lag.restored(frames), share * lag.releases

@@ -4,7 +4,10 @@ from enum import IntFlag
 
 
 class PixelFlag(IntFlag):
-    """Reasons why a pixel has no offset; zero is a good pixel."""
+    """Reasons why a pixel has no offset; zero is a good pixel.
+
+    Masks are uint8: one bit, 128, is left.
+    """
 
     HOT = 1
     DEAD = 2

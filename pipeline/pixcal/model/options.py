@@ -24,7 +24,7 @@ MAX_ELECTRONS = 1e15  # limit of the Poisson generator
 FWHMS = (0.5, 50.0)  # widths of stars, px
 
 
-def _python(default: Any, **meaning: Any) -> Any:
+def python_only_option(default: Any, **meaning: Any) -> Any:
     """An option of the Python function that the command line does not offer."""
     return quantity(default, python_only=True, **meaning)
 
@@ -50,7 +50,7 @@ class Running:
         shown="2GiB",
         doc="Memory limit; work that needs more is refused.",
     )
-    quiet: bool = _python(True, doc="No progress on stderr.")
+    quiet: bool = python_only_option(True, doc="No progress on stderr.")
 
 
 @dataclass(frozen=True)
@@ -87,37 +87,37 @@ class Reduce:
     gain: Literal["declared", "measured"] = quantity(
         "declared", doc="Gain to use: declared in acquisition.yaml or measured from the flats."
     )
-    clip_sigma: float = _python(
+    clip_sigma: float = python_only_option(
         4.0, low=4, high=100, doc="Clipping of calibration frames, robust sigmas."
     )
-    hot_sigma: float = _python(
+    hot_sigma: float = python_only_option(
         10.0, low=5, high=1e6, doc="Dark signal of ``HOT`` pixels, robust sigmas above the median."
     )
-    dead_below: float = _python(
+    dead_below: float = python_only_option(
         0.5,
         low=0,
         high=1,
         doc="Response relative to the neighbours below which a pixel is ``DEAD``.",
     )
-    dead_above: float = _python(
+    dead_above: float = python_only_option(
         2.0,
         low=1,
         high=1e6,
         doc="Response relative to the neighbours above which a pixel is ``DEAD``.",
     )
-    noisy_factor: float = _python(
+    noisy_factor: float = python_only_option(
         1.5,
         low=1,
         high=1e6,
         doc="Noise relative to the typical noise above which a pixel is ``NOISY``.",
     )
-    nonlinear_share: float = _python(
+    nonlinear_share: float = python_only_option(
         0.03,
         above=0,
         high=1e6,
         doc="Deviation from a straight line above which a pixel is ``NONLINEAR``.",
     )
-    rounding_share: float = _python(
+    rounding_share: float = python_only_option(
         1e-3, above=0, high=1, doc="Largest share of the variance that rounding may add."
     )
     cubes: StrPath | None = as_in(Ingest, "cubes")
@@ -127,10 +127,10 @@ class Reduce:
 class Sweep:
     """Options of the pass over the cube, a part of ``fit``."""
 
-    batch_frames: int | None = _python(
+    batch_frames: int | None = python_only_option(
         None, low=4, unit="frames", doc="Frames of an Allan batch; 500, or fewer in a short run."
     )
-    chi2_limit: float = _python(
+    chi2_limit: float = python_only_option(
         1.5, above=1.0, doc="Reduced chi-square above which a pixel is ``BAD_FIT``."
     )
 
@@ -141,7 +141,7 @@ class Fit(Sweep):
 
     model: str = quantity(
         "auto",
-        choices=("auto", "hyperbolic", "paraxial"),  # as in pixcal.estimators.fringe_fit.models
+        choices=("auto", "hyperbolic", "paraxial"),  # as in pixcal.estimators.fringe_fit.shapes
         doc="Shape of the fringes: hyperbolic, straight (paraxial), or chosen from the data.",
     )
     with_diagnosis: bool = quantity(
@@ -162,7 +162,7 @@ class Fit(Sweep):
 class Allan:
     """Measure how the error falls with the number of frames (Allan deviation)."""
 
-    region: Region | None = _python(
+    region: Region | None = python_only_option(
         None, unit="px", low=0, doc="Limits (y0, y1, x0, x1) of the main curve, ends excluded."
     )
     regions: tuple[Region, ...] = quantity(
@@ -198,8 +198,8 @@ class Crests:
 class Diagnose:
     """Find where data and simulation differ, which effect causes it, and the residual gap."""
 
-    only: tuple[str, ...] = _python((), doc="The only candidates.")
-    without: tuple[str, ...] = _python((), doc="Effects to leave out.")
+    only: tuple[str, ...] = python_only_option((), doc="The only candidates.")
+    without: tuple[str, ...] = python_only_option((), doc="Effects to leave out.")
     own: tuple[Path, ...] = _own("Python file with your own effect")
     nominal: Path | None = quantity(
         None, metavar="BENCH.yaml", doc="Bench file whose effects belong to the nominal simulation."

@@ -30,7 +30,7 @@ WILD_STEP = 5.0  # robust deviations above which a step between neighbours is an
 AROUND = 5  # side (pixels) of a pixel's surroundings
 # share of the pixels' changes by which they may differ from those of their surroundings
 ALONE = 0.5
-WILD = 8.0  # standard deviations above which a residual is an outlier
+OUTLIER_SIGMA = 8.0  # standard deviations above which a residual is an outlier
 HARMONICS = 2  # harmonics of the phase on which fitted frame parameters may depend
 KNOWN = 0.02  # relative error of the modelled variance of a frame's parameters
 
@@ -162,7 +162,8 @@ class SetDeviations(_Deviations):
         """Residuals (t, n) of the fit in good pixels, e-."""
         freedom = self.freedom
         rest = freedom.left_over(freedom.of_good(self.found.residual))
-        weight = np.where(rest**2 * freedom.weight < WILD**2, freedom.weight, np.float32(0))
+        calm = rest**2 * freedom.weight < OUTLIER_SIGMA**2
+        weight = np.where(calm, freedom.weight, np.float32(0))
         return Deviation(rest, weight)
 
     @cached_property
@@ -284,7 +285,7 @@ class StackDeviations(_Deviations):
         dark = np.maximum(e.dark_rate[self.good], 0) * np.nan_to_num(self._stack.exptime_s)
         variance = (e.read_noise**2 + dark) / e.gain**2 * max(1 - 1 / len(adu), 0.5)
         rest = adu - adu.mean(axis=0)
-        weight = np.where(rest**2 < WILD**2 * variance, 1 / variance, 0)
+        weight = np.where(rest**2 < OUTLIER_SIGMA**2 * variance, 1 / variance, 0)
         return Deviation(rest, weight.astype(np.float32))
 
     @cached_property

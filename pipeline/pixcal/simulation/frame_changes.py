@@ -35,7 +35,7 @@ LIGHT, MOTION = (0, 1), (2, 3)  # (B over its mean less one, log A/B), and (kx, 
 
 
 @dataclass(frozen=True)
-class Watched:
+class AffectedSeries:
     """A series that a model may change."""
 
     series: FrameSeries = field(compare=False)
@@ -106,7 +106,7 @@ class Strength:
 
 
 def strengths_of(
-    every: Sequence[Watched], start: ForwardModel, leave: Sequence[str]
+    every: Sequence[AffectedSeries], start: ForwardModel, leave: Sequence[str]
 ) -> list[Strength]:
     """Strengths of a model that change some series."""
     start, found = _off_resonance(start), []
@@ -124,7 +124,9 @@ def _off_resonance(start: ForwardModel) -> ForwardModel:
     return replace(start, **{name: OTHER * getattr(start, name) for name in lines})
 
 
-def _strength(every: Sequence[Watched], own: ForwardModel, key: str, unit: float) -> list[Strength]:
+def _strength(
+    every: Sequence[AffectedSeries], own: ForwardModel, key: str, unit: float
+) -> list[Strength]:
     drawn = [w.changes(own, 2) for w in every]
     if not any(v.any() for v in drawn):
         return []
@@ -154,20 +156,20 @@ class FrameChanges:
         recordings = set_recordings(evidence)
         light, motion = light_of(evidence), motion_of(evidence)
 
-        def watched(series: FrameSeries, channels: tuple[int, int]) -> Watched:
+        def watched(series: FrameSeries, channels: tuple[int, int]) -> AffectedSeries:
             recording = recordings[series.name]
             recording = replace(recording, bench=_rounded(recording.bench))
-            return Watched(series, channels, recording, tuple(series.frame.tolist()))
+            return AffectedSeries(series, channels, recording, tuple(series.frame.tolist()))
 
         self.light, self.crossed = light, motion is not None and motion.crossed
         self._every = [[watched(s, MOTION) for s in motion.series]] if motion else []
         self._lines: list[Line | None] = [motion.line] if motion else []
         if light is not None:
-            dark = [Watched(s, LIGHT, None, tuple(range(len(s)))) for s in light.dark]
+            dark = [AffectedSeries(s, LIGHT, None, tuple(range(len(s)))) for s in light.dark]
             self._every.append([*(watched(s, LIGHT) for s in light.sets), *dark])
             self._lines.append(light.line)
 
-    def series(self, start: ForwardModel) -> list[Watched]:
+    def series(self, start: ForwardModel) -> list[AffectedSeries]:
         """Series of the kinds that a strong model changes."""
         strong = _off_resonance(start)
         return [

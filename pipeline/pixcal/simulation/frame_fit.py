@@ -35,9 +35,9 @@ from pixcal.simulation.forward import ForwardModel, with_numbers
 from pixcal.simulation.frame_changes import (
     DRAWS,
     LIGHT,
+    AffectedSeries,
     FrameChanges,
     Strength,
-    Watched,
     strengths_of,
     unit_of,
 )
@@ -58,7 +58,7 @@ class FrameBasis:
     """Parts and shapes of strengths and nuisances in the series."""
 
     def __init__(
-        self, changes: FrameChanges, every: Sequence[Watched], strengths: Sequence[Strength]
+        self, changes: FrameChanges, every: Sequence[AffectedSeries], strengths: Sequence[Strength]
     ) -> None:
         self.every = every
         self._made: dict[tuple[Strength, float | None], list[F64]] = {}
@@ -190,13 +190,13 @@ class FrameBasis:
         return float(np.sqrt(more)) / square if more > ROUGH * normal else 0.0
 
 
-def _names(changes: FrameChanges, every: Sequence[Watched]) -> list[str]:
+def _names(changes: FrameChanges, every: Sequence[AffectedSeries]) -> list[str]:
     kinds = {w.channels is LIGHT for w in every}
     motion = MOTION_PARTS if changes.crossed else MOTION_PARTS[:-1]
     return [*(LIGHT_PARTS if True in kinds else ()), *(motion if False in kinds else ())]
 
 
-def _nuisance_parts(changes: FrameChanges, name: str, every: Sequence[Watched]) -> list[F64]:
+def _nuisance_parts(changes: FrameChanges, name: str, every: Sequence[AffectedSeries]) -> list[F64]:
     """Covariance (t - 1, 2, 2) of the modes of each series by a nuisance."""
     found = []
     for w in every:
@@ -209,7 +209,7 @@ def _nuisance_parts(changes: FrameChanges, name: str, every: Sequence[Watched]) 
     return found
 
 
-def _nuisance_shapes(changes: FrameChanges, of: Watched) -> F64:
+def _nuisance_shapes(changes: FrameChanges, of: AffectedSeries) -> F64:
     """Steady changes (t, 2, q) of a series by nuisances."""
     if of.channels is LIGHT:
         return np.zeros((len(of.series), 2, 3 if changes.crossed else 2))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
-from pixcal.estimators.diagnosis.evidence import Evidence, Stack, once
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack, cached_on_evidence
 from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.sample_sums import frame_means
 from pixcal.kernels.significance import SIGNIFICANT
@@ -53,7 +53,7 @@ class Ladder:
         return float(self.levels.max())
 
 
-@once
+@cached_on_evidence
 def light_of(evidence: Evidence, stack: Stack) -> F64:
     """Mean (t,) of the good pixels in each frame without bias and dark signal, e-."""
     good = evidence.good
@@ -63,7 +63,7 @@ def light_of(evidence: Evidence, stack: Stack) -> F64:
     return np.asarray(frame_means(stack.adu, good) * evidence.gain - dark)
 
 
-@once
+@cached_on_evidence
 def level_before(evidence: Evidence, stack: Stack) -> float:
     """Level (e-) of the frame before a series; zero where time stamps do not identify it."""
     start = stack.start_s + stack.time_s[0]
@@ -146,7 +146,7 @@ def straight_line(times: F64, levels: F64, at: F64) -> F64:
     return np.asarray(np.stack([at, np.ones_like(at)][:terms], axis=1) @ found)
 
 
-@once
+@cached_on_evidence
 def ladder(evidence: Evidence) -> Ladder | None:
     """The ladder of an acquisition; None with too few levels, or a lamp that was changed."""
     stacks = [s for s in evidence.ladder if s.exptime_s > 0]

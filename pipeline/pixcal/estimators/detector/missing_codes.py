@@ -126,6 +126,6 @@ def noise_before_missing_codes(
 
 def _variance_at(mean: F64, error: F64, means: F64, variances: F64) -> F64:
     """Variances of samples at means with errors (variances), corrected for bias by these."""
-    bend = np.gradient(np.gradient(variances, means), means)
+    curvature = np.gradient(np.gradient(variances, means), means)
     at = np.interp(mean, means, variances)
-    return np.asarray(at - np.interp(mean, means, bend) * error / 2)
+    return np.asarray(at - np.interp(mean, means, curvature) * error / 2)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pixcal.estimators.diagnosis.distortions import Freedom, TwoWay
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, once
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, cached_on_evidence
 from pixcal.kernels import kernel
 from pixcal.kernels.boundaries import REACH, boundary_pushes, shared_noise
 from pixcal.kernels.line_means import without_line_means
@@ -58,7 +58,7 @@ class SharedCharge:
     covariance: F64
 
 
-@once
+@cached_on_evidence
 def shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
     """Size of the brighter-fatter effect from the covariance of neighbours.
 

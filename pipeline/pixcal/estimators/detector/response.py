@@ -18,7 +18,7 @@ from pixcal.estimators.diagnosis.distortions import (
     distortion_sums,
     fit_distortions,
 )
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, once
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, cached_on_evidence
 from pixcal.kernels.boundaries import REACH, boundary_shifts, moved_charge
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F32, F64
@@ -164,7 +164,7 @@ def _of_fine_falloffs() -> F64:
     return shares
 
 
-@once
+@cached_on_evidence
 def _boundary_sums(evidence: Evidence) -> list[tuple[F64, F64]]:
     """Sums of `distortion_sums` for powers and falloffs, of fringes across columns and rows."""
     every = [UNIT * boundary_shifts(falloff) for falloff in FALLOFFS_PX]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import Evidence, Stack, once
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack, cached_on_evidence
 from pixcal.kernels.line_means import without_line_means
 from pixcal.kernels.residual_sums import residual_sums
 from pixcal.model.arrays import F64, Mask
@@ -42,7 +42,7 @@ class TransferCurve:
     errors: F64
 
 
-@once
+@cached_on_evidence
 def transfer_curve(evidence: Evidence, *, whole: bool = False) -> TransferCurve | None:
     """Photon transfer of each level of flats.
 
@@ -155,7 +155,7 @@ def _is_enough(stack: Stack) -> bool:
     return len(stack.adu) >= 2
 
 
-@once
+@cached_on_evidence
 def _of_stack(evidence: Evidence, stack: Stack) -> F64 | None:
     good = evidence.good & (stack.adu < evidence.saturation_adu).all(axis=0)
     pixels = np.count_nonzero(good)

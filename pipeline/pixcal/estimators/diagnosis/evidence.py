@@ -231,7 +231,9 @@ class Evidence:
         )
 
 
-def once(make: Callable[Concatenate[Evidence, P], T]) -> Callable[Concatenate[Evidence, P], T]:
+def cached_on_evidence(
+    make: Callable[Concatenate[Evidence, P], T],
+) -> Callable[Concatenate[Evidence, P], T]:
     """Decorate a function of `Evidence` whose results are to be kept in it (`Evidence.once`).
 
     Further arguments: hashable ones, stacks of the evidence, and arrays.

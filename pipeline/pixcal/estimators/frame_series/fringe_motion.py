@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import Evidence, once
+from pixcal.estimators.diagnosis.evidence import Evidence, cached_on_evidence
 from pixcal.estimators.frame_series.series import MEDIAN, FrameSeries, mode_variance, motion_series
 from pixcal.estimators.frame_series.spectral_line import Line, cleared_of_line
 from pixcal.kernels.robust import robust_sigma
@@ -48,7 +48,7 @@ class Motion:
     crossed: bool  # whether there are fringes of different directions
 
 
-@once
+@cached_on_evidence
 def motion_of(evidence: Evidence) -> Motion | None:
     """Motion of the fringes in all sets with enough frames; None without any."""
     found = [s for s in map(motion_series, evidence.fringes.values()) if s is not None]

@@ -117,8 +117,8 @@ def find_hopping(
 
 def _error(likelihood: Callable[[float], float], step: float) -> float:
     """One sigma, from the curvature of the log-likelihood at its maximum."""
-    bend = 2 * likelihood(0.0) - likelihood(-step) - likelihood(step)
-    return abs(step) / float(np.sqrt(max(bend, 1e-9)))
+    curvature = 2 * likelihood(0.0) - likelihood(-step) - likelihood(step)
+    return abs(step) / float(np.sqrt(max(curvature, 1e-9)))
 
 
 def scatter_of(values: F64) -> float:

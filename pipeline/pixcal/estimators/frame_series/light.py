@@ -11,7 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, once, stripes
+from pixcal.estimators.diagnosis.evidence import (
+    Evidence,
+    FringeEvidence,
+    Stack,
+    cached_on_evidence,
+    stripes,
+)
 from pixcal.estimators.frame_series.series import FrameSeries, assemble, light_series, mode_variance
 from pixcal.estimators.frame_series.spectral_line import Line, cleared_of_line
 from pixcal.estimators.frame_series.variance_components import Modes
@@ -125,7 +131,7 @@ def separate_powers(evidence: Evidence) -> float:
     return float(np.sqrt(of_contrast / max(len(evidence.fringes), 1)))
 
 
-@once
+@cached_on_evidence
 def light_of(evidence: Evidence) -> FrameLight | None:
     """Light of all sets with enough frames; None without any."""
     found = {f.name: light_series(f) for f in evidence.fringes.values()}

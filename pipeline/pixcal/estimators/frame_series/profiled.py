@@ -60,9 +60,9 @@ def best_shape(
         # A parabola through the three, ever closer; its curvature is the information.
         sides = tuple(fit(float(np.exp(log_value + w)), found) for w in (-width, width))
         below, above = (high(side) - high(found) for side in sides)
-        bend = -(below + above)
-        error = width / np.sqrt(bend) if bend > 0 else np.inf
-        shift = float(np.clip((above - below) / (2 * max(bend, 1e-9)), -1, 1)) * width
+        curvature = -(below + above)
+        error = width / np.sqrt(curvature) if curvature > 0 else np.inf
+        shift = float(np.clip((above - below) / (2 * max(curvature, 1e-9)), -1, 1)) * width
         moved = fit(float(np.exp(log_value + shift)), found)
         if high(moved) > high(found):
             log_value, found = log_value + shift, moved

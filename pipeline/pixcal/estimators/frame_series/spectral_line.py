@@ -114,9 +114,9 @@ def _peak(grid: F64, power: F64, at: int) -> tuple[float, float]:
     step = grid[1] - grid[0]
     inside = min(max(at, 1), len(grid) - 2)
     before, here, after = power[inside - 1 : inside + 2]
-    bend = before - 2 * here + after
-    if bend >= 0:
+    curvature = before - 2 * here + after
+    if curvature >= 0:
         return float(grid[at]), float(step)
-    shift = float(np.clip((before - after) / (2 * bend), -1, 1))
+    shift = float(np.clip((before - after) / (2 * curvature), -1, 1))
     # The power is the growth of the log-likelihood: its curvature is the information.
-    return float(grid[inside] + shift * step), float(step / np.sqrt(-bend))
+    return float(grid[inside] + shift * step), float(step / np.sqrt(-curvature))

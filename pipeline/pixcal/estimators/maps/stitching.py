@@ -19,7 +19,7 @@ from pixcal.model.arrays import F64, Indices, Mask
 
 MIN_SIDE = 4  # least side of a field, px
 USUAL_SIDE = 12  # least mean side, px: more lines than that are a pattern, not stitching
-CHANCE = 1e-3  # false-alarm rate of a line anywhere in a map of white noise without steps
+FALSE_ALARM_RATE = 1e-3  # of a line anywhere in a map of white noise without steps
 _ROUNDS = 3  # iterations in which each line is sought again given all others
 # share of a step's information, and number of pixels, that regularise its normal matrix where
 # smooth terms absorb the step, or no pixel is good
@@ -66,7 +66,7 @@ def _with_line(
     found = {axis: _best_line(fits, lines, axis) for axis in axes}
     axis = min(found, key=lambda one: found[one])
     log_chance, _, place = found[axis]
-    if log_chance > np.log(CHANCE):
+    if log_chance > np.log(FALSE_ALARM_RATE):
         return lines
     return _replaced(lines, axis, {*lines[axis], place})
 

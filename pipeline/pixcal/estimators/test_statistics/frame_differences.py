@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import Evidence, Stack, once
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack, cached_on_evidence
 from pixcal.estimators.test_statistics import Curve, family, statistic
 from pixcal.estimators.test_statistics.fringe_set_data import ADJACENT, STEPS, neighbour_sums
 from pixcal.kernels.line_means import without_line_means
@@ -19,11 +19,11 @@ from pixcal.model.arrays import F32, F64, Mask
 of_noise = partial(statistic, "noise")
 
 REPEATS = (1, 2, 3, 4)  # distances (lines) of rows or columns that may share noise
-WILD = 8.0
+OUTLIER_SIGMA = 8.0
 BANDS = 4  # of the spectrum, from the size of the window to two pixels
 
 
-@once
+@cached_on_evidence
 def differences(evidence: Evidence, stack: Stack) -> F32:
     """Differences (t, y, x) of frames 0 and 1, 2 and 3, ..., over their noise; outliers zero."""
     light = stack.adu - evidence.bias.astype(np.float32)
@@ -38,7 +38,7 @@ def differences(evidence: Evidence, stack: Stack) -> F32:
     steps -= frame_means(steps, good)[:, None, None].astype(np.float32)
     # Root mean squares, as medians of integers are quantised.
     rest = steps / np.sqrt((steps[:, good] ** 2).mean())
-    rest[np.abs(rest) > WILD] = 0
+    rest[np.abs(rest) > OUTLIER_SIGMA] = 0
     return np.asarray(rest * good, np.float32)
 
 
@@ -50,7 +50,7 @@ def _without_gradient(steps: F32, evidence: Evidence) -> F32:
     return np.asarray((flat - flat @ basis @ basis.T).reshape(steps.shape))
 
 
-@once
+@cached_on_evidence
 def _gradient(evidence: Evidence) -> F32:
     """Light and its gradient, orthonormal (pixel, 3)."""
     ny, nx = evidence.good.shape
@@ -75,7 +75,7 @@ def _correlation(evidence: Evidence, stacks: Sequence[Stack]) -> F64:
     return np.asarray(total / np.maximum(pairs, 1) / (square / np.maximum(count, 1)))
 
 
-@once
+@cached_on_evidence
 def _neighbour_sums(evidence: Evidence, stack: Stack) -> F64:
     """Sums (4, step): of products with neighbours, their number; of squares, and theirs."""
     good = evidence.good
@@ -128,7 +128,7 @@ def bias_change(evidence: Evidence) -> Curve | None:
     change = adu[:half].mean(axis=0) - adu[-half:].mean(axis=0)
     change = np.where(good, change - change[good].mean(), 0)
     noise = np.sqrt(2 / half) * evidence.read_noise / evidence.gain
-    change = np.clip(change / noise, -WILD, WILD)
+    change = np.clip(change / noise, -OUTLIER_SIGMA, OUTLIER_SIGMA)
     power = np.abs(np.fft.rfft2(change)) ** 2 / change.size
     fy, fx = np.abs(np.fft.fftfreq(change.shape[0])), np.fft.rfftfreq(change.shape[1])
     band = np.minimum((2 * BANDS * np.maximum(fy[:, None], fx[None, :])).astype(int), BANDS - 1)

@@ -27,7 +27,7 @@ from pixcal.kernels.sample_sums import (
 )
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
-WILD = 8.0  # standard deviations beyond which a residual counts only as an outlier
+OUTLIER_SIGMA = 8.0  # standard deviations beyond which a residual counts only as an outlier
 OUTLIERS = (5.0, 7.0, 10.0)  # standard deviations beyond which residuals are counted
 
 
@@ -48,7 +48,9 @@ class FringeSetData:
         fringes, maps = self.fringes, (self.fringes.shot_factor, self.fringes.read_variance)
         shot, read = (noise.astype(np.float32) for noise in maps)
         limits = np.array(OUTLIERS)
-        return calm_residuals(fringes.electrons, fringes.model, shot, read, self.good, WILD, limits)
+        return calm_residuals(
+            fringes.electrons, fringes.model, shot, read, self.good, OUTLIER_SIGMA, limits
+        )
 
     @property
     def residual(self) -> F32:

@@ -16,7 +16,8 @@ from pixcal.estimators.test_statistics.expectation import Expectation, statistic
 from pixcal.model.arrays import F64
 
 ALLOWED = 2.0  # standard deviations of a value that do not count as a gap
-CHANCE = 1e-3  # p-value, for all statistics together, below which a difference is a gap
+# p-value, for all statistics together, below which a difference is a gap
+FALSE_ALARM_RATE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ def _any_of(log_chance: F64, count: F64) -> F64:
 
 def flagged(differences: Mapping[Key, Difference]) -> set[Key]:
     """Curves that differ by more than chance, for all statistics together (Bonferroni)."""
-    limit = np.log(CHANCE / max(len(differences), 1))
+    limit = np.log(FALSE_ALARM_RATE / max(len(differences), 1))
     return {key for key, d in differences.items() if d.log_chance < limit}
 
 

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 
 from pixcal.estimators.detector.flat_ladder import MIN_STEPS, ladder, straight_line
-from pixcal.estimators.diagnosis.evidence import Evidence, once
+from pixcal.estimators.diagnosis.evidence import Evidence, cached_on_evidence
 from pixcal.estimators.test_statistics import Curve, statistic
 from pixcal.estimators.test_statistics.fringe_set_data import CODES, FringeSetData
 from pixcal.model.arrays import F64
@@ -52,7 +52,7 @@ def photon_transfer(evidence: Evidence) -> Curve:
     return Curve.numbered(_noise_of_flats(evidence))
 
 
-@once
+@cached_on_evidence
 def _noise_of_flats(evidence: Evidence) -> F64:
     values = []
     for stack in evidence.ladder if evidence.has_level else ():

@@ -9,7 +9,7 @@ from scipy.fft import rfft2
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics import Curve, family, statistic
-from pixcal.estimators.test_statistics.detector_frames import differences, repeated
+from pixcal.estimators.test_statistics.frame_differences import differences, repeated
 from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData, pattern_sizes
 from pixcal.estimators.test_statistics.time import DISTINCT
 from pixcal.kernels.significance import sigmas_of_largest

@@ -17,7 +17,7 @@ from pixcal.model.arrays import F32, F64, U8, U16, Mask
 from pixcal.model.errors import InputError
 from pixcal.model.flags import PixelFlag
 from pixcal.simulation.effect import Effect, FittedFrames, FringeMaps
-from pixcal.stages.diagnose.fitted_set import undone_on_samples
+from pixcal.stages.diagnose.fitted_set import corrected_on_samples
 from pixcal.stages.evidence import Part, fitted_theta
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.treatment import Treatment
@@ -140,7 +140,7 @@ def free_of_samples(swept: Swept, part: Part) -> tuple[FringeMaps, Mask]:
     """Maps of a part as fitted without effects on samples; pixels (y, x) with an offset."""
     maps, good, _ = maps_of(replace(swept, folder=swept.raw or swept.folder), part)
     for effect in swept.samples:
-        maps = undone_on_samples(effect, maps) or maps
+        maps = corrected_on_samples(effect, maps) or maps
     return maps, good
 
 

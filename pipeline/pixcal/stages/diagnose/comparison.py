@@ -14,7 +14,7 @@ from pixcal.estimators.test_statistics.expectation import (
     expect_with,
 )
 from pixcal.estimators.test_statistics.gap import (
-    CHANCE,
+    FALSE_ALARM_RATE,
     Difference,
     Gap,
     compare,
@@ -138,7 +138,7 @@ class Comparison:
         gains = likelier(self.data, start.expected, trial.expected)
         differences = compare(self.data, start.expected)
         where = flagged(differences)
-        if own in differences and differences[own].log_chance < np.log(CHANCE):
+        if own in differences and differences[own].log_chance < np.log(FALSE_ALARM_RATE):
             where.add(own)
         return sum(gains[key] for key in where)
 

@@ -43,14 +43,14 @@ class IntensityBeforeEffects:
         frames = np.broadcast_to(levels[:, None, None], (len(levels), ACROSS, ACROSS))
         found = start = np.asarray(frames, np.float32)
         for effect in sorted(self.effects, key=lambda e: e.sort_key, reverse=True):
-            undone = effect.undo_samples(found)
-            found = found if undone is None else undone
+            corrected = effect.undo_samples(found)
+            found = found if corrected is None else corrected
         if found is start:
             return levels
         return np.asarray(found[:, ACROSS // 2, ACROSS // 2], float)
 
 
-def undone_on_samples(
+def corrected_on_samples(
     effect: Effect, maps: FringeMaps, fit: "FitOfFrames | None" = None, *, beyond: bool = False
 ) -> FringeMaps | None:
     """Maps fitted to noise-free frames after an effect on them was undone.
@@ -66,11 +66,11 @@ def undone_on_samples(
     light = with_margin(LightMaps(*(maps.theta * flat).astype(np.float32)), margin)
     wide = np.stack([light.iota, light.alpha_sin, light.alpha_cos])
     charge = np.einsum("tm,myx->tyx", _EVEN, wide).astype(np.float32)
-    undone = effect.undo_samples(charge)
-    if undone is None:
+    corrected = effect.undo_samples(charge)
+    if corrected is None:
         return None
     rows, columns = (slice(margin, margin + n) for n in flat.shape)
-    change = (undone.astype(float) - charge)[:, rows, columns]
+    change = (corrected.astype(float) - charge)[:, rows, columns]
     fit = FitOfFrames.of(maps, _EVEN) if fit is None else fit
     return replace(maps, theta=maps.theta + fit.taken_up(change) / flat)
 
@@ -165,7 +165,7 @@ class FittedSet:
         """The set with effects on maps undone: offsets as fitted with the effects known."""
         maps = before = self.maps
         for effect in sorted(effects, key=lambda e: e.sort_key, reverse=True):
-            maps = self.undone(effect, maps) or maps
+            maps = self.corrected(effect, maps) or maps
         if maps is before:
             return self._untouched
         size = float(np.hypot(*self.k))
@@ -198,9 +198,9 @@ class FittedSet:
         theta = filled(self.theta, self.k)
         return FringeMaps(theta, self.k, self.origin, self.flat, self.name, self.frames)
 
-    def undone(self, effect: Effect, maps: FringeMaps) -> FringeMaps | None:
+    def corrected(self, effect: Effect, maps: FringeMaps) -> FringeMaps | None:
         """Maps without an effect, as a fit of the same frames gives them; None if unknown."""
-        return effect.undo(maps) or undone_on_samples(effect, maps, self._fit, beyond=True)
+        return effect.undo(maps) or corrected_on_samples(effect, maps, self._fit, beyond=True)
 
     @cached_property
     def _fit(self) -> FitOfFrames | None:

@@ -124,7 +124,7 @@ def _change(effect: Effect, fit: FittedSet) -> F64:
     """Change (pixel,) of the offsets of good pixels by an effect, px; modes removed."""
     good = np.isfinite(fit.theta).all(axis=0) & np.isfinite(fit.delta)
     maps = fit.maps
-    after = fit.undone(effect, maps) or effect.predict(maps)
+    after = fit.corrected(effect, maps) or effect.predict(maps)
     if after is None or not good.any():
         return np.zeros(0)
     change = -phase_change(maps.theta, after.theta)[good]
