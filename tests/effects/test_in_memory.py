@@ -14,7 +14,7 @@ from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
 from pixcal.model.options import Sweep
 from pixcal.stages import ingest, reduce, simulate
-from pixcal.stages.diagnose.parts import NO_BATCHES, RawFrames, run_in_memory, take
+from pixcal.stages.diagnose.parts import NO_BATCHES, RawFrames, RunFrames, run_in_memory, take
 from pixcal.stages.diagnose.parts import evidence_of as evidence_of_part
 from pixcal.stages.diagnose.windows import whole_of
 from pixcal.stages.evidence import evidence_of
@@ -45,7 +45,9 @@ def raw(
     ingested = Ingested(run / "ingest")
     half = {name: np.arange(3, a.shape[0]) for name, a in ingested.arrays.items()}
     part = whole_of(ingested.shape)
-    return take(ingested, read_acquisition(run), half, part, reduce.Config())
+    dtypes = {name: array.dtype for name, array in ingested.arrays.items()}
+    frames = RunFrames(read_acquisition(run), ingested.tables, dtypes, reduce.Config())
+    return take(ingested, frames, half, part)
 
 
 @pytest.mark.quick(1)

@@ -1,5 +1,8 @@
 """Pixels that do not fit, beside pixels that all fit a little worse than noise would."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -17,17 +20,10 @@ def of_noise(scale: np.ndarray | float = 1.0, seed: int = 1) -> np.ndarray:
 def flagged(chi2: np.ndarray, noise: float, excess: float, limit: float = 1.1) -> np.ndarray:
     ones = np.ones(SHAPE, np.float32)
     count = (FREEDOM + 3) * ones
-    found = fit_flags(
-        np.zeros(SHAPE, np.uint8),
-        100 * ones,
-        80 * ones,
-        0.01 * ones,
-        chi2,
-        count,
-        noise,
-        excess,
-        limit,
+    maps: Any = SimpleNamespace(
+        iota=100 * ones, alpha=80 * ones, sigma=0.01 * ones, chi2=chi2, count=count
     )
+    found = fit_flags(np.zeros(SHAPE, np.uint8), maps, noise, excess, limit)
     return found == PixelFlag.BAD_FIT
 
 

@@ -16,6 +16,7 @@ from pixcal.estimators.frame_series.series import (
 )
 from pixcal.estimators.frame_series.spectral_line import cleared_of_line, find_line
 from pixcal.estimators.frame_series.variance_components import walk_modes
+from pixcal.estimators.fringe_fit.fringes import FrameParameters
 from pixcal.estimators.fringe_fit.tile_fit import Coding
 
 T = 297
@@ -80,8 +81,8 @@ def fringes(seed: int, frames: int = 80) -> FringeEvidence:
     read, shot = np.full(shape, 100.0), np.ones(shape)
     electrons = (mean + np.sqrt(mean + 100) * rng.standard_normal(mean.shape)).astype(np.float32)
     good, dk = rng.random(shape) > 0.02, np.zeros((frames, 2))
-    coding = Coding(1.0, 0.0, NO_SAMPLE)
-    (free, covariance), *_ = free_frames(electrons, coding, g, dk, theta, read, shot, good)
+    coding, start = Coding(1.0, 0.0, NO_SAMPLE), FrameParameters(g, dk, (19.5, 21.5))
+    (free, covariance), *_ = free_frames(electrons, coding, start, theta, read, shot, good)
     return FringeEvidence(
         name="a",
         baseline_mm=(6.0, 0.0),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.detector.neighbours import pair_sums
+from pixcal.estimators.detector.neighbours import NoiseBlock, pair_sums
 
 T, Y, X, MARGIN = 3, 11, 14, 2
 
@@ -17,14 +17,10 @@ def test_they_are_those_of_the_definition(step: tuple[int, int]) -> None:
     root, of_place = rng.standard_normal((T, 2, 2)), rng.standard_normal((2, Y, X))
     covariance = root @ root.swapaxes(1, 2)
     given = [a.astype(np.float32) for a in (residual, variance, charge, *shared)]
-    found, right = pair_sums(
-        *given[:3],
-        (given[3], given[4]),
-        covariance.astype(np.float32),
-        of_place.astype(np.float32),
-        step,
-        MARGIN,
+    noise = NoiseBlock(
+        *given[:3], covariance.astype(np.float32), of_place.astype(np.float32), kept=1.0
     )
+    found, right = pair_sums(noise, (given[3], given[4]), step, MARGIN)
 
     normal, expected = np.zeros((4, 4)), np.zeros(4)
     for t in range(T):

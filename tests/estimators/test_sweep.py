@@ -5,6 +5,7 @@ import pytest
 
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
 from pixcal.estimators.fringe_fit.sweep import (
+    SetSweep,
     frames_to_prime,
     phase_bound,
     plan_batches,
@@ -30,7 +31,8 @@ def sweep(bench, codes, cuts, batch=20):
     blocks = np.split(codes, cuts)
     batches = plan_batches(np.arange(len(codes)) * 0.14, batch)
     k = (2 * np.pi / 5, 0.0)
-    return sweep_tile(tile, blocks, CODING, frames, k, batches, frames_to_prime(frames, 64))
+    common = SetSweep(CODING, frames, k, batches, frames_to_prime(frames, 64))
+    return sweep_tile(tile, blocks, common)
 
 
 @pytest.fixture(scope="module")
@@ -74,9 +76,8 @@ def test_batches_are_fits_of_their_own_frames(case):
     full = np.ones(bench.shape, np.float32)
     tile = Tile((0, 23), (0, 37), full * 256, full, full > 0)
     k = (2 * np.pi / 5, 0.0)
-    only = sweep_tile(
-        tile, [codes[60:120]], CODING, alone, k, plan_batches(np.arange(60) * 0.14, 60), 60
-    )
+    common = SetSweep(CODING, alone, k, plan_batches(np.arange(60) * 0.14, 60), prime=60)
+    only = sweep_tile(tile, [codes[60:120]], common)
     difference = np.angle(np.exp(1j * (maps.phase + maps.batch_phase[1] - only.phase)))
     # Weights come from other start models: the same to a small part of the error.
     assert (difference / only.sigma).std() < 0.05

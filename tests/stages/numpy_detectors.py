@@ -18,7 +18,7 @@ from pixcal.model.config import parse
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.measure_nominal import nominal_bench
 from pixcal.stages.diagnose.nominal import NominalBench
-from pixcal.stages.diagnose.parts import RawFrames, evidence_of, select
+from pixcal.stages.diagnose.parts import RawFrames, RunFrames, evidence_of
 from pixcal.stages.diagnose.windows import Split, split, whole_of
 from pixcal.storage.manifest import read_json
 
@@ -132,21 +132,13 @@ def held_against_nominal(
     def look(raw: RawFrames) -> Evidence:
         return evidence_of(raw, part, detector.shape)
 
+    dtypes = {name: array.dtype for name, array in arrays.items()}
+    frames = RunFrames(acquisition, tables, dtypes, reduce.Config())
     halves = [
-        look(
-            RawFrames(
-                acquisition,
-                {name: array[half[name]] for name, array in arrays.items()},
-                select(tables, half),
-                reduce.Config(),
-            )
-        )
+        look(frames.raw({name: array[half[name]] for name, array in arrays.items()}, half))
         for half in (own.learn, own.test)
     ]
-    dtypes = {name: array.dtype for name, array in arrays.items()}
-    bench = nominal_bench(
-        acquisition, tables, halves, (own.learn, own.test), detector.shape, reduce.Config(), dtypes
-    )
+    bench = nominal_bench(frames, halves, (own.learn, own.test), detector.shape)
     made = [measure(look(bench.simulate(own.test, (), 1000 * seed + n))) for n in range(count)]
     reference = Reference.of(made)
     data = reference.on_scale(measure(halves[1]))

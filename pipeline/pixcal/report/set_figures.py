@@ -148,8 +148,8 @@ def allan_figure(sets: Mapping[str, tuple[Facts, Facts]]) -> Figure:
     }
     unit = unit_for(np.concatenate([c["adev_px"] for c in curves.values()]), "px")
     for n, (name, curve) in enumerate(curves.items()):
-        drawing: Any = {"color": LINES[n % len(LINES)], "aside": 1.012 ** (n - (len(sets) - 1) / 2)}
-        _allan_lines(axes, below, name, *sets[name], curve, unit, **drawing)
+        aside = 1.012 ** (n - (len(sets) - 1) / 2)
+        _allan_lines((axes, below), name, sets[name], curve, unit, LINES[n % len(LINES)], aside)
     below.axhline(1, color=GREY, lw=1.5)
     axes.set(xscale="log", yscale="log")
     axes.xaxis.set_minor_locator(NullLocator())
@@ -165,18 +165,16 @@ def allan_figure(sets: Mapping[str, tuple[Facts, Facts]]) -> Figure:
 
 
 def _allan_lines(
-    axes: Axes,
-    below: Axes,
+    where: tuple[Axes, Axes],
     name: str,
-    measured: Facts,
-    facts: Facts,
+    of_set: tuple[Facts, Facts],
     curve: Mapping[str, F64],
     unit: Unit,
-    *,
     color: str,
     aside: float,
 ) -> None:
     """One set: points, square-root law, bound, knee; ``aside`` shifts its points."""
+    (axes, below), (measured, facts) = where, of_set
     frames, adev, white = curve["frames"], curve["adev_px"], curve["white_expected_px"]
     low, high = curve["adev_lo_px"], curve["adev_hi_px"]
     bars = np.nan_to_num(np.abs(np.stack([adev - low, high - adev])))

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, free_frames
-from pixcal.estimators.fringe_fit.fringes import grid
+from pixcal.estimators.fringe_fit.fringes import FrameParameters, grid
+from pixcal.model.acquisition import FringeSet
 from pixcal.model.arrays import F64, Indices
 from pixcal.model.errors import InputError
 from pixcal.stages.fit.sweep import read_frames
@@ -59,9 +60,7 @@ def evidence_of(
     }
     fringes = {}
     for listed in acquisition.frames.fringes:
-        fringes[listed.name] = _fringes(
-            run_dir, ingested, listed.name, listed.baseline_mm, (y, x), frames, origin, window
-        )
+        fringes[listed.name] = _fringes(run_dir, ingested, listed, (y, x), frames, origin, window)
     used = read_json(run_dir / "reduce" / "reduce.json")
     without_dark = None if black is None else black.without_dark
     if without_dark is None:
@@ -97,24 +96,29 @@ def _photon_transfer(gain: dict[str, Any]) -> tuple[float, float, float]:
     return value, error, chi2
 
 
+def _span(frames: slice, count: int) -> tuple[int, int]:
+    """First of some consecutive frames, and the one after the last."""
+    first, last, step = frames.indices(count)
+    if step != 1:
+        raise ValueError("consecutive frames are needed")
+    return first, last
+
+
 def _fringes(
     run_dir: Local,
     ingested: Ingested,
-    name: str,
-    baseline: tuple[float, float],
+    listed: FringeSet,
     part: Part,
     frames: slice,
     origin: tuple[int, int],
     window: tuple[int, int],
 ) -> FringeEvidence:
+    name = listed.name
     source = ReducedSet(run_dir / "reduce" / "reduced.zarr" / name)
     swept = run_dir / "sweep" / "sweep.zarr" / name
     fitted = run_dir / "fit" / "fit.zarr" / name
     y, x = part
-    times = source.time_s()[frames]
-    first, last, step = frames.indices(source.n_frames)
-    if step != 1:
-        raise ValueError("consecutive frames are needed")
+    first, last = _span(frames, source.n_frames)
     if (last - first) * (y[1] - y[0]) * (x[1] - x[0]) > MAX_SAMPLES:
         raise InputError(f"fringe set {name!r}: more than {MAX_SAMPLES} samples; take a part")
     codes = source.signal.read((first, last), y, x).astype(np.uint16, copy=False)
@@ -124,30 +128,29 @@ def _fringes(
 
     found = read_frames(swept)
     centre = ((y[0] + y[1] - 1) / 2, (x[0] + x[1] - 1) / 2)
-    g, dk = found.at(*centre)[frames], found.dk[frames]
+    start = FrameParameters(found.at(*centre)[frames], found.dk[frames], centre)
     facts = read_json(run_dir / "fit" / "fit.json")["sets"][name]
     theta = fitted_theta(swept, part, found.reference)
     mask = ArrayReader(swept / "mask").read(y, x)
     good = (mask == 0) & np.isfinite(theta).all(axis=0)
     read = ArrayReader(source.folder / "read_variance").read(y, x).astype(float)
     shot = ArrayReader(source.folder / "shot_factor").read(y, x).astype(float)
-    (free, covariance), *halves = free_frames(codes, coding, g, dk, theta, read, shot, good)
+    (free, covariance), *halves = free_frames(codes, coding, start, theta, read, shot, good)
     table = ingested.tables[f"fringes/{name}"]
-    numbers = frame_numbers(table)[frames]
     exposure = table["exptime_s"][0]
     made = FringeEvidence(
         name=name,
-        baseline_mm=baseline,
+        baseline_mm=listed.baseline_mm,
         k=(float(facts["kx"]), float(facts["ky"])),
         origin=origin,
         window=window,
-        frame=numbers,
-        time_s=times,
+        frame=frame_numbers(table)[frames],
+        time_s=source.time_s()[frames],
         exptime_s=np.nan if exposure is None else float(exposure),
         electrons=electrons,
         adu=ingested.arrays[f"fringes/{name}"].read((first, last), y, x),
-        g=g,
-        dk=dk,
+        g=start.g,
+        dk=start.dk,
         free=free,
         free_covariance=covariance,
         theta=theta,

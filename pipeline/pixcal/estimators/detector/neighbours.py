@@ -35,7 +35,7 @@ _CROSSTALK = 13.3
 
 
 @dataclass(frozen=True)
-class _Noise:
+class NoiseBlock:
     """Residuals of a block of frames; all (t, y, x) or (y, x), e- before the flat."""
 
     residual: F32  # zero where a sample is not used
@@ -75,10 +75,7 @@ def shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
                 shared_noise(noise.charge, pushes, shifts, step, (1, 0)),
                 shared_noise(noise.charge, pushes, shifts, step, (0, 1)),
             )
-            more, more_right = pair_sums(
-                noise.residual, noise.variance, noise.charge, shared, noise.covariance,
-                noise.of_place, step, REACH,
-            )  # fmt: skip
+            more, more_right = pair_sums(noise, shared, step, REACH)
             # Only as many products are independent as degrees of freedom: one for two frames.
             normal[np.ix_(at, at)] += noise.kept * more
             right[at] += more_right
@@ -119,14 +116,14 @@ def _without_crosstalk(normal: F64, right: F64) -> tuple[F64, F64]:
     return normal[np.ix_(kept, kept)], right[kept]
 
 
-def _noises(evidence: Evidence) -> Iterator[_Noise]:
+def _noises(evidence: Evidence) -> Iterator[NoiseBlock]:
     for fringes in evidence.fringes.values():
         yield from _of_fringes(fringes, evidence)
     for stack in evidence.of_kind("flat"):
         yield from _of_flats(stack, evidence)
 
 
-def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Iterator[_Noise]:
+def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Iterator[NoiseBlock]:
     count, good = len(fringes.g), fringes.good
     kept = 1 - (2 * HARMONICS + 1) / count
     if kept <= 0:
@@ -145,10 +142,12 @@ def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Iterator[_Noise]
         residual[:, good] = left[frames]
         charge = np.maximum(np.nan_to_num(fringes.model[frames]), 0) * flat
         variance = fringes.variance[frames] * flat**2
-        yield _Noise(residual * flat, variance, charge, covariance[frames], of_place * flat, kept)
+        yield NoiseBlock(
+            residual * flat, variance, charge, covariance[frames], of_place * flat, kept
+        )
 
 
-def _of_flats(stack: Stack, evidence: Evidence) -> Iterator[_Noise]:
+def _of_flats(stack: Stack, evidence: Evidence) -> Iterator[NoiseBlock]:
     if len(stack.adu) < _MIN_FRAMES or not np.isfinite(stack.exptime_s):
         return
     good = evidence.good & (stack.adu < evidence.saturation_adu).all(axis=0)
@@ -167,7 +166,7 @@ def _of_flats(stack: Stack, evidence: Evidence) -> Iterator[_Noise]:
     residual = freedom.left_over(noise.reshape(weight.shape))
     residual[np.abs(residual) * np.sqrt(weight) > _CLIP] = 0
 
-    yield _Noise(
+    yield NoiseBlock(
         residual.reshape(frames.shape), variance.astype(np.float32),
         np.repeat(charge[None], len(frames), 0), freedom.frame_covariance.astype(np.float32),
         freedom.of_place.reshape(1, *good.shape), 1 - 1 / len(frames),
@@ -175,30 +174,25 @@ def _of_flats(stack: Stack, evidence: Evidence) -> Iterator[_Noise]:
 
 
 def pair_sums(
-    residual: F32,
-    variance: F32,
-    charge: F32,
-    shared: tuple[F32, F32],
-    covariance: F32,
-    of_place: F32,
-    step: tuple[int, int],
-    margin: int,
+    noise: NoiseBlock, shared: tuple[F32, F32], step: tuple[int, int], margin: int
 ) -> tuple[F64, F64]:
     """Normal matrix (4, 4) and right-hand side (4,) for products of pixels at a step.
 
     The terms are a constant, the sum of the two charges, and the two ``shared`` noises. The weight
     of a product is one over the product of the two variances.
 
-    residual, variance, charge : (t, y, x) float32; pairs with a zero residual have no weight
+    noise : pairs with a zero residual have no weight; what the fit of the functions of place
+        removed from the product of two residuals is added back
     shared : two (t, y, x) float32, at the first pixel of each pair
-    covariance, of_place : (t, j, j), (j, y, x) float32 of the functions of place fitted to each
-        frame: what the fit removed from the product of two residuals is added back
     step : rows (not negative) and columns to the second pixel
     margin : pixels along the edges that are not used
     """
     sums = np.zeros((_TERMS, _TERMS + 1))
-    scratch = np.empty((2, residual.shape[2]), np.float32)
-    _sum(residual, variance, charge, *shared, covariance, of_place, *step, margin, *scratch, sums)
+    scratch = np.empty((2, noise.residual.shape[2]), np.float32)
+    _sum(
+        noise.residual, noise.variance, noise.charge, *shared, noise.covariance, noise.of_place,
+        *step, margin, *scratch, sums,
+    )  # fmt: skip
     normal = np.triu(sums[:, :_TERMS])
     return normal + np.triu(normal, 1).T, sums[:, _TERMS]
 

@@ -8,7 +8,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.fringe_fit.fringes import grid
+from pixcal.estimators.fringe_fit.fringes import FrameParameters, grid
 from pixcal.estimators.fringe_fit.tile_fit import Coding
 from pixcal.kernels.bilinear import frame_sums
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
@@ -104,7 +104,9 @@ class FringeEvidence:
     def free_of(self, samples: F32) -> tuple[FreeFrames, FreeFrames, FreeFrames]:
         """`free_frames` of samples (t, y, x), e-, `NO_SAMPLE` without weight."""
         pixels = self.theta, self.read_variance, self.shot_factor, self.good
-        return free_frames(samples, Coding(1.0, 0.0, NO_SAMPLE), self.g, self.dk, *pixels)
+        ny, nx = self.good.shape
+        start = FrameParameters(self.g, self.dk, ((ny - 1) / 2, (nx - 1) / 2))
+        return free_frames(samples, Coding(1.0, 0.0, NO_SAMPLE), start, *pixels)
 
 
 Level = tuple[float, int]
@@ -264,8 +266,7 @@ def stripes(shape: tuple[int, ...]) -> Mask:
 def free_frames(
     codes: NDArray[np.generic],
     coding: Coding,
-    g: F64,
-    dk: F64,
+    start: FrameParameters,
     theta: F64,
     read_variance: F64,
     shot_factor: F64,
@@ -276,11 +277,11 @@ def free_frames(
     From all good pixels, and from each half of them by stripes of rows: the bench is common to both
     halves; the noise of samples, and of whole rows, is not.
 
-    ``codes``: (t, y, x) samples as they are stored, or in electrons. ``g, dk``: (t, 3), (t, 2)
-    start, at the middle of the part. The maps are as in `FringeEvidence`.
+    ``codes``: (t, y, x) samples as they are stored, or in electrons. ``start``: at the middle
+    of the part. The maps are as in `FringeEvidence`.
     """
     y, x = np.broadcast_arrays(*grid((good.shape[0], good.shape[1])))
-    start, turned = g.astype(np.float32), dk.astype(np.float32)
+    g, dk = start.g.astype(np.float32), start.dk.astype(np.float32)
 
     def sums(good: Mask) -> tuple[F64, F64]:
         used, n = np.flatnonzero(good), len(g)
@@ -288,13 +289,13 @@ def free_frames(
         samples = np.take(codes.reshape(n, -1), used, axis=1).astype(np.float32, copy=False)
         maps = (y, x, theta, read_variance, shot_factor)
         pixels = (np.ascontiguousarray(one[..., good], np.float32) for one in maps)
-        frame_sums(samples, *coding, start, turned, *pixels, packed, right)
+        frame_sums(samples, *coding, g, dk, *pixels, packed, right)
         return packed, right
 
     def solved(packed: F64, right: F64) -> FreeFrames:
         covariance = inverse_normal(symmetric(packed), 1e-10)
         step = np.einsum("tij,tj->ti", covariance, right)
-        return np.hstack([start, turned]) + step, covariance
+        return np.hstack([g, dk]) + step, covariance
 
     own = stripes(good.shape)
     one, other = sums(good & own), sums(good & ~own)

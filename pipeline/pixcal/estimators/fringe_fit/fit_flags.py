@@ -4,7 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from pixcal.model.arrays import F32, U8
+from pixcal.estimators.fringe_fit.sweep import TileMaps
+from pixcal.model.arrays import U8
 from pixcal.model.flags import PixelFlag
 
 # largest phase error: beyond it errors are not Gaussian, and deviations of 6 sigma occur (with 0.3
@@ -16,31 +17,20 @@ MAX_VISIBILITY = 1.05
 NOISE_MARGIN_SIGMA = 6.0  # standard errors by which noise may exceed this limit
 
 
-def fit_flags(
-    mask: U8,
-    iota: F32,
-    alpha: F32,
-    sigma: F32,
-    chi2: F32,
-    count: F32,
-    noise: float,
-    excess: float,
-    chi2_limit: float,
-) -> U8:
+def fit_flags(mask: U8, maps: TileMaps, noise: float, excess: float, chi2_limit: float) -> U8:
     """Flags of pixels: those of the reduction, and NO_DATA and BAD_FIT of the fit.
 
-    iota, alpha, sigma, chi2, count : (y, x) of the sweep: mean and amplitude (e-), error of
-        the phase (rad), reduced chi-square, samples
     noise : usual reduced chi-square, which is not 1 if the noise model is off by a factor
     excess : relative scatter of reduced chi-squares beyond chance, which is not a defect
     chi2_limit : largest reduced chi-square, over ``noise``, of a good pixel
     """
+    iota, alpha, sigma = maps.iota, maps.alpha, maps.sigma
     flags = mask.copy()
-    flags[count == 0] |= np.uint8(PixelFlag.NO_DATA)
+    flags[maps.count == 0] |= np.uint8(PixelFlag.NO_DATA)
     # A reduced chi-square scatters by sqrt(2 / n) by chance.
-    scatter = 8 * np.sqrt(2 / np.maximum(count - 3, 1) + excess**2)
+    scatter = 8 * np.sqrt(2 / np.maximum(maps.count - 3, 1) + excess**2)
     with np.errstate(invalid="ignore"):
-        good = np.isfinite(sigma) & (chi2 / noise < np.maximum(chi2_limit, 1 + scatter))
+        good = np.isfinite(sigma) & (maps.chi2 / noise < np.maximum(chi2_limit, 1 + scatter))
         good &= (iota > 0) & (sigma < MAX_SIGMA_RAD)
         # Noise that raises an amplitude lowers its phase error: use the median visibility.
         usual = np.nanmedian((alpha / iota)[good]) if good.any() else np.float32(1.0)

@@ -88,21 +88,21 @@ def frames_to_prime(frames: FrameParameters, block: int) -> int:
     return n
 
 
-def sweep_tile(
-    tile: Tile,
-    blocks: Iterable[U16],
-    coding: Coding,
-    frames: FrameParameters,
-    k: tuple[float, float],
-    batches: FrameBatches,
-    prime: int,
-    bound_pixels: int = BOUND_PIXELS,
-) -> TileMaps:
-    """Fit a tile, taking its blocks (t, y, x) of stored codes one after the other.
+@dataclass(frozen=True)
+class SetSweep:
+    """What the sweeps of all tiles of a set have in common."""
 
-    ``k``: carrier (kx, ky), rad/px. ``prime``: first frames held until the start model is made
-    (`frames_to_prime`). ``bound_pixels``: pixels for which the Cramér-Rao bound is computed.
-    """
+    coding: Coding
+    frames: FrameParameters
+    k: tuple[float, float]  # carrier (kx, ky), rad/px
+    batches: FrameBatches
+    prime: int  # first frames held until the start model is made (`frames_to_prime`)
+    bound_pixels: int = BOUND_PIXELS  # pixels for which the Cramér-Rao bound is computed
+
+
+def sweep_tile(tile: Tile, blocks: Iterable[U16], common: SetSweep) -> TileMaps:
+    """Fit a tile, taking its blocks (t, y, x) of stored codes one after the other."""
+    frames = common.frames
     held: list[U16] = []
     sums: PixelSums | None = None
     for block in blocks:
@@ -111,27 +111,21 @@ def sweep_tile(
             continue
         held.append(block.copy())
         n_held = sum(map(len, held))
-        if n_held < prime and n_held < len(frames.g):
+        if n_held < common.prime and n_held < len(frames.g):
             continue
         first = FrameParameters(frames.g[:n_held], frames.dk[:n_held], frames.reference)
-        model, smooth = start_model(tile, held, coding, first, k)
-        sums = PixelSums(tile, coding, frames, model, batches.ranges)
+        model, smooth = start_model(tile, held, common.coding, first, common.k)
+        sums = PixelSums(tile, common.coding, frames, model, common.batches.ranges)
         while held:
             sums.add(held.pop(0))
     if sums is None or sums.position != len(frames.g):
         given = sum(map(len, held)) if sums is None else sums.position
         raise ValueError(f"{given} frames given, {len(frames.g)} expected")
-    return _maps(tile, frames, smooth, sums, k, bound_pixels)
+    return _maps(tile, common, smooth, sums)
 
 
-def _maps(
-    tile: Tile,
-    frames: FrameParameters,
-    smooth: SmoothPhasor,
-    sums: PixelSums,
-    k: tuple[float, float],
-    bound_pixels: int,
-) -> TileMaps:
+def _maps(tile: Tile, common: SetSweep, smooth: SmoothPhasor, sums: PixelSums) -> TileMaps:
+    frames, k = common.frames, common.k
     theta, sigma, chi2, count = sums.finish()
     z = theta[2] + 1j * theta[1]
     (cy, cx), (ry, rx) = tile.centre, frames.reference
@@ -149,7 +143,7 @@ def _maps(
         smooth=smooth,
         batch_phase=_relative(sums.turn, turn),
         batch_sigma=sums.sigma,
-        bound=phase_bound(tile, theta, frames, bound_pixels),
+        bound=phase_bound(tile, theta, frames, common.bound_pixels),
     )
 
 

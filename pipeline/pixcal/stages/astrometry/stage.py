@@ -106,7 +106,6 @@ def _measure(
     """Run all measurements and write the artefact's files."""
     shape = components[0].delta.shape
     observed = _star(telescope, config, acquisition, shape)
-    psf, half = observed.psf, observed.half
     need = planned(shape, modes.number if modes else 0, observed.side, config)
     runtime = within_memory("astrometry", *need, runtime)
     removed = None
@@ -141,20 +140,26 @@ def _measure(
             "background_e": config.background_e,
             "window_px": observed.side,
             "seed": config.seed,
-            "exposures": exposures(psf, config.electrons, acquisition.detector),
+            "exposures": exposures(observed.psf, config.electrons, acquisition.detector),
             "read_noise_e": acquisition.detector.read_noise_e,
         },
         "axes": _axes(detector, observed, errors, maps, telescope),
     }
     result["warnings"] = _warnings(result)
     write_json(made.folder / "astrometry.json", result)
-    # Photon noise (px, the mean of both axes) of other stars.
-    share = config.background_e / config.electrons
-    others = (star(psf, half, n, share * n, acquisition.detector) for n in CURVE)
-    photons = [np.sqrt(np.mean(other.bound() ** 2)) for other in others]
+    photons = _photon_noise(observed, config.background_e / config.electrons, acquisition)
     view = _view(result, detector, observed, maps, np.stack([CURVE, photons]))
     (made.folder / "astrometry.png").write_bytes(png(astrometry_figure(view)))
     made.summary = {"warnings": result["warnings"]}
+
+
+def _photon_noise(observed: Star, share: float, acquisition: Acquisition) -> list[float]:
+    """Photon noise (px, the mean of both axes) of stars as bright as `CURVE`.
+
+    ``share``: background over the light of the star.
+    """
+    others = (star(observed.psf, observed.half, n, share * n, acquisition.detector) for n in CURVE)
+    return [float(np.sqrt(np.mean(other.bound() ** 2))) for other in others]
 
 
 def _star(

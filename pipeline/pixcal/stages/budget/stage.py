@@ -3,7 +3,7 @@
 docs/reference/products.md describes ``budget.json``.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -89,17 +89,9 @@ def _budget(
     counts = [s.count for s in f.fringes]
     given = None if frames is None else np.full(len(counts), frames)
 
-    def cost(variance: float) -> dict[str, Any] | None:
-        """Frames for the precision, their time and their bytes."""
-        if precision is None:
-            return None
-        n = frames_needed(variance, precision)
-        size = n * d.shape[0] * d.shape[1] * 2  # two bytes a sample
-        return {"frames": n, "hours": n * f.period_s / 3600, "bytes": size}
-
     def facts(reach: Reach, one: Shares, planned: Shares, given: Shares | None) -> dict[str, Any]:
         """Precision of one frame and of given frames, and the cost of the required precision."""
-        (median, worst), wanted = reach(one), cost(reach(one)[0])
+        (median, worst), wanted = reach(one), _cost(bench, reach(one)[0], precision)
         if wanted and precision is not None:
             wanted["frames_worst"] = frames_needed(worst, precision)
         return {
@@ -111,19 +103,17 @@ def _budget(
 
     sets = {}
     for n, (scan, s) in enumerate(zip(f.fringes, bound.sets, strict=True)):
-        alone = None if frames is None else [frames]
         shares = s.shares()
-        factors = {name: value for name, value in shares.items() if name != "photons"}
-        largest = max(factors, key=lambda name: factors[name])
+        limited_by = _limited_by(shares)
         if precision is not None:
             shares["photons_frames"] = frames_needed(shares["photons"], precision)
         sets[scan.name] = {
             "interfringe_px": s.interfringe,
             "mean_e": float(np.median(s.iota)),
             "visibility": s.visibility,
-            **facts(s.reach, [1], [counts[n]], alone),
+            **facts(s.reach, [1], [counts[n]], None if frames is None else [frames]),
             "shares": shares,
-            "limited_by": largest if factors[largest] > DOMINANT else "photons",
+            "limited_by": limited_by,
             "calibration": _calibration(bench, s),
         }
     components = {
@@ -141,7 +131,7 @@ def _budget(
         "sets": sets,
         "joined": {
             "components": components,
-            "wanted": cost(float(bound.median(split).max())),
+            "wanted": _cost(bench, float(bound.median(split).max()), precision),
             "split": split.tolist(),
             "best_split": bound.best_split().tolist(),
         },
@@ -157,6 +147,22 @@ def _budget(
 def _time(variance: float, period_s: float, precision: float | None) -> dict[str, Any]:
     frames = None if precision is None else frames_needed(variance, precision)
     return {"frames": frames, "hours": None if frames is None else frames * period_s / 3600}
+
+
+def _limited_by(shares: Mapping[str, float]) -> str:
+    """The largest of the shares if it dominates, else photons."""
+    others = {name: value for name, value in shares.items() if name != "photons"}
+    largest = max(others, key=lambda name: others[name])
+    return largest if others[largest] > DOMINANT else "photons"
+
+
+def _cost(bench: Bench, variance: float, precision: float | None) -> dict[str, Any] | None:
+    """Frames for a precision, their time and their bytes."""
+    if precision is None:
+        return None
+    n, (ny, nx) = frames_needed(variance, precision), bench.detector.shape
+    hours = n * bench.frames.period_s / 3600
+    return {"frames": n, "hours": hours, "bytes": n * ny * nx * 2}  # two bytes a sample
 
 
 def _reached(reach: Reach, frames: Shares) -> dict[str, Any]:

@@ -116,17 +116,7 @@ def find_crests(
     size. ``k``: near its centre, rad/px. ``segment``: pixels along the fringes that share a point.
     Raises InputError if there are too few fringes, or too few windows show them.
     """
-    carrier, windows = CrestCarrier.straight(k, frame), Windows.lay(frame, k, segment)
-    for _ in range(SETTLING):
-        phase, sigma, light = _window_phases(accumulate(0, windows, carrier), windows)
-        _check(np.isfinite(sigma))
-        followed = _follow(windows, phase, sigma, carrier)
-        carrier = replace(
-            carrier, phase=followed, light=_brightened(windows, light, sigma, carrier)
-        )
-        kx, ky = (float(v) for v in carrier.vector(*np.array(carrier.centre)))
-        windows = Windows.lay(frame, (kx, ky), segment)
-
+    carrier, windows, vector = _from_first_frame(accumulate, frame, k, segment)
     phi = np.full(n_frames, np.nan)
     total, weight = np.zeros(windows.shape), np.zeros(windows.shape)
     for n in range(n_frames):
@@ -163,10 +153,28 @@ def find_crests(
         weight[use] ** -0.5,
         np.hypot(*carrier.vector(y, x)),
         phi - start,
-        (kx, ky),
+        vector,
         frame,
         windows.size[1],
     )
+
+
+def _from_first_frame(
+    accumulate: Accumulate, frame: tuple[int, int], k: Vector, segment: int | None
+) -> tuple[CrestCarrier, Windows, Vector]:
+    """Carrier that follows the first frame, windows along it, and its vector at the centre."""
+    carrier, windows, vector = CrestCarrier.straight(k, frame), Windows.lay(frame, k, segment), k
+    for _ in range(SETTLING):
+        phase, sigma, light = _window_phases(accumulate(0, windows, carrier), windows)
+        _check(np.isfinite(sigma))
+        followed = _follow(windows, phase, sigma, carrier)
+        carrier = replace(
+            carrier, phase=followed, light=_brightened(windows, light, sigma, carrier)
+        )
+        kx, ky = carrier.vector(*np.array(carrier.centre))
+        vector = float(kx), float(ky)
+        windows = Windows.lay(frame, vector, segment)
+    return carrier, windows, vector
 
 
 def _check(use: Mask) -> None:

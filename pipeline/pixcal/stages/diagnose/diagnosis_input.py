@@ -14,9 +14,9 @@ from pixcal.model.errors import InputError
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.frames_used import FramesUsed, frames_of, missing_frames
 from pixcal.stages.diagnose.measure_nominal import nominal_bench
-from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, evidence_of, take
+from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, RunFrames, evidence_of, take
 from pixcal.stages.diagnose.trial import Curves, Signature, Window, averaged, measured_curves
-from pixcal.stages.diagnose.windows import chosen_windows, frames_of_half, split
+from pixcal.stages.diagnose.windows import Split, chosen_windows, frames_of_half, split
 from pixcal.stages.evidence import Part
 from pixcal.stages.reduce.black_cut_off import Black
 from pixcal.stages.reduce.ingested import Ingested
@@ -60,28 +60,21 @@ def prepare_input(
     part cannot be fitted.
     """
     ingested = Ingested(run_dir / "ingest")
-    acquisition, reduction = _acquisition(run_dir, ingested), _reduction(run_dir)
-    shape = ingested.shape
-    fringes = acquisition.frames.fringes
+    frames, shape = _run_frames(run_dir, ingested), ingested.shape
+    fringes = frames.acquisition.frames.fringes
     first, parts = chosen_windows(shape, 0 if fringes else frames_of_half(ingested.tables))
     pixels = (first[0][1] - first[0][0]) * (first[1][1] - first[1][0])
-    reduced = read_json(run_dir / "reduce" / "reduce.json")
-    black = Black(ingested.cut_off, reduced["gain_e_per_adu"].get("without_dark"))
-    own = split(ingested.tables, pixels, reduced["saturation_adu"].get("full_frames", ()))
+    saturation = read_json(run_dir / "reduce" / "reduce.json")["saturation_adu"]
+    own = split(ingested.tables, pixels, saturation.get("full_frames", ()))
     _enough(own.test)
     runtime, few, room = _memory(own.test, pixels, runtime)
-    dtypes = {name: array.dtype for name, array in ingested.arrays.items()}
     windows: list[Window] = []
     left_out: list[dict[str, Any]] = []
     measured: list[Curves] = []
     signatures: tuple[Signature, ...] = ()
-    seed: int | None = None
     for part in dict.fromkeys((first, *parts)):
-        raws = [
-            take(ingested, acquisition, half, part, reduction, black)
-            for half in (own.learn, own.test)
-        ]
-        seed = raws[0].checksum if seed is None else seed
+        raws = [take(ingested, frames, half, part) for half in (own.learn, own.test)]
+        seed = windows[0].seed if windows else raws[0].checksum
         try:
             number = len(windows) + len(left_out) + 1
             halves = _evidence(run_dir, part, shape, raws, runtime, number)
@@ -98,34 +91,45 @@ def prepare_input(
         halves = [replace(half, full=full) for half in halves]
         if not windows:
             signatures = tuple(on_evidence(halves[0], halves[1], few))
-        bench = nominal_bench(
-            acquisition,
-            ingested.tables,
-            halves,
-            (own.learn, own.test),
-            shape,
-            reduction,
-            dtypes,
-            black,
-        )
-        assert seed is not None
+        bench = nominal_bench(frames, halves, (own.learn, own.test), shape)
         windows.append(Window(part, bench, own.learn, own.test, shape, seed, full))
         if part in parts:
             measured.append(measured_curves(halves[1], signatures))
     tried = tuple(w for w in windows if w.part in parts)
-    steps = [s.step for s in windows[0].bench.measured.sets]
-    facts = FramesUsed(
-        shape,
-        {"window": first, "frames": frames_of(own.learn)},
-        {"windows": tuple(w.part for w in tried), "frames": frames_of(own.test)},
-        tuple(left_out),
-        tuple(name for name, frames in own.learn.items() if set(frames) & set(own.test[name])),
-        tuple(kind for kind in ("bias", "dark", "flat") if kind in ingested.tables),
-        {s.name: s.baseline_mm for s in acquisition.frames.fringes},
-        missing_frames(acquisition, ingested.tables, steps),
-    )
+    facts = _frames_used(frames, own, windows[0], tried, left_out)
     return DiagnosisInput(
         windows[0], tried, tuple(measured), averaged(measured), facts, runtime, few, room
+    )
+
+
+def _run_frames(run_dir: Path, ingested: Ingested) -> RunFrames:
+    gain = read_json(run_dir / "reduce" / "reduce.json")["gain_e_per_adu"]
+    return RunFrames(
+        _acquisition(run_dir, ingested),
+        ingested.tables,
+        {name: array.dtype for name, array in ingested.arrays.items()},
+        _reduction(run_dir),
+        Black(ingested.cut_off, gain.get("without_dark")),
+    )
+
+
+def _frames_used(
+    frames: RunFrames,
+    own: Split,
+    first: Window,
+    tried: Sequence[Window],
+    left_out: Sequence[dict[str, Any]],
+) -> FramesUsed:
+    steps = [s.step for s in first.bench.measured.sets]
+    return FramesUsed(
+        first.whole,
+        {"window": first.part, "frames": frames_of(own.learn)},
+        {"windows": tuple(w.part for w in tried), "frames": frames_of(own.test)},
+        tuple(left_out),
+        tuple(name for name, some in own.learn.items() if set(some) & set(own.test[name])),
+        tuple(kind for kind in ("bias", "dark", "flat") if kind in frames.tables),
+        {s.name: s.baseline_mm for s in frames.acquisition.frames.fringes},
+        missing_frames(frames.acquisition, frames.tables, steps),
     )
 
 

@@ -16,17 +16,14 @@ from pixcal.kernels.processes import ramp_step
 from pixcal.kernels.robust import median_and_sigma, robust_sigma
 from pixcal.kernels.rounding import level_before_rounding
 from pixcal.kernels.scene import DetectorMaps
-from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F32, F64, Indices, Mask
 from pixcal.simulation.effect import FittedFrames
-from pixcal.stages import reduce
 from pixcal.stages.diagnose.description import bench_of, pedestal_of, recordings_of
 from pixcal.stages.diagnose.fitted_set import FittedSet, contrast_surface, light_surface
 from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain
 from pixcal.stages.diagnose.nominal import Measured, NominalBench, SetTruth, uncoupled
-from pixcal.stages.diagnose.parts import FrameSubset, Table
-from pixcal.stages.reduce.black_cut_off import Black
+from pixcal.stages.diagnose.parts import FrameSubset, RunFrames
 from pixcal.stages.reduce.calibration import FLAT_FLOOR
 
 MAX_GAIN_CHI2 = 10.0  # reduced chi-square of the photon transfer above which its gain is not used
@@ -35,21 +32,17 @@ _MOST_UNLIT = 0.5  # largest share of unlit pixels for which the lit ones set th
 
 
 def nominal_bench(
-    acquisition: Acquisition,
-    tables: Mapping[str, Table],
+    frames: RunFrames,
     evidence: Sequence[Evidence],
     halves: Sequence[FrameSubset],
     whole: tuple[int, int],
-    reduction: reduce.Config,
-    dtypes: Mapping[str, np.dtype[Any]],
-    black: Black | None = None,
 ) -> NominalBench:
     """The nominal bench measured from one or more parts of an acquisition.
 
     ``evidence``: of the same pixels, of each of the ``halves``. ``whole``: detector's window (y,
     x).
     """
-    one = evidence[0]
+    one, tables, dtypes = evidence[0], frames.tables, frames.dtypes
     good = np.all([e.good for e in evidence], axis=0)
     names = list(one.fringes)
     with_flats = "flat" in tables
@@ -74,13 +67,10 @@ def nominal_bench(
         adu_per_e=np.full(good.shape, 1 / one.gain, np.float32),
         mask=np.where(good, 0, 1).astype(np.uint8),
     )
-    bench = bench_of(acquisition, tables, one, whole, sets, dtypes)
-    recordings, places, light = recordings_of(bench, acquisition, tables, evidence, halves)
+    bench = bench_of(frames.acquisition, tables, one, whole, sets, dtypes)
+    recordings, places, light = recordings_of(bench, frames.acquisition, tables, evidence, halves)
     return NominalBench(
-        acquisition,
-        tables,
-        reduction,
-        dtypes,
+        frames,
         bench,
         Measured(maps, sets, FlatLight.of(evidence, light)),
         _pixel_noise(evidence, halves, good),
@@ -89,7 +79,6 @@ def nominal_bench(
         pedestal_of(evidence, dtypes, bench.detector.step_adu),
         tuple(recordings),
         tuple(places),
-        black,
     )
 
 

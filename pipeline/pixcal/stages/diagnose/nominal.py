@@ -7,9 +7,9 @@ errors. Fringes, repeating rows or columns, and curvature are removed from the o
 foundry makes them: only an effect may produce them in a simulation.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -19,7 +19,6 @@ from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.beams import Light
 from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.scene import DetectorMaps, FrameStates, Rows
-from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F32, F64, Indices
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
@@ -27,12 +26,10 @@ from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import SEEDS_APART, Recording
 from pixcal.simulation.replica import TOP_ADU, OfAcquisition
 from pixcal.simulation.shot import Shot
-from pixcal.stages import reduce
 from pixcal.stages.diagnose.fitted_set import FittedSet, IntensityBeforeEffects
 from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_change
-from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, Table, select
-from pixcal.stages.reduce.black_cut_off import Black
+from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, RunFrames
 
 _GAIN, _NOISE, _DARK = 101, 102, 103  # keys of random numbers
 _WHITE = 1e-3  # least share of the variance of the read noise that effects leave
@@ -98,10 +95,7 @@ class Measured(OfAcquisition):
 class NominalBench:
     """An acquisition's nominal bench, to simulate the same frames."""
 
-    acquisition: Acquisition
-    tables: Mapping[str, Table]  # of all frames, as in ``frames.json``
-    reduction: reduce.Config
-    dtypes: Mapping[str, np.dtype[Any]]  # of the samples of each array
+    frames: RunFrames
     bench: Bench  # geometry and other properties that effects use
     measured: Measured  # without offsets
     noise: PixelNoise | None  # read noise of the pixels
@@ -113,7 +107,6 @@ class NominalBench:
     recordings: tuple[Recording, ...]
     # array of each recording and the numbers of its frames there
     places: tuple[tuple[str, Indices], ...]
-    black: Black | None = None  # known of the camera from the whole run
 
     def simulate(
         self, half: FrameSubset, effects: Sequence[Effect], seed: int, *, window: int = 0
@@ -144,7 +137,7 @@ class NominalBench:
         measured = self._electronics(measured, (seed, own_seed), change, added)
         camera = Camera(bench, rows, [measured, *effects], maps=measured.maps)
         arrays = {
-            name: np.empty((len(frames), *bench.detector.shape), self.dtypes[name])
+            name: np.empty((len(frames), *bench.detector.shape), self.frames.dtypes[name])
             for name, frames in half.items()
         }
         levels = measured.lamp.levels(self.recordings, undone)
@@ -165,9 +158,7 @@ class NominalBench:
             for frame, samples in camera.expose(own, wanted.tolist()):
                 at = int(np.searchsorted(half[name], numbers[frame]))
                 arrays[name][at] = samples - np.float32(self.pedestal)
-        return RawFrames(
-            self.acquisition, arrays, select(self.tables, half), self.reduction, self.black
-        )
+        return self.frames.raw(arrays, half)
 
     def _of_measured_k(
         self, measured: Measured, bench: Bench, effects: Sequence[Effect]

@@ -59,20 +59,29 @@ class RawFrames:
         return found
 
 
-def take(
-    ingested: Ingested,
-    acquisition: Acquisition,
-    half: FrameSubset,
-    part: Part,
-    reduction: reduce.Config,
-    black: Black | None = None,
-) -> RawFrames:
+@dataclass(frozen=True)
+class RunFrames:
+    """The frames of a run without their samples."""
+
+    acquisition: Acquisition
+    tables: Mapping[str, Table]  # properties of all frames, as in ``frames.json``
+    dtypes: Mapping[str, np.dtype[Any]]  # of the samples of each array
+    reduction: reduce.Config  # how to reduce them
+    black: Black | None = None  # known of the camera
+
+    def raw(self, arrays: Mapping[str, Frames], half: FrameSubset) -> RawFrames:
+        """Some of the frames, with their samples."""
+        tables = select(self.tables, half)
+        return RawFrames(self.acquisition, arrays, tables, self.reduction, self.black)
+
+
+def take(ingested: Ingested, frames: RunFrames, half: FrameSubset, part: Part) -> RawFrames:
     """Read a part of a run's frames."""
     arrays = {}
-    for name, frames in half.items():
+    for name, numbers in half.items():
         array = ingested.arrays[name]
-        arrays[name] = np.concatenate([array.read(run, *part) for run in runs(frames)])
-    return RawFrames(acquisition, arrays, select(ingested.tables, half), reduction, black)
+        arrays[name] = np.concatenate([array.read(run, *part) for run in runs(numbers)])
+    return frames.raw(arrays, half)
 
 
 def select(tables: Mapping[str, Table], half: FrameSubset) -> dict[str, Table]:

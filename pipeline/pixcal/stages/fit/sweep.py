@@ -22,7 +22,7 @@ from pixcal.estimators.fringe_fit.fringes import FrameParameters
 from pixcal.estimators.fringe_fit.scout import Scout, serial_map
 from pixcal.estimators.fringe_fit.sweep import (
     BOUND_PIXELS,
-    FrameBatches,
+    SetSweep,
     TileMaps,
     frames_to_prime,
     plan_batches,
@@ -116,10 +116,8 @@ class _Job:
 
     source: ReducedSet
     writers: dict[str, ArrayWriter]
-    frames: FrameParameters
+    common: SetSweep
     carrier: Carrier
-    batches: FrameBatches
-    prime: int
     noise: float
     excess_scatter: float
     chi2_limit: float
@@ -158,14 +156,15 @@ def sweep_set(
     runtime = within_memory(f"the fit of {name}", per_task, CACHE_BYTES, runtime)
     carrier = Carrier((float(facts["k"][0]), float(facts["k"][1])), frames.reference)
     usual = (facts["noise"], facts["excess_scatter"])
-    job = _Job(source, writers, frames, carrier, batches, prime, *usual, config.chi2_limit)
+    number = _bound_pixels(source)
+    common = SetSweep(source.coding, frames, carrier.k, batches, prime, number)
+    job = _Job(source, writers, common, carrier, *usual, config.chi2_limit)
     steps = {f"{name}:{strip[0]}": strip for strip in source.strips()}
     run_steps(made, partial(_sweep_strip, job), steps, runtime, label=f"fit {name}")
     for writer in writers.values():
         writer.finish()
     table = ArrayReader(folder / "tiles").read()
-    bounds = table[..., 1 : 1 + _bound_pixels(source)]
-    chi2 = table[..., 1 + _bound_pixels(source) :]
+    bounds, chi2 = table[..., 1 : 1 + number], table[..., 1 + number :]
     chi2 = chi2[np.isfinite(chi2)]
     return facts | {
         "chunks": source.signal.n_chunks,
@@ -229,34 +228,15 @@ def _sweep_tile(job: _Job, at: tuple[int, int]) -> dict[str, NDArray[Any]]:
     source = job.source
     tile, mask = source.tile(at), source.mask(at)
     fresh = sum(not source.signal.holds((n, *at)) for n in range(source.n_blocks))
-    number = _bound_pixels(source)
-    maps = sweep_tile(
-        tile,
-        source.blocks(at),
-        source.coding,
-        job.frames,
-        job.carrier.k,
-        job.batches,
-        job.prime,
-        number,
-    )
-    flags = fit_flags(
-        mask,
-        maps.iota,
-        maps.alpha,
-        maps.sigma,
-        maps.chi2,
-        maps.count,
-        job.noise,
-        job.excess_scatter,
-        job.chi2_limit,
-    )
+    maps = sweep_tile(tile, source.blocks(at), job.common)
+    flags = fit_flags(mask, maps, job.noise, job.excess_scatter, job.chi2_limit)
     usable = (mask == 0) & np.isfinite(maps.chi2)
     chi2 = maps.chi2[usable]
     chi2 = chi2[:: -(-len(chi2) // _chi2_pixels(source)) or 1]
     facts = np.full((1, 1, job.writers["tiles"].shape[2]), np.nan)
     facts[0, 0, 0] = fresh
     facts[0, 0, 1 : 1 + len(maps.bound)] = maps.bound
+    number = job.common.bound_pixels
     facts[0, 0, 1 + number : 1 + number + len(chi2)] = chi2
     sums = _sums(job, tile, maps, flags == 0)[None, None]
     found = {name: getattr(maps, name) for name in MAPS}
@@ -311,6 +291,13 @@ def scout_tiles(grid: tuple[int, int], number: int) -> list[tuple[int, int]]:
     return [(int(tiles[n][0]), int(tiles[n][1])) for n in chosen]
 
 
+def _write_frames(folder: Local, parts: Sequence[FrameParameters], time_s: F64) -> None:
+    g = np.concatenate([p.g for p in parts])
+    dk = np.concatenate([p.dk for p in parts])
+    for array, data in (("g", g), ("dk", dk), ("time", time_s)):
+        write_array(folder / array, data, dims=("time", "component")[: data.ndim])
+
+
 def scout_set(
     source: ReducedSet, nominal: tuple[float, float], folder: Local, runtime: Runtime, name: str
 ) -> None:
@@ -355,11 +342,7 @@ def scout_set(
             runtime,
             label=f"scout {name}",
         )
-    g = np.concatenate([p.g for p in parts])
-    dk = np.concatenate([p.dk for p in parts])
-    for array, data in (("g", g), ("dk", dk), ("time", source.time_s())):
-        dims = ("time", "component")[: data.ndim]
-        write_array(folder / array, data, dims=dims)
+    _write_frames(folder, parts, source.time_s())
     again = 0 if keep else len(places) * (source.n_blocks + len(first))
     facts: dict[str, Any] = {
         "k": [float(v) for v in scout.k],

@@ -52,7 +52,7 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
 
 
 def _gain_warnings(fit: GainFit, summary: Summary, used: float) -> list[str]:
-    warnings, declared, step = [], summary.declared.gain_e_per_adu, summary.step
+    warnings = []
     if fit.chi2_reduced > _ROUGH:
         warnings.append(
             "the points of the photon-transfer curve deviate from a smooth curve by more than "
@@ -92,26 +92,31 @@ def _gain_warnings(fit: GainFit, summary: Summary, used: float) -> list[str]:
             "that at level zero; possible causes: a nonlinear response, or the brighter-fatter "
             "effect"
         )
+    return warnings + _declared_gain_warnings(fit, summary, used)
+
+
+def _declared_gain_warnings(fit: GainFit, summary: Summary, used: float) -> list[str]:
+    """That no gain is declared, or another one than measured."""
+    declared, step = summary.declared.gain_e_per_adu, summary.step
     value, error = fit.gain, fit.error
     if declared is None:
         return [
-            *warnings,
-            f"no gain is declared: the flats give the gain used, {used:.4g} ± {error:.2g} e-/ADU",
+            f"no gain is declared: the flats give the gain used, {used:.4g} ± {error:.2g} e-/ADU"
         ]
-    if abs(value - declared) > max(3 * error, 0.02 * declared):
-        warnings.append(
-            f"photon transfer gives a gain of {value:.4g} ± {error:.2g} e-/ADU, not the "
-            f"{declared:g} of detector.gain_e_per_adu: "
-            + (
-                f"samples are multiples of {step:g} ADU, so the gain of one step of the converter "
-                f"must be divided by {step:g}; "
-                if step > 1 and abs(value * step - declared) < _OF_STEP * declared
-                else ""
-            )
-            + (
-                "correct it, or use '--gain measured'; the declared value is used now"
-                if used == declared
-                else "the measured value is used"
-            )
+    if abs(value - declared) <= max(3 * error, 0.02 * declared):
+        return []
+    return [
+        f"photon transfer gives a gain of {value:.4g} ± {error:.2g} e-/ADU, not the "
+        f"{declared:g} of detector.gain_e_per_adu: "
+        + (
+            f"samples are multiples of {step:g} ADU, so the gain of one step of the converter "
+            f"must be divided by {step:g}; "
+            if step > 1 and abs(value * step - declared) < _OF_STEP * declared
+            else ""
         )
-    return warnings
+        + (
+            "correct it, or use '--gain measured'; the declared value is used now"
+            if used == declared
+            else "the measured value is used"
+        )
+    ]

@@ -89,19 +89,30 @@ def find_stays(
 
     if mean[0] < CLEAR * covariance[0, 0] ** 0.5:
         return None
-    tried = [(decades, *fitted(decades)) for decades in DECADES]
-    best = min(tried[1:], key=lambda one: one[1])
-    if tried[0][1] - best[1] < DIFFER:
-        best = tried[0]
-    decades, chi2, (_, log_time), (_, error) = best
+    chosen = _best_range([fitted(decades) for decades in DECADES])
+    if chosen is None:
+        return None
+    decades, log_time, error = chosen
+    time = float(np.exp(log_time))
+    return Stays(time, decades, upper), min(error, 1.0) * time
+
+
+def _best_range(tried: Sequence[tuple[float, F64, F64]]) -> tuple[float, float, float] | None:
+    """Best of `DECADES`, the logarithm of its time, and its error; None if no fit is determined.
+
+    ``tried``: chi-square, (variance factor, logarithm of the time), and errors, of each range.
+    """
+    best = 1 + min(range(len(tried) - 1), key=lambda n: tried[1 + n][0])
+    if tried[0][0] - tried[best][0] < DIFFER:
+        best = 0
+    chi2, (_, log_time), (_, error) = tried[best]
     if not np.isfinite(chi2):
         return None
     # Another range of the times, with another mean, may be the true one.
-    chi2s, times = (np.array([one[n] for one in tried]) for n in (1, 2))
+    chi2s, times = (np.array([one[n] for one in tried]) for n in (0, 1))
     chance = np.exp((chi2 - chi2s) / 2) * np.where(np.array(DECADES) > 0, 1 / len(DECADES), 1)
     other = float(chance @ (times[:, 1] - log_time) ** 2 / chance.sum())
-    time = float(np.exp(log_time))
-    return Stays(time, decades, upper), float(min(np.hypot(error, other**0.5), 1.0)) * time
+    return DECADES[best], float(log_time), float(np.hypot(error, other**0.5))
 
 
 def _products(series: LitSeries) -> tuple[F64, F64]:
