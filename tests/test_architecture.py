@@ -163,6 +163,48 @@ def test_no_module_imports_itself_in_a_circle() -> None:
         pytest.fail(" -> ".join(circle))
 
 
+MOST_LINES, MOST_PARAMETERS = 60, 7
+LONG = {
+    "pixcal.api.arrays.calibrate": "signature and docstring document every option",
+    "pixcal.kernels.bilinear.sweep_batches": "forty lines describe the arrays it works on",
+}
+"""Functions of more than `MOST_LINES`, and why."""
+MANY_PARAMETERS = {
+    "pixcal.api.arrays.calibrate": "public: one for every input and option",
+    "pixcal.storage.stage.make": "named options that most stages leave out",
+    "pixcal.report.drawing.axes_grid": "named margins, most left at their defaults",
+    "pixcal.estimators.test_statistics.statistic": "a decorator: fields of a statistic",
+    "pixcal.estimators.detector.pair_noise.flat_pair_sums": "noise and limits of samples",
+}
+"""Functions of more than `MOST_PARAMETERS`, and why."""
+
+
+def functions(module: str) -> Iterator[ast.FunctionDef]:
+    for node in ast.walk(syntax(MODULES[module])):
+        if isinstance(node, ast.FunctionDef):
+            yield node
+
+
+def parameters(function: ast.FunctionDef) -> int:
+    """Without ``self`` and ``cls``; zero of compiled functions, which take plain arrays."""
+    if any(ast.unparse(d).startswith(("kernel(", "inner(")) for d in function.decorator_list):
+        return 0
+    names = [arg.arg for arg in (*function.args.posonlyargs, *function.args.args)]
+    return len(names) + len(function.args.kwonlyargs) - (names[:1] in (["self"], ["cls"]))
+
+
+@EVERY_FOLDER
+def test_functions_are_short_and_take_few_parameters(folder: str) -> None:
+    for module in modules_in(folder) if folder not in PACKAGES else []:
+        for one in functions(module):
+            assert one.end_lineno is not None
+            name, lines = f"{module}.{one.name}", one.end_lineno - one.lineno + 1
+            long = lines > MOST_LINES
+            assert long == (name in LONG), f"{name}: {lines} lines"
+            many = folder != "kernels" and parameters(one) > MOST_PARAMETERS
+            assert many == (name in MANY_PARAMETERS), f"{name}: {parameters(one)} parameters"
+
+
 @EVERY_FOLDER
 def test_random_numbers_come_from_a_generator(folder: str) -> None:
     for module in modules_in(folder):
@@ -188,6 +230,8 @@ def test_random_numbers_come_from_a_generator(folder: str) -> None:
         ("from distributed import Client", test_libraries_stay_in_their_folders),
         ("np.random.seed(1)", test_random_numbers_come_from_a_generator),
         ("from numpy.random import rand", test_random_numbers_come_from_a_generator),
+        ("def f(a, b, c, d, e, f, g, h): ...", test_functions_are_short_and_take_few_parameters),
+        ("def f():" + 60 * "\n    pass", test_functions_are_short_and_take_few_parameters),
     ],
 )
 def test_a_breach_is_caught(
