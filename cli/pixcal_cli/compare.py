@@ -73,7 +73,7 @@ def _sentences(components: Mapping[str, Any]) -> list[str]:
     for name, facts in components.items():
         evidence = "; ".join(facts["evidence"])
         sentences.append(
-            f"{name}: {f'beyond noise: {evidence}' if evidence else 'noise explains all'}"
+            f"{name}: {f'beyond noise: {evidence}' if evidence else 'consistent with noise'}"
         )
         if facts["suspicion"] is not None:
             sentences.append(f"{name}: {facts['suspicion']}")

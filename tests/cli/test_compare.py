@@ -36,7 +36,7 @@ def test_what_is_printed(run: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
         "2",
     ]
     assert any(line.startswith("  8 px and larger") for line in lines)
-    assert "  note: delta_x: noise explains all" in lines
+    assert "  note: delta_x: consistent with noise" in lines
     assert lines[-2:] == [f"  {out / 'compare.json'}", f"  {out / 'compare.png'}"]
     assert invoke([*command, "--split", "halves"]) == 0
     assert capsys.readouterr().out == text.replace("(written)", "(up to date)")
@@ -53,7 +53,7 @@ def test_three_runs(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     for pair in ("one | two", "one | three", "two | three"):
         assert f"\n{pair}\n" in text
     assert "errors of each map beyond noise" in text
-    assert "delta_x: the maps differ less than their noise" in text
+    assert "delta_x: the maps agree better than their noise allows" in text
 
 
 @pytest.mark.parametrize(

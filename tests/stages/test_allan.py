@@ -271,7 +271,7 @@ def test_a_drift_has_its_knee(tmp_path: Path) -> None:
     found = measured(write_fit(tmp_path / "weak", {"vertical": weak}))
     assert found["knee_frames"] is None
     (warning,) = found["warnings"]
-    assert "not quite white" in warning
+    assert "weak evidence of drift" in warning
 
 
 @pytest.mark.parametrize(

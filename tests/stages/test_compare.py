@@ -259,7 +259,7 @@ def test_rows_blocks_and_pixels_are_named(make: Any, tmp_path: Path) -> None:
     assert rows["period"]["amplitude_px"] == pytest.approx(3.16e-4, rel=0.15)
     assert rows["significance"] > 10
     assert found["delta_y"]["columns"]["significance"] < 4
-    assert any(e.startswith("rows: a wave of 4") for e in found["delta_y"]["evidence"])
+    assert any(e.startswith("rows: period 4") for e in found["delta_y"]["evidence"])
     facts = found["delta_x"]
     worst = {(p["y"], p["x"]) for p in facts["outliers"]["worst"]}
     assert worst == {(10, 20), (101, 7)}

@@ -53,7 +53,7 @@ def test_darks_of_two_times_are_enough_without_bias() -> None:
         ({"bias": [0.0]}, "no flat frames"),
         ({"dark": [1.0, 1.0], "flat": [1.0]}, "is subtracted as bias and dark signal"),
         ({"dark": [1.0], "fringes__a": [1.0, 2.0]}, "1 of 2 frames do not have the exposure time"),
-        ({"bias": [1.0], "dark": [1.0], "flat": [1.0]}, "dark signal is part of the bias"),
+        ({"bias": [1.0], "dark": [1.0], "flat": [1.0]}, "dark signal is included in the bias"),
         ({"bias": [0.0], "dark": [1.0, None], "flat": [1.0]}, "1 of 2 dark frames have no EXPTIME"),
         ({"bias": [0.0], "dark": [1.0], "flat": [None]}, "dark signal is not removed"),
         ({"bias": [0.0], "flat": [1.0, None]}, "1 of 2 flat frames have no EXPTIME"),

@@ -109,4 +109,4 @@ def test_stamped_cube_of_unknown_rhythm_is_numbered() -> None:
 def test_cube_that_lasts_too_long_is_told() -> None:
     files = [frame_file("a", 60000.0, 3), frame_file("b", 60000 + SECOND, 3)]
     _, warnings = table(files, 0.9)
-    assert "by its frame_period_s, a cube ends after the time stamp of the next file" in warnings[0]
+    assert "a cube overlaps the next file in time, judging by its frame_period_s" in warnings[0]

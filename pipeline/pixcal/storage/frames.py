@@ -77,7 +77,7 @@ def tabulate(
         late = next((a for a, b in pairwise(frames) if b.time_s < a.time_s), None)
         if late is not None:
             warnings.append(
-                f"by its {late.time_source}, a cube ends after the time stamp of the next file"
+                f"a cube overlaps the next file in time, judging by its {late.time_source}"
             )
     else:
         frames = _counted_frames(ordered, frame_period_s)

@@ -242,7 +242,9 @@ def _measure_region(
     warnings = []
     if curve.knee is not None and curve.knee > batches.n / 2:
         at = f"{curve.knee * batches.frames:.0f} frames"
-        warnings = [f"the noise is not quite white: fitted knee at {at}, beyond half of the run"]
+        warnings = [
+            f"weak evidence of drift: fitted knee at {at}, more than half the run, not reported"
+        ]
         curve = replace(curve, knee=None)
     expected = float(np.median(noise)) / np.sqrt(chosen)
     facts = _as_json(batches, chosen, curve, expected.tolist(), warnings)

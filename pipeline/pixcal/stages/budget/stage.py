@@ -190,8 +190,7 @@ def _left_out(bench: Bench) -> list[str]:
     """Effects that the bound does not include."""
     d, sentences = bench.detector, []
     sentences.append(
-        "systematic errors (crosstalk, drifts, ghosts, nonlinearity): no number of frames removes "
-        "them"
+        "systematic errors (crosstalk, drifts, ghosts, nonlinearity), which do not average out"
     )
     if bench.effects:
         sentences.append(
@@ -200,11 +199,13 @@ def _left_out(bench: Bench) -> list[str]:
         )
     if d.prnu_rms > 0:
         sentences.append(
-            f"the response of single pixels, {100 * d.prnu_rms:.2g} % rms, which changes their "
-            f"errors by {50 * d.prnu_rms:.2g} % rms"
+            f"PRNU of {100 * d.prnu_rms:.2g} % rms, which changes the errors of single pixels by "
+            f"{50 * d.prnu_rms:.2g} % rms"
         )
     if not bench.shot_noise:
-        sentences.append("shot_noise: false in the bench file: a budget always counts it")
+        sentences.append(
+            "shot_noise: false in the bench file: the budget includes shot noise anyway"
+        )
     return sentences
 
 

@@ -260,7 +260,7 @@ def _evidence(facts: dict[str, Any]) -> list[str]:
         profile, wave = facts[name], facts[name]["period"]
         if wave is not None:
             size = f"{wave['px']:.4g} px, amplitude {wave['amplitude_px']:.2g} px"
-            evidence.append(f"{name}: a wave of {size}")
+            evidence.append(f"{name}: period {size}")
         elif profile["significance"] > -ndtri(SHARE):
             times = f"{profile['ratio']:.2g} times"
             evidence.append(f"{name}: means differ by {times} the noise")
@@ -281,8 +281,8 @@ def _suspicion(scales: list[dict[str, Any]]) -> str | None:
     if not close:
         return None
     return (
-        f"the maps differ less than their noise at {', '.join(close)} px: they share frames, or "
-        "SIGMA is too large"
+        f"the maps agree better than their noise allows at scales of {', '.join(close)} px: they "
+        "share frames, or SIGMA is too large"
     )
 
 

@@ -19,8 +19,8 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
     if saturation is not None:
         warnings.append(
             f"flats saturate at {saturation:.0f} ADU, where their samples pile up: "
-            f"{(~summary.usable).sum()} of {len(summary.usable)} levels are left out of gain and "
-            "linearity; declare detector.saturation_adu if it is another level"
+            f"{(~summary.usable).sum()} of {len(summary.usable)} levels are excluded from gain "
+            "and linearity; declare detector.saturation_adu if it is another level"
         )
     if summary.gain is not None:
         warnings += _gain_warnings(summary.gain, summary, gain)
@@ -28,15 +28,15 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
         assert summary.well is not None
         warnings.append(
             f"the wells are full at {summary.well[0]:.0f} ADU above bias: {summary.full.sum()} of "
-            f"{len(summary.levels)} levels of flats reach that level, or nearly, and are left out "
-            "of gain and linearity"
+            f"{len(summary.levels)} levels of flats are at or near full well and are excluded from "
+            "gain and linearity"
         )
     if summary.linearity is not None and summary.linearity.max_deviation > _LINEARITY:
         warnings.append(
             "the levels of the flats deviate by up to "
             f"{100 * summary.linearity.max_deviation:.2g} % from a straight line over exposure "
-            "time: the response of all pixels, or the lamp, is not linear; no pixel is flagged for "
-            "this"
+            "time: the response of all pixels, or the lamp, is not linear; no pixels are flagged "
+            "NONLINEAR for it"
         )
     noise = summary.declared.read_noise_e
     measured = summary.noise_measured_e(summary.before_rounding, gain)
@@ -63,21 +63,21 @@ def _gain_warnings(fit: GainFit, summary: Summary, used: float) -> list[str]:
     if fit.step:
         warnings.append(
             f"the photon-transfer curve is not smooth above {fit.levels[1]:.0f} ADU, as in a "
-            "camera that reads bright pixels at another gain (dual gain, HDR): the gain given is "
-            "that below this level; gain and noise of brighter pixels are not measured"
+            "camera that reads bright pixels at another gain (dual gain, HDR): the reported gain "
+            "applies below this level; gain and noise of brighter pixels are not measured"
         )
     if fit.without_dark:
         warnings.append(
             "frames without light differ in noise from the photon-transfer curve at level zero: "
             "the gain is that of the flats alone; possible causes: the camera clips its black "
-            "level, or reads dark frames in another way"
+            "level, or reads dark frames differently"
         )
     clear = [lag for lag, sigmas in fit.neighbours.items() if sigmas > SHARED]
     if clear:
         lags = ", ".join(f"({y}, {x})" for y, x in clear)
         warnings.append(
             "crosstalk: the noise of neighbours in the flats is correlated at (rows, columns) "
-            f"{lags}; the gain includes it"
+            f"{lags}; the gain allows for these covariances"
         )
     if fit.uneven:
         warnings.append(
@@ -101,7 +101,7 @@ def _declared_gain_warnings(fit: GainFit, summary: Summary, used: float) -> list
     value, error = fit.gain, fit.error
     if declared is None:
         return [
-            f"no gain is declared: the flats give the gain used, {used:.4g} ± {error:.2g} e-/ADU"
+            f"no gain declared: using {used:.4g} ± {error:.2g} e-/ADU, measured from the flats"
         ]
     if abs(value - declared) <= max(3 * error, 0.02 * declared):
         return []

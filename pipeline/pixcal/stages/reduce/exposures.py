@@ -104,11 +104,12 @@ def _group_darks(found: Exposures, times: Mapping[str, list[float | None]]) -> N
     elif not bias and not found.has_rate:
         found.warnings.append(
             "no bias frames, and darks of one exposure time only: their mean is subtracted as "
-            "bias and dark signal, which is right only for frames of the same exposure time"
+            "bias and dark signal, which is valid only for frames of the same exposure time"
         )
     elif not found.has_rate and dark:
         found.warnings.append(
-            "darks are exposed as long as bias frames: the dark signal is part of the bias"
+            "darks and bias frames have the same exposure time: the dark signal is included in the "
+            "bias"
         )
 
 

@@ -128,7 +128,7 @@ def _line_noise(found: Json, dark: F64, gain: float, shape: tuple[int, int]) -> 
             # Each line of each pair of frames is one sample of it.
             error = math.hypot(error, shared * math.sqrt(2 * lengths[name] / dark[:, 0].sum()))
             noise = math.sqrt(shared)
-            title, note = f"noise of whole {name}s", "part of the read noise"
+            title, note = f"{name} noise", "part of the read noise"
             found[f"{name}_noise"] = _figure(
                 title, "e-", (gain * noise, gain * error / (2 * noise)), note
             )
@@ -199,10 +199,10 @@ def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: 
     for axis, lines in ((0, "row"), (1, "column")):
         size, error = alternation(*pair, axis=axis)
         if size > _ALTERNATES * error and size**2 > _ALTERNATING_SHARE * spread.total[0] ** 2:
-            higher = f"every second {lines} is {with_error(size, error)} {unit} higher"
-            patterns.append((higher, size / 2))
+            differ = f"alternate {lines}s differ by {with_error(size, error)} {unit}"
+            patterns.append((differ, size / 2))
     trend = ["quadratic trend of the lamp removed"] if name == "prnu" else []
-    note = "; ".join([*trend, *(higher for higher, _ in patterns)])
+    note = "; ".join([*trend, *(differ for differ, _ in patterns)])
     found[name] = _figure(_TITLES[name], unit, spread.total, note)
     for part in ("row", "column", "pixel"):
         title = f"{_TITLES[name]} of {part}s"
@@ -220,9 +220,9 @@ def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: 
         )
     seen_in, removed_by = {"dsnu": ("bias or dark", "bias"), "prnu": ("flat", "flat")}[name]
     return [
-        f"in the {seen_in} frames {higher}: a fixed pattern of period 2 px and amplitude "
+        f"in the {seen_in} frames {differ}: a fixed pattern of period 2 px and amplitude "
         f"{amplitude:.3g} {unit}; the {removed_by} map removes it"
-        for higher, amplitude in patterns
+        for differ, amplitude in patterns
     ]
 
 
