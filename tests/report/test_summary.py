@@ -63,7 +63,7 @@ def test_a_good_run_has_nothing_to_check() -> None:
 
 
 def test_precision_is_given_in_pixels_and_nanometres() -> None:
-    assert headline(contents()) == "The median pixel is calibrated in δx to 2.0 × 10⁻⁴ px (1.0 nm)."
+    assert headline(contents()) == "Median error (1σ): δx 2.0 × 10⁻⁴ px (1.0 nm)."
 
 
 @pytest.mark.parametrize(("ratio", "level"), [(1.0, "good"), (1.3, "check"), (2.0, "bad")])
@@ -157,4 +157,4 @@ def test_corrected_maps_are_shown_beside_those_of_the_fit() -> None:
     assert "corrected" not in fill("maps", run)
     shown = fill("maps", replace(run, corrected=run.offsets))
     assert shown.index("Map of δx.") < shown.index("Map of δx, corrected.")
-    assert shown.count("this is the map to use") == 1
+    assert shown.count("Use this map") == 1

@@ -456,7 +456,7 @@ def test_three_sets_are_compared(tmp_path: Path) -> None:
 def test_without_allan_the_rest_is_shown(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", (23, 40), ("one",), stages=("ingest", "reduce", "fit"))
     page = page_of(run)
-    assert "Not measured: there is no Allan deviation; run 'pixcal allan'" in words(page)
+    assert "Not measured: there is no Allan deviation; run 'pixcal allan RUN', then" in words(page)
     assert "<img" in section(page, "maps")
 
 
@@ -468,7 +468,7 @@ def test_without_a_fit_the_detector_is_shown(tmp_path: Path, sets: tuple[str, ..
     assert re.findall(r'<section id="(\w+)">', page) == shown
     assert "<img" in section(page, "detector")
     for name in of_fringes[:4] if sets else ():
-        assert "there is no fit; run 'pixcal fit'" in words(section(page, name))
+        assert "there is no fit; run 'pixcal fit RUN'" in words(section(page, name))
 
 
 @pytest.mark.usefixtures("without_figures")
@@ -496,7 +496,7 @@ def test_all_pixels_masked_is_no_error(tmp_path: Path) -> None:
     shutil.rmtree(run / "fit")
     mask = np.full((20, 33), 32, np.uint8)
     write_fit(run, (20, 33), mask, ("one",), "k", False, np.random.default_rng(1))
-    assert "no pixel with an offset" in words(page_of(run))
+    assert "No pixel has a valid offset" in words(page_of(run))
 
 
 @pytest.mark.long

@@ -41,7 +41,7 @@ def gap(result: DiagnosisContents) -> Figure:
     parts = [Bar(d, before, after) for d, (before, after) in facts.get("domains", {}).items()]
     rest = facts["after"] - sum(b.after for b in parts)
     if causes and parts and rest > 0.001:
-        parts.append(Bar("introduced by the causes", 0.0, rest))
+        parts.append(Bar("new differences due to the causes", 0.0, rest))
     titles = {effect_title(result, cause["effect"]): cause for cause in causes}
     return gap_figure([whole, *sorted(parts, key=lambda b: -b.before)], titles)
 
@@ -104,12 +104,12 @@ def _causes(axes: Axes, causes: Mapping[str, Mapping[str, Any]]) -> None:
     axes.plot(unique, rows, "D", color=INK, ms=7, fillstyle="none", label="unique share")
     axes.set_yticks(rows, _cause_names(causes))
     axes.set_xlim(min(-3.0, shares.min()) - 2, max(103.0, shares.max()) + 2)
-    axes.set_title("what each cause closes", **TITLE)
+    axes.set_title("gap closed by each cause", **TITLE)
     _share_axes(axes, len(causes))
 
 
 def _domain_names(bars: Sequence[Bar]) -> list[str]:
-    return [_plain(b.name, 24) for b in bars]
+    return ["\n".join(textwrap.wrap(_plain(b.name, 40), 24)) for b in bars]
 
 
 def _cause_names(titles: Iterable[str]) -> list[str]:

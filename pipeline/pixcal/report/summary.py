@@ -47,10 +47,10 @@ def headline(contents: Contents) -> str:
         sigma = offset.sigma.median
         if np.isfinite(sigma):
             nm = sigma * contents.pitch_um * 1e3
-            parts.append(f"{NAMES[offset.name]} to {number(sigma, 2)} px ({number(nm, 2)} nm)")
+            parts.append(f"{NAMES[offset.name]} {number(sigma, 2)} px ({number(nm, 2)} nm)")
     if not parts:
         return NO_OFFSETS
-    return f"The median pixel is calibrated in {' and '.join(parts)}."
+    return f"Median error (1σ): {', '.join(parts)}."
 
 
 def detector_headline(facts: dict[str, Any]) -> str:
@@ -121,7 +121,8 @@ def _diagnosis_card(diagnosis: DiagnosisContents) -> Card:
     if verdict == "no gap" and (
         untested := sum(map(len, diagnosis.facts.get("not_tested", {}).values()))
     ):
-        detail += f"; {untested} effects not tested for lack of frames"
+        effects = "effect" if untested == 1 else "effects"
+        detail += f"; {untested} {effects} not tested (required frames missing)"
     return Card("diagnosis", verdict, f"{causes}. {detail}" if causes else detail, level(diagnosis))
 
 
@@ -132,7 +133,7 @@ def _bound_card(sets: Sequence[SetContents]) -> Card:
     return Card(
         "σ / Cramér–Rao bound",
         ", ".join(number(ratio, 4) for ratio in ratios.values()),
-        f"{', '.join(ratios)}; no unbiased estimate reaches less than 1",
+        f"{', '.join(ratios)}; 1 is the limit for any unbiased estimate",
         max((_bound_level(ratio) for ratio in ratios.values()), key=SEVERITY.index),
     )
 
@@ -207,7 +208,7 @@ def _of_sets(sets: Sequence[SetContents]) -> Iterator[tuple[str, str]]:
 def _of_set(facts: dict[str, Any], allan: dict[str, Any] | None) -> Iterator[FindingTemplate]:
     ratio = _ratio(facts.get("sigma_median_px"), facts.get("crb_median_px"))
     if ratio is not None:
-        text = "errors over the Cramér–Rao bound of the same frames: {}"
+        text = "errors relative to the Cramér–Rao bound: {}"
         yield _bound_level(ratio), text, number(ratio, 4)
     scale = facts.get("sigma_scale")
     if scale is not None and abs(scale - 1) > 0.02:
@@ -246,7 +247,7 @@ def _of_geometry(facts: dict[str, Any]) -> Iterator[FindingTemplate]:
         yield (
             CHECK,
             f"the fit places the fibres {{}} from their nominal position along {axis}. If the "
-            "bench is better aligned, the fit took smooth structure of the detector (such as "
+            "bench is better aligned, the fit mistook large-scale detector structure (such as "
             "stitching) for curvature of the fringes. Compare with --model paraxial",
             f"{number(abs(centre - nominal))} mm",
         )
@@ -289,7 +290,7 @@ def _of_target(facts: dict[str, Any]) -> Iterator[FindingTemplate]:
     time = f" ({duration(needed * pace)} at this rate)" if pace else ""
     yield (
         GOOD,
-        f"the target of {target} needs {{}}, if the square-root law holds that long",
+        f"the target of {target} needs {{}}, if the error keeps falling as 1/√N",
         f"{number(needed, 2)} frames{time}",
     )
 

@@ -20,7 +20,7 @@ from pixcal.report.text import (
 
 _GAIN_WORDS = {
     "chi2_reduced": "reduced chi-square",
-    "neighbours": "neighbours (rows, columns) whose noise is included",
+    "neighbours": "covariances included, at lags (rows, columns)",
     "used_from": "gain used:",
     "with_rounding": "with rounding",
 }
@@ -124,8 +124,8 @@ def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
             ["declared (ADU)", number(end["declared"], 5)],
             ["found in the flats (ADU)", number(end["found"], 5)],
             ["used (ADU)", number(end["used"], 5)],
-            ["levels of flats left out", number(end["levels_left_out"])],
-            ["flats with full wells", number(len(end["full_frames"]))],
+            ["flat levels excluded", number(end["levels_left_out"])],
+            ["flat frames at full well", number(len(end["full_frames"]))],
         ]
         yield Table("Saturation of the samples", ["", ""], rows)
     rows = [[key, _plain(value)] for key, value in _flat(rest) if value is not None]

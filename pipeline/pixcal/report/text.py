@@ -8,7 +8,7 @@ from typing import Any
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-NO_OFFSETS = "The fit left no pixel with an offset: see the masks."
+NO_OFFSETS = "No pixel has a valid offset; see the masks."
 NAMES = {"delta_x": "δx", "delta_y": "δy", "delta_fringe": "δ along the fringe axis"}
 SYMBOLS = {"delta_x": "δx", "delta_y": "δy", "delta_fringe": "δ"}
 

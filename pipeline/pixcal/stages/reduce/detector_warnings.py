@@ -100,9 +100,7 @@ def _declared_gain_warnings(fit: GainFit, summary: Summary, used: float) -> list
     declared, step = summary.declared.gain_e_per_adu, summary.step
     value, error = fit.gain, fit.error
     if declared is None:
-        return [
-            f"no gain declared: using {used:.4g} ± {error:.2g} e-/ADU, measured from the flats"
-        ]
+        return [f"no gain declared: using {used:.4g} ± {error:.2g} e-/ADU, measured from the flats"]
     if abs(value - declared) <= max(3 * error, 0.02 * declared):
         return []
     return [
