@@ -170,7 +170,7 @@ def _why(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> str:
         )
     if truth.part in (LEFT_OUT, SECOND_OTHER):
         blamed = [c for c in diagnosis["causes"] if c["gap_closed"] > BLAMED]
-        reasons = [f"{c['effect']} blamed for {c['gap_closed']:.2f} of the gap" for c in blamed]
+        reasons = [f"{c['effect']} credited with {c['gap_closed']:.2f} of the gap" for c in blamed]
         return "; ".join(reasons) or f"verdict {diagnosis['verdict']!r}"
     about = {c["effect"]: c for c in diagnosis["candidates"]}
     for name in truth.names:

@@ -66,7 +66,9 @@ def _couplings(
         matching = [n for n, other in enumerate(estimated) if _meet(one, other)]
         share = sum(float(estimated[n]["share"]) for n in matching)
         error = math.hypot(*(errors.get(f"couplings[{n}].share", 0.0) for n in matching))
-        name = f"share from rows {one['row']} of {one['every_rows']} by ({one['dy']}, {one['dx']})"
+        name = f"share of the pixel at (dy, dx) = ({one['dy']}, {one['dx']})"
+        if one["every_rows"] > 1:
+            name += f", from row {one['row']} of every {one['every_rows']}"
         yield ParameterCheck(name, float(one["share"]), share, error)
 
 

@@ -9,6 +9,8 @@ from pixcal.model.errors import InputError
 
 Plain = Mapping[str, Any]
 
+# questions whose names in the score are not their words
+WORDS = {"nobody blamed for most": "no effect credited with most of the gap"}
 BY_STRENGTH = {"below_twice": "named first below twice the threshold", "from_twice": "from there"}
 
 
@@ -69,7 +71,8 @@ def _parts(parts: Mapping[str, Plain]) -> str:
             if not count["of"]:
                 continue
             right = f"{count['right']} of {count['of']}"
-            rows.append((name, question, right, *_percent(count), *_target(count)))
+            words = WORDS.get(question, question)
+            rows.append((name, words, right, *_percent(count), *_target(count)))
     header = ("part", "question", "right", "share", "95 % interval", "target", "reached")
     return _table(header, rows)
 

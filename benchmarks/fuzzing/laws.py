@@ -39,7 +39,7 @@ RUNTIME = ("--cluster", "sync", "--memory", "1GiB", "--quiet")
 MENDS = re.compile(
     r"; |expected|must be|is (above|below)|not one of|the keys here are|missing|known are"
     r"|are needed|not valid YAML|not allowed|twice|not found|number too large|in the range"
-    r"|too large|is not |cannot be (read|used|written)|MiB are allowed|Did you mean|Possible|choose"
+    r"|too large|is not |cannot be (read|used|written)|the limit is|Did you mean|Possible|choose"
     r"|no room|do not fit|at least|more than half|is zero|no frames at all|not a |not in UTC"
     r"|no permission|empty"
 )

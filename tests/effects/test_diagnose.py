@@ -376,7 +376,7 @@ def test_wrong_options_are_told(with_lag: Path, options: dict[str, Any], reason:
 
 def test_too_few_frames_to_part_are_told(reduced: Callable[..., Path]) -> None:
     run = reduced(None, {"frames.fringes.1.count": 20})
-    with pytest.raises(InputError, match=r"fringes/horizontal: half of its frames are 10; .* 24"):
+    with pytest.raises(InputError, match=r"fringes/horizontal: only 10 frames in one half; .* 24"):
         diagnose.run(run, diagnose.Config(), SYNC)
 
 

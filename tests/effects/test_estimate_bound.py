@@ -39,9 +39,7 @@ class Missing:
 
 def test_it_is_not_decided_and_says_why() -> None:
     told = estimate(EVIDENCE, cast(Any, Endless), Bound(0.2))
-    assert told == (
-        "not decided: an estimate may use 0.2 s of processor time, this one would need more"
-    )
+    assert told == "not decided: the estimate exceeded its limit of 0.2 s of processor time"
 
 
 @pytest.mark.parametrize("cluster", ["sync", "threads"])

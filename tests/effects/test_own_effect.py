@@ -128,7 +128,7 @@ def test_it_cannot_act_before_the_light_of_the_bench(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("starts", "reason"),
     [
-        ("[1]", "TypeError: gives no list of LightStart of a Glow"),
+        ("[1]", "TypeError: does not return a list of LightStart for Glow"),
         ("[LightStart(cls(), ('rat',))]", "ValueError: free: rat is not a parameter"),
         ("[cls.nothing]", "AttributeError: .*nothing"),
     ],

@@ -282,7 +282,7 @@ def test_once_nothing_differs_only_what_is_sure_is_tried() -> None:
         found = sought(sigmas, mimicked)
         assert found.accepted == ("left",)
         assert frozenset({"left", "right"}) not in tried
-        assert "3.0 sigma in addition to left" in found.candidates["right"].reason
+        assert "once left is included (3.0 sigma)" in found.candidates["right"].reason
 
 
 def test_what_will_be_estimated_again_is_asked_for_when_a_bench_is_confirmed() -> None:
@@ -373,7 +373,7 @@ def test_a_small_remainder_of_what_another_cause_brings_about_is_not_claimed() -
     assert alone.accepted == ("left", "little")
     beside, _ = search(truth, both, {"little": 20.0})
     assert beside.accepted == ("left",)
-    assert "40% of its significance" in beside.candidates["little"].reason
+    assert "40 % of its significance" in beside.candidates["little"].reason
 
 
 def test_a_small_remainder_that_only_the_held_out_frames_show_is_not_claimed() -> None:

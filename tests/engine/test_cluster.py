@@ -256,9 +256,9 @@ def test_a_worker_without_the_disk_is_refused(cluster: Any, tmp_path: Path) -> N
     """The path is a folder of this process's own; another process finds nothing there."""
     (tmp_path / "run").mkdir()
     here = Path(f"/proc/self/fd/{os.open(tmp_path, os.O_RDONLY)}")
-    with pytest.raises(InputError, match=rf"{here}/run: the worker on .* does not see it"):
+    with pytest.raises(InputError, match=rf"{here}/run: the worker on .* cannot see this path"):
         run_tasks(partial(spot, here / "run"), range(3), cluster.runtime, label="spots")
-    with pytest.raises(InputError, match=rf"{here}/run: the worker on .* does not see it"):
+    with pytest.raises(InputError, match=rf"{here}/run: the worker on .* cannot see this path"):
         run_tasks(len, [[here / "run"]], cluster.runtime, label="lengths")
 
 
@@ -274,7 +274,9 @@ def test_a_worker_with_a_run_of_its_own_is_refused(
         (folder / "run" / ".partial").mkdir()
     monkeypatch.chdir(tmp_path)
     source = Path("/proc/self/cwd/run/reduce")
-    with pytest.raises(InputError, match=r"run/\.cluster-\w+: the worker on .* does not see it"):
+    with pytest.raises(
+        InputError, match=r"run/\.cluster-\w+: the worker on .* cannot see this path"
+    ):
         run_tasks(partial(spot, source), range(3), cluster.runtime, label="spots")
     assert not list((tmp_path / "run").glob(".cluster*"))
     monkeypatch.chdir(there)

@@ -40,7 +40,7 @@ def test_too_little_memory_is_refused_with_both_numbers() -> None:
         make_plan("the fit of vertical", 100 * MIB, 1000 * MIB, runtime)
     need = BASE_BYTES // MIB + 1100
     assert str(caught.value) == (
-        f"--memory: the fit of vertical needs {need} MiB, 600 MiB are allowed"
+        f"--memory: the fit of vertical needs {need} MiB, but the limit is 600 MiB"
     )
     assert isinstance(caught.value, InputError), "so that the exit code is 2"
 

@@ -343,5 +343,5 @@ def test_a_damaged_fit_is_named(tmp_path: Path) -> None:
 
 def test_work_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     run = write_fit(tmp_path, {"vertical": noise(12)})
-    with pytest.raises(PlanError, match=r"\d+ MiB, 300 MiB are allowed"):
+    with pytest.raises(PlanError, match=r"\d+ MiB, but the limit is 300 MiB"):
         allan.run(run, Config(), Runtime("sync", memory=300 << 20))

@@ -446,14 +446,14 @@ UNKNOWN = replace(
         (BOTH, answer(["ipc", "lag", "row_noise"], 0.7), False, "invented: row_noise"),
         (MISSING, answer([], 0.0, "unexplained"), True, ""),
         (MISSING, answer(["ipc"], 0.4, "partly explained"), True, ""),
-        (MISSING, answer(["ipc"], 0.8, "partly explained"), False, "ipc blamed for 0.80"),
+        (MISSING, answer(["ipc"], 0.8, "partly explained"), False, "ipc credited with 0.80"),
         (MISSING, answer([], 0.0), False, "verdict 'no gap'"),
         (STRANGER, answer(["lag"], 0.9), True, ""),
         (STRANGER, answer(["ipc", "lag"], 0.9), False, "named after ipc"),
         (ORDINARY, answer([], 0.0), True, ""),
         (ORDINARY, answer([], 0.0, "unexplained"), False, "verdict 'unexplained'"),
         (UNKNOWN, answer([], 0.0, "unexplained"), True, ""),
-        (UNKNOWN, answer(["ipc"], 0.8), False, "ipc blamed for 0.80"),
+        (UNKNOWN, answer(["ipc"], 0.8), False, "ipc credited with 0.80"),
     ],
 )
 def test_an_answer_is_marked(truth: Truth, diagnosis: Any, right: bool, why: str) -> None:

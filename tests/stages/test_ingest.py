@@ -154,7 +154,7 @@ def test_workers_and_bands_do_not_matter(
 
 
 def test_memory_too_small_is_refused_with_both_numbers(acquisition: Path, tmp_path: Path) -> None:
-    with pytest.raises(PlanError, match=r"needs \d+ MiB, 100 MiB are allowed"):
+    with pytest.raises(PlanError, match=r"needs \d+ MiB, but the limit is 100 MiB"):
         ingest.run(acquisition, tmp_path / "r", ingest.Config(), Runtime(memory=100 << 20))
 
 

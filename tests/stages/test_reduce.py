@@ -403,7 +403,7 @@ def test_too_little_memory_is_refused_with_both_numbers(
     bench: tuple[Path, Camera, Any], tmp_path: Path
 ) -> None:
     shutil.copytree(bench[0] / "ingest", tmp_path / "ingest")
-    with pytest.raises(PlanError, match=r"reduce needs \d+ MiB, 300 MiB are allowed"):
+    with pytest.raises(PlanError, match=r"reduce needs \d+ MiB, but the limit is 300 MiB"):
         reduce.run(tmp_path, reduce.Config(), replace(SYNC, memory=300 << 20))
 
 

@@ -444,7 +444,7 @@ def test_any_printable_name_fits_the_header(tmp_path: Path) -> None:
 
 
 def test_too_little_memory_is_refused_with_both_numbers(tmp_path: Path) -> None:
-    with pytest.raises(PlanError, match=r"simulate needs \d+ MiB, 64 MiB are allowed"):
+    with pytest.raises(PlanError, match=r"simulate needs \d+ MiB, but the limit is 64 MiB"):
         simulated(tmp_path, Runtime(memory=64 << 20))
     assert not (tmp_path / "acq").exists()
 

@@ -277,7 +277,7 @@ def test_the_index_of_another_array_is_refused(small: tuple[Path, Path]) -> None
 def test_a_chunk_that_is_cut_before_the_end_is_not_indexed(small: tuple[Path, Path]) -> None:
     path, file = small
     file.write_bytes(b"\0\0")
-    with pytest.raises(DamagedError, match="c/1/0/0: chunk cut short"):
+    with pytest.raises(DamagedError, match="c/1/0/0: truncated chunk"):
         create_array(path, (2, 4, 8), "u2", chunks=(1, 4, 8)).finish()
 
 

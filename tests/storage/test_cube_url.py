@@ -157,7 +157,7 @@ def test_an_array_left_unfinished_is_taken_up_again(place: UrlPath) -> None:
     again = create_array(place / "a", SHAPE, "u2", chunks=CHUNKS)
     again.write((8, 0, 0), cube()[8:])
     put(place / "a/c/1/2/1", b"12")
-    with pytest.raises(DamagedError, match=f"{place}/a/c/1/2/1: chunk cut short"):
+    with pytest.raises(DamagedError, match=f"{place}/a/c/1/2/1: truncated chunk"):
         again.finish()
     again.write((4, 0, 0), cube()[4:8])
     again.finish()

@@ -92,7 +92,9 @@ def calibrate(
     """
     stacks = _stacks(frames, bias, darks or {}, flats or {}, exptime_s)
     if darks and exptime_s is None:
-        raise InputError("exptime_s: missing (in s); dark signal is scaled to it")
+        raise InputError(
+            "exptime_s: missing; give the exposure time in s, which scales the dark signal"
+        )
     described = _describe(
         stacks,
         baselines_mm,

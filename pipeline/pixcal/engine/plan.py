@@ -45,7 +45,7 @@ def make_plan(what: str, bytes_per_task: int, shared_bytes: int, runtime: Runtim
     plan = Plan(bytes_per_task, shared_bytes, workers)
     if plan.total > runtime.memory:
         need, have = plan.total / 2**20, runtime.memory / 2**20
-        raise PlanError(f"--memory: {what} needs {need:.0f} MiB, {have:.0f} MiB are allowed")
+        raise PlanError(f"--memory: {what} needs {need:.0f} MiB, but the limit is {have:.0f} MiB")
     if workers < runtime.n_workers and not runtime.quiet:
         all_of_them = Plan(bytes_per_task, shared_bytes, runtime.n_workers).total
         _tell(
@@ -81,7 +81,7 @@ def _plan_on_cluster(what: str, bytes_per_task: int, shared_bytes: int, runtime:
         if need > have:
             raise PlanError(
                 f"--cluster {runtime.cluster}: {what} needs {need >> 20} MiB in a worker, "
-                f"{address} may use {have >> 20} MiB ({USABLE:.0%} of its limit); start it "
+                f"{address} may use {have >> 20} MiB ({100 * USABLE:.0f} % of its limit); start it "
                 "with a larger --memory-limit"
             )
         at_once = min(at_once, (have - DASK_WORKER_BYTES) // max(bytes_per_task, 1))

@@ -150,8 +150,8 @@ def _require_visible(paths: tuple[Path, ...]) -> None:
         while not path.exists():
             if time.monotonic() > begin + PATIENCE_S:
                 raise InputError(
-                    f"{path}: the worker on {platform.node()} does not see it; all workers need "
-                    "the disk with the data, under the same path"
+                    f"{path}: the worker on {platform.node()} cannot see this path; mount the data "
+                    "at the same path on all workers"
                 )
             time.sleep(0.1)
 

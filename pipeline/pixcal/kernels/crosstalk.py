@@ -70,7 +70,7 @@ class Coupling:
         return replace(self, share=self.share * factor)
 
     def places(self, shape: tuple[int, int], first: tuple[int, int]) -> tuple[Place, Place]:
-        """Sources and receivers on a piece (y, x) of the window, where both lie on it.
+        """Source and receiver pixels that both lie in a sub-window (y, x).
 
         ``first`` are its first row and column in the window.
         """

@@ -88,7 +88,8 @@ def answer(diagnosis: DiagnosisContents) -> str:
 def considered(facts: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """Candidates; without fringes, excluding those that show only in fringes."""
     sets = facts.get("looked_at", {}).get("sets", True)
-    return [c for c in facts["candidates"] if sets or "fringes would" not in c["rejected_because"]]
+    only = "; record fringes"
+    return [c for c in facts["candidates"] if sets or not c["rejected_because"].endswith(only)]
 
 
 def _shared(facts: Mapping[str, Any]) -> bool:

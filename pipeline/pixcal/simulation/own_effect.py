@@ -136,7 +136,7 @@ def _check_starts(found: Any, effect: type[Effect]) -> None:
     fields = {field.name for field in dataclasses.fields(effect)}
     for start in found:
         if not isinstance(start, LightStart) or not isinstance(start.model, effect):
-            raise TypeError(f"gives no list of LightStart of a {effect.__name__}")
+            raise TypeError(f"does not return a list of LightStart for {effect.__name__}")
         if unknown := set(start.free) - fields:
             raise ValueError(f"free: {', '.join(sorted(unknown))} is not a parameter")
 
@@ -144,7 +144,7 @@ def _check_starts(found: Any, effect: type[Effect]) -> None:
 def _check_estimate(found: Any, effect: type[Effect]) -> None:
     """Raise TypeError or ValueError unless all fields of an estimate are usable."""
     if not isinstance(found, Estimate) or not isinstance(found.effect, effect):
-        raise TypeError(f"gives no Estimate of a {effect.__name__}")
+        raise TypeError(f"does not return an Estimate of {effect.__name__}")
     try:
         parse(effect, to_plain(found.effect), effect.__name__)
     except InputError as error:

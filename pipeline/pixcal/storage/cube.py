@@ -239,7 +239,7 @@ class ArrayWriter:
                 for name, (size, tail) in zip(names, folder.ends(names), strict=True):
                     if len(tail) < 4:
                         path = f"{self.path}/{name}"
-                        raise DamagedError(f"{path}: chunk cut short", path)
+                        raise DamagedError(f"{path}: truncated chunk", path)
                     rows.append((size, int.from_bytes(tail, "little")))
             except OSError as error:
                 if error.errno not in _LOST:

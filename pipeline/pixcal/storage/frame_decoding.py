@@ -228,7 +228,7 @@ def _decoded(file: FrameFile) -> Iterator[tuple[int, int, NDArray[Any]]]:
                 times = [slice(t0, t1) if m > 1 else slice(None) for m in section.shape[:-2]]
                 piece = section[(*times, slice(y0, y1))].reshape(t1 - t0, y1 - y0, nx)
                 if piece.dtype != file.coding.stored:
-                    raise ValueError(f"decoded as {piece.dtype}")
+                    raise ValueError(f"decoded as {piece.dtype}, header says {file.coding.stored}")
                 yield t0, y0, piece
     except Exception as error:  # the decoders raise a dozen kinds, all of which mean one thing
         reason = " ".join(str(error).split())

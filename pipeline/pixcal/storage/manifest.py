@@ -147,7 +147,9 @@ def check_intact(folder: Path, manifest: Manifest) -> None:
     """
     mark = folder / UNFLUSHED
     if mark.exists() and mark.read_bytes() != boot().encode():
-        raise DamagedError(f"{folder}: the machine stopped before all of it was on the disk", mark)
+        raise DamagedError(
+            f"{folder}: incomplete: the machine stopped before it was flushed to disk", mark
+        )
     for name in damaged_files(folder):
         raise DamagedError(f"{folder / name}: damaged", folder / name)
     for name, expected in manifest.files.items():

@@ -18,7 +18,6 @@ from pixcal.storage.frame_file import FrameFile, SampleFormat
 from pixcal.storage.header_values import Header, exposure_s, temperature_c, time_stamp_mjd
 from pixcal.storage.sources import SourceFile
 
-# PNG; TIFF and BigTIFF in both byte orders.
 # modes of Pillow that hold one sample a pixel, and how `unpack_picture` writes them
 _CODINGS = {
     "L": SampleFormat(8),
@@ -32,6 +31,7 @@ _CODINGS = {
 
 def is_picture(start: bytes) -> bool:
     """Whether a file with this beginning is TIFF or PNG."""
+    # PNG; TIFF and BigTIFF in both byte orders
     return start.startswith((b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"))
 
 

@@ -189,7 +189,7 @@ def to_first_order(
 def level_dependence(
     found: Products, couplings: Sequence[Coupling], links: Sequence[Place]
 ) -> tuple[float, float]:
-    """Further relative change of the shares with the source's charge, 1/ke-, and its error.
+    """Remaining relative change of the coupling with source charge (1/ke-), and its error.
 
     From covariance whose rise with the square of the charge differs from that of the variance.
     """

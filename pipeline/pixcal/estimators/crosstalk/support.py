@@ -156,7 +156,7 @@ def _fall(value: F64, weight: F64) -> F64:
 
 
 def _greedy(normal: F64, right: F64, directions: F64) -> tuple[F64, float]:
-    """Directions that are worth it (u, number), the strongest first, and the fall in chi-square."""
+    """Directions (u, number) that lower chi-square enough to keep, strongest first; the fall."""
     weight = np.einsum("ud,ud->d", directions, normal @ directions)
     # Of equals the plainest: many shares alike, both ways.
     plain = np.count_nonzero(directions, axis=0) / len(directions)

@@ -96,7 +96,7 @@ class FringeEvidence:
     def halves(self) -> tuple[FreeFrames, FreeFrames]:
         """``free`` and ``free_covariance`` of each half of the pixels, as in `free_frames`.
 
-        They are stored in a new evidence, and recomputed for a subset of its frames or pixels.
+        Stored when the `Evidence` is built; recomputed for a subset of its frames or pixels.
         """
         codes = np.where(np.isnan(self.electrons), np.float32(NO_SAMPLE), self.electrons)
         return self.free_of(codes)[1:]

@@ -70,7 +70,7 @@ def _taken(maps: F64, at: Indices) -> F64:
 
 @dataclass(frozen=True)
 class MapFit:
-    """Parameters, their covariance, and the fall in chi-square that they bring."""
+    """Parameters, their covariance, and the resulting decrease in chi-square."""
 
     values: F64
     covariance: F64

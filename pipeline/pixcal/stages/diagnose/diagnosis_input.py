@@ -194,8 +194,8 @@ def _enough(half: FrameSubset) -> None:
     for name, frames in half.items():
         if "/" in name and len(frames) < FEWEST_FRAMES:
             raise InputError(
-                f"{name}: half of its frames are {len(frames)}; diagnose needs {FEWEST_FRAMES} in "
-                "each half: it fits effects on one and tests them on the other"
+                f"{name}: only {len(frames)} frames in one half; diagnose needs {FEWEST_FRAMES} in "
+                "each: it fits effects on one and tests them on the other"
             )
 
 

@@ -47,7 +47,9 @@ def needed_gain(candidate: Candidate) -> float:
 def gain_too_small(gain: float, candidate: Candidate) -> str:
     """Why a candidate that was tried is rejected."""
     if candidate.in_maps_alone and gain < MIN_LOGLIK_GAIN:
-        return "the maps of the held-out frames show no more of it than true offsets can by chance"
+        return (
+            "its pattern in the held-out maps is no stronger than chance patterns of true offsets"
+        )
     if gain < MIN_LOGLIK_GAIN:
         return "does not improve the fit of the held-out frames"
     return (
@@ -70,13 +72,13 @@ def redundant(
 def possible_proxy(closed: float, still_open: float) -> str:
     """Why a cause is rejected that closes little of a large gap."""
     return (
-        f"closes only {_weighted(closed)} while {still_open:.0%} of it stays open; it may be a "
-        "proxy for an unknown cause"
+        f"closes only {_weighted(closed)} while {100 * still_open:.0f} % of it stays open; it may "
+        "be a proxy for an unknown cause"
     )
 
 
 def _weighted(closed: float) -> str:
-    return f"{max(closed, 0):.1%} of the gap weighted by significance"
+    return f"{100 * max(closed, 0):.1f} % of the gap weighted by significance"
 
 
 def all_close_little(
@@ -147,7 +149,7 @@ def doubtful(
     if open_still > MAX_RESIDUAL_GAP or least not in imitated:
         return least, possible_proxy(closed[least], open_still)
     sigmas, mimicked = candidates[least].significance, 1 - candidates[least].share
-    why = f"the other causes produce {mimicked:.0%} of its significance"
+    why = f"{100 * mimicked:.0f} % of its significance comes from the other causes"
     if sigmas < SIGNIFICANT:
         why = f"it is not significant ({sigmas:.1f} sigma) in the frames that it was fitted to"
     return (

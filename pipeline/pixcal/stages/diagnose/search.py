@@ -255,12 +255,14 @@ class Search:
         if self.comparison.differs(causes.current):
             strong = max(sizes.values(), default=0.0) >= SIGNIFICANT
             least = MIN_SIGMA_IN_GAP if strong else MIN_SIGMA_WEAK
-        beside = f" in addition to {' and '.join(causes.effects)}" if causes.effects else ""
+        names = " and ".join(causes.effects)
+        verb = "are" if len(causes.effects) > 1 else "is"
+        beside = f" once {names} {verb} included" if names else ""
         for name, size in sizes.items():
             estimate = remaining[name].estimate
             assert estimate is not None
             if size < least or estimate.effect.is_null:
-                remaining[name].reason = f"not significant ({size:z.1f} sigma{beside})"
+                remaining[name].reason = f"not significant{beside} ({size:z.1f} sigma)"
                 del remaining[name]
 
     def _sizes(self) -> dict[str, float]:
@@ -282,8 +284,7 @@ class Search:
             left -= SCREEN_SIMULATIONS * (len(candidate.variants(causes.shares.get(name, 1.0))) + 1)
             if left < 0:
                 candidate.reason = (
-                    f"not decided: this search may use {self._most} simulations, and too few are "
-                    "left"
+                    f"not decided: too few of the search's {self._most} simulations are left"
                 )
                 del remaining[name]
 

@@ -86,7 +86,7 @@ def run_search(
         if candidate.estimate is None and not candidate.reason:
             candidate.needs = _needs(kinds[name], inputs.facts)
             candidate.reason = (
-                f"these frames give no estimate; {' or '.join(candidate.needs)} would help"
+                f"cannot be estimated from these frames; record {' or '.join(candidate.needs)}"
             )
     estimates = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
     quick = tuple(s for s in signatures if kinds[s.name].quick)
@@ -111,7 +111,7 @@ def _nominal(
     """Null distribution from the nominal bench, and the curves of the data on its scales."""
     (nominal,) = trials.curves([base], REFERENCES, "nominal bench")
     if isinstance(nominal, str):
-        where = "--nominal" if base else f"{run_dir}: its nominal bench"
+        where = "--nominal" if base else f"{run_dir}: the nominal simulation failed"
         raise InputError(f"{where}: {nominal}")
     reference = Reference.of(nominal)
     return reference, reference.on_scale(inputs.measured)

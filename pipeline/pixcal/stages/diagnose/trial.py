@@ -245,7 +245,7 @@ def _kept_within(bound: Bound, ask: Callable[[Evidence], T], evidence: Evidence)
         with bound.enforced():
             return ask(evidence)
     except Exceeded:
-        return f"not decided: an estimate may use {bound.describe()}, this one would need more"
+        return f"not decided: the estimate exceeded its limit of {bound.describe()}"
     except NotImplementedError as error:
         return str(error)
     except np.linalg.LinAlgError:

@@ -82,7 +82,8 @@ def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
     apart = Target.of(config.truth or truth, "--truth", TRUTH)
     if apart.final.is_relative_to(there.final) or there.final.is_relative_to(apart.final):
         raise InputError(
-            f"--truth {apart.final}: lies inside {there.final}, or around it; choose another"
+            f"--truth {apart.final}: one directory contains the other ({there.final}); choose "
+            "another"
         )
     effects = _checked_effects(plan, bench, config.own)
     own = {f"effect {file.name}": file_digest(file) for file in config.own}
