@@ -156,17 +156,17 @@ class FrameChanges:
         recordings = set_recordings(evidence)
         light, motion = light_of(evidence), motion_of(evidence)
 
-        def watched(series: FrameSeries, channels: tuple[int, int]) -> AffectedSeries:
+        def affected(series: FrameSeries, channels: tuple[int, int]) -> AffectedSeries:
             recording = recordings[series.name]
             recording = replace(recording, bench=_rounded(recording.bench))
             return AffectedSeries(series, channels, recording, tuple(series.frame.tolist()))
 
         self.light, self.crossed = light, motion is not None and motion.crossed
-        self._every = [[watched(s, MOTION) for s in motion.series]] if motion else []
+        self._every = [[affected(s, MOTION) for s in motion.series]] if motion else []
         self._lines: list[Line | None] = [motion.line] if motion else []
         if light is not None:
             dark = [AffectedSeries(s, LIGHT, None, tuple(range(len(s)))) for s in light.dark]
-            self._every.append([*(watched(s, LIGHT) for s in light.sets), *dark])
+            self._every.append([*(affected(s, LIGHT) for s in light.sets), *dark])
             self._lines.append(light.line)
 
     def series(self, start: ForwardModel) -> list[AffectedSeries]:
