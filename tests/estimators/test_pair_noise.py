@@ -136,6 +136,23 @@ def test_noise_of_rows_is_whole_where_every_second_row_repeats_it() -> None:
     assert shared == pytest.approx(row**2, abs=3 * error)
 
 
+@pytest.mark.parametrize("column", [0.0, 2.0])
+@pytest.mark.parametrize("period", [7.3, 22.2, 90.0])
+def test_noise_that_neighbouring_rows_share_is_none_of_columns(
+    period: float, column: float
+) -> None:
+    """Mains hum hardly changes along a row."""
+    rng, size = np.random.default_rng(13), 3.0
+    dark = READ * rng.standard_normal((DARKS, 208, 176))
+    phase = rng.uniform(0, 2 * np.pi, (DARKS, 1)) + 2 * np.pi / period * np.arange(208)
+    dark += np.sqrt(2) * size * np.cos(phase)[..., None]
+    dark += column * rng.standard_normal((DARKS, 1, 176))
+    found = shared_by_lines(dark_pair_sums(dark.astype(np.float32), READ, 0.0))
+    assert found["row"][0] > 5 * found["row"][1]
+    error = np.hypot(found["column"][1], column**2 * np.sqrt(4 / (DARKS * 176)))
+    assert found["column"][0] == pytest.approx(column**2, abs=4 * error)
+
+
 @pytest.mark.parametrize("axis", [1, 2])
 def test_pixels_that_share_noise_two_apart_are_no_line(axis: int) -> None:
     """As of two outputs that read the columns in turn, and settle slowly."""

@@ -109,6 +109,39 @@ def rows_and_columns(sensor: Sensor) -> Drawn:
     return {"row_e": float(row), "column_e": float(column)}
 
 
+def _wave(sensor: Sensor, size: float, columns: float, rows: float) -> None:
+    """A wave of this rms (e-) and these cycles per pixel, with a phase of its own in each frame."""
+    ny, nx = sensor.shape
+    phase = 2 * np.pi * (rows * np.arange(ny)[:, None] + columns * np.arange(nx))
+
+    def adds(e: F64, _: int) -> F64:
+        return e + np.sqrt(2) * size * np.sin(phase + sensor.rng.uniform(0, 2 * np.pi))
+
+    sensor.amplified.append(adds)
+
+
+@kind("pickup")
+def hum(sensor: Sensor) -> Drawn:
+    """Hum of the mains, which goes through a cycle in some rows, and hardly changes along one."""
+    rng = sensor.rng
+    size = float(rng.uniform(0.15, 0.8) * sensor.read_noise_e.mean())
+    rows = float(rng.uniform(0.06, 0.44))
+    _wave(sensor, size, rows / 2000, rows)
+    return {"hum_e": size, "rows": rows}
+
+
+@kind("pickup")
+def tones(sensor: Sensor) -> Drawn:
+    """Two signals of high frequency."""
+    rng = sensor.rng
+    sizes = rng.uniform(0.1, 0.5, 2) * sensor.read_noise_e.mean()
+    waves = rng.uniform((0.05, -0.5), (0.45, 0.5), (2, 2))
+    for size, (columns, rows) in zip(sizes.tolist(), waves.tolist(), strict=True):
+        _wave(sensor, size, columns, rows)
+    sensor.shared_e = float(np.hypot(*sizes))
+    return {"tones_e": sensor.shared_e}
+
+
 def _outputs(sensor: Sensor, at: tuple[float, float]) -> NDArray[np.int_]:
     """Number (y, x) of each pixel's output; four meet at a place, relative to the shape."""
     ny, nx = sensor.shape

@@ -33,6 +33,9 @@ _DISTINCT = 0.7  # least distance of two tones, modes
 # low, as noise is 1/f there.
 _AROUND, _AROUND_SLOW = (8, 8), (32, 1)
 _SLOW = 8  # modes along rows that are low
+# Mains hum hardly changes along a row. Noise of rows has a spectrum of its own, with harmonics of
+# steps between outputs: a tone stands out of every mode within an octave, but those next to it.
+_FIRST, _STANDS_OUT = 6, 3.0  # least cycles along columns; least power over the next highest
 # Fewer cycles along columns are drifts; or, with few along rows, steps between outputs.
 _DRIFTS, _STEPS = 4, 24
 
@@ -44,6 +47,7 @@ class Pickup(Effect):
     A signal of one frequency makes a wave along the order in which pixels are read: a tone along
     rows and columns. It does not keep step with the frames, so its phase differs in each and no
     bias map holds it. A signal of some bandwidth is several tones.
+    Mains hum has no cycles per column.
     """
 
     name = "pickup"
@@ -109,7 +113,8 @@ class Pickup(Effect):
             ordinates, sigmas = _search(rest)
         tones = tones if len(tones) else first
         size, number = _sizes(frames, good, tones), np.count_nonzero(good)
-        white = 2 * float(np.square(rest).sum()) / len(frames) / number**2
+        own = rest - rest.mean(axis=2, keepdims=True)
+        white = 2 * float(np.square(own).sum()) / len(frames) / number**2
         power = np.maximum((np.abs(size) ** 2).mean(axis=0) / 2 - white, 0.0)
         # Two waves of random phases, whose difference this is, add up by chance.
         variance = (power**2 / 2 + 2 * power * white + white**2) / len(frames)
@@ -138,7 +143,7 @@ class Pickup(Effect):
 
 
 def _noise(evidence: Evidence) -> tuple[F32, Mask] | None:
-    """Differences of frames (t, y, x) over root two, e-, without what rows and columns share.
+    """Differences of frames (t, y, x) over root two, e-, without what columns share.
 
     Zero in bad pixels. None without two frames of a kind whose noise spans a step.
     """
@@ -152,7 +157,7 @@ def _noise(evidence: Evidence) -> tuple[F32, Mask] | None:
             adu = stack.adu[:, *middle].astype(np.float32)
             count = len(adu) // 2 * 2
             for step in (adu[1:count:2] - adu[:count:2]) * np.float32(evidence.gain / 2**0.5):
-                own = _without_lines(step, good)
+                own = _without_columns(step, good)
                 # Root mean squares, as medians of integers are quantised.
                 own[np.abs(own) > _WILD * np.sqrt(np.square(own).mean())] = 0
                 if own.any():
@@ -160,13 +165,10 @@ def _noise(evidence: Evidence) -> tuple[F32, Mask] | None:
     return (np.stack(some[:_FRAMES]), good) if some else None
 
 
-def _without_lines(frame: F32, good: Mask) -> F32:
-    """A frame without the means of its columns and rows; zero in bad pixels."""
-    for axis in (0, 1):
-        count = np.maximum(good.sum(axis=axis, keepdims=True), 1)
-        mean = np.where(good, frame, 0).sum(axis=axis, keepdims=True) / count
-        frame = frame - mean.astype(np.float32)
-    return np.where(good, frame, np.float32(0))
+def _without_columns(frame: F32, good: Mask) -> F32:
+    """A frame without the means of its columns; zero in bad pixels."""
+    mean = np.where(good, frame, 0).sum(axis=0) / np.maximum(good.sum(axis=0), 1)
+    return np.where(good, frame - mean.astype(np.float32), np.float32(0))
 
 
 def _search(frames: F32) -> tuple[F64, F64]:
@@ -174,12 +176,16 @@ def _search(frames: F32) -> tuple[F64, F64]:
     count, ny, nx = frames.shape
     spectra = rfft2(frames)
     power = spectra.real**2 + spectra.imag**2
-    power = (power / np.square(frames).sum(axis=(1, 2), keepdims=True)).mean(axis=0, dtype=float)
+    # Rows share noise that would give frames other weights.
+    rest = np.square(frames - frames.mean(axis=2, keepdims=True)).sum(axis=(1, 2), keepdims=True)
+    power = (power / rest).mean(axis=0, dtype=float)
+    of_rows = _over_next_highest(power[:, 0])
     power[:, _SLOW:] /= _surroundings(power[:, _SLOW:], _AROUND)
     power[:, :_SLOW] /= _surroundings(power[:, :_SLOW], _AROUND_SLOW)
     down = np.abs(np.fft.fftfreq(ny)) * ny
-    power[down < _DRIFTS] = power[:, 0] = 0
+    power[down < _DRIFTS] = 0
     power[down < _STEPS, :_DRIFTS] = 0
+    power[:, 0] = of_rows
     if nx % 2 == 0:
         # The two halves of this column are the same.
         power[ny // 2 + 1 :, -1] = 0
@@ -192,6 +198,19 @@ def _search(frames: F32) -> tuple[F64, F64]:
     own = (np.cbrt(power[*at.T]) - 1) * (1 - ninth) / np.sqrt(ninth)
     sigmas = [sigmas_of_largest(float(z), (ny - 1) * (nx // 2)) for z in own]
     return np.stack([np.fft.fftfreq(ny)[at[:, 0]], at[:, 1] / nx], axis=1), np.array(sigmas)
+
+
+def _over_next_highest(power: F64) -> F64:
+    """Modes (y,) of the means of rows over the mean of those within an octave; zero for no tone.
+
+    The two halves are the same; the highest modes are differences of even and odd rows.
+    """
+    found, end = np.zeros(len(power)), (len(power) - 1) // 2 - 1
+    for k in range(_FIRST, end):
+        about = np.concatenate([power[k // 2 : k - 1], power[k + 2 : min(2 * k, end) + 1]])
+        if power[k] > _STANDS_OUT * about.max():
+            found[k] = power[k] / about.mean()
+    return found
 
 
 def _surroundings(power: F64, size: tuple[int, int]) -> F64:
@@ -221,14 +240,14 @@ def _refined(frames: F32, tone: F64) -> F64:
     shift = minimize(loss, start[0], method="Nelder-Mead", options=options).x
     fy, fx = tone + np.clip(shift, -1, 1) * bins
     # The wave is the same with both frequencies of opposite sign, or whole cycles more.
-    fy, fx = (fy, fx) if fx <= 0.5 else (-fy, 1 - fx)
+    fy, fx = (fy, fx) if 0 <= fx <= 0.5 else (-fy, fx % -1 * -1)
     return np.array([(fy + 0.5) % 1 - 0.5, fx])
 
 
 def _apart(tone: F64, others: F64, shape: tuple[int, ...]) -> bool:
     """Whether a tone is so far from others, and from the same waves in reverse, as to differ."""
-    reverse = others * [-1, -1] + [0, 1]
-    away = np.hypot(*((np.concatenate([others, reverse]) - tone) * shape[1:]).T)
+    same = np.concatenate([others, -others, [0, 1] - others])
+    away = np.hypot(*((same - tone) * shape[1:]).T)
     return bool((away > _DISTINCT).all())
 
 

@@ -15,6 +15,8 @@ from pixcal.kernels.robust import lit, median_and_deviation, median_and_sigma
 from pixcal.model.arrays import F32, F64
 
 LINES = {"row": ((0, 1), (0, 2)), "column": ((1, 0), (2, 0))}  # lags along a line
+# As far along a line, and to the next one.
+_ASLANT = {"row": ((1, 1), (1, 2)), "column": ((1, 1), (2, 1))}
 
 _SHARED = 5.0  # significance (errors) from which the noise shared by lines counts
 _OUT = 5.0  # standard deviations of outlying samples
@@ -38,16 +40,21 @@ def shared_by_lines(dark: F64) -> dict[str, Measure]:
     covariance = dict(zip(map(tuple, LAGS.tolist()), total[3:] / total[0], strict=True))
     # Coupling reaches lag 1 only, a repeat of every second row lag 2 only; line noise has both.
     seen = np.array([min(covariance[lag] for lag in own) for own in LINES.values()])
-    # Subtracting block means removed part of the row noise, more where every second row repeats
-    # it, and took column noise off pairs in different columns. Diagonal neighbours show a repeat,
-    # and no coupling along rows or columns.
+    # Pairs in different rows hold what neighbouring rows share, less what block means took off:
+    # both drop out of the difference of pairs in one column and in two, which is column noise. The
+    # other way round where columns share noise, or every second row does.
     kept, taken = BLOCK / (BLOCK + 1), (BLOCK - 1) / BLOCK**2
-    repeated = [covariance[2, 2] - covariance[near] for near in ((1, 2), (2, 1))]
-    seen += 2 * (BLOCK - 2) / (BLOCK**2 - 1) * np.maximum(repeated, 0)
-    shared = np.linalg.solve([[kept, -taken], [-taken, kept]], seen)
+    of_columns = covariance[1, 2] < covariance[2, 1]
+    smooth, other = (1, 0) if of_columns else (0, 1)
+    name, shared = tuple(LINES)[other], np.empty(2)
+    pairs = zip(LINES[name], _ASLANT[name], strict=True)
+    apart = min(covariance[along] - covariance[aslant] for along, aslant in pairs)
+    shared[other] = apart / (kept + taken)
+    shared[smooth] = (seen[smooth] + taken * shared[other]) / kept
+    errors = np.where(np.arange(2) == other, math.sqrt(2), 1) * error
     return {
         name: (float(own) if own > _SHARED * error else 0.0, error)
-        for name, own in zip(LINES, shared, strict=True)
+        for name, own, error in zip(LINES, shared, errors.tolist(), strict=True)
     }
 
 
