@@ -58,17 +58,16 @@ class FlatLight:
 
     def factor(self, recording: Recording, frame: int) -> float:
         """Light of a frame over that of its recording."""
+        level = 1.0
+        if self.one_lamp and recording.exptime_s not in self.off:
+            level += self.wander * float(recording.rng("lamp").standard_normal())
         known = self.frames.get(recording.number)
         if known is not None and np.isfinite(known[frame]):
-            return float(known[frame])
-        of_frame = (
-            1
-            + self._flicker(recording.bench.seed) * recording.rng("lamp", frame).standard_normal()
-            + self._rise(recording.bench.seed) * (frame - (recording.count - 1) / 2)
-        )
-        if known is not None or not self.one_lamp or recording.exptime_s in self.off:
-            return float(of_frame)
-        return float(of_frame * (1 + self.wander * recording.rng("lamp").standard_normal()))
+            return level * float(known[frame])
+        flicker = self._flicker(recording.bench.seed)
+        flicker *= float(recording.rng("lamp", frame).standard_normal())
+        rise = self._rise(recording.bench.seed) * (frame - (recording.count - 1) / 2)
+        return level * (1 + flicker + rise)
 
     def _rise(self, seed: int) -> float:
         """Rise of the light in a simulation, drawn within its error."""
