@@ -50,6 +50,16 @@ def test_eight_bits_may_saturate() -> None:
     assert flagged(found.differences) == set()
 
 
+@pytest.mark.parametrize("count", [2, 12])
+def test_levels_that_scatter_as_lamps_do_show_no_gap(count: int) -> None:
+    """By a thousandth, whether or not the light of each frame is measured."""
+    lamp = np.array([1.0, -0.8, 1.2, -1.0, 0.4, -0.8])
+    times = (0.1, 0.2, 0.3, 0.45, 0.7, 0.9)
+    flats = [(t, count, 1 + 1e-3 * own) for t, own in zip(times, lamp.tolist(), strict=True)]
+    found = held_against_nominal(Detector(flats=flats), 6)
+    assert flagged(found.differences) == set()
+
+
 def test_flats_of_full_pixels_do_not_pull_the_light_of_the_others() -> None:
     """Levels that are not looked at are not known, and the line of the lamp is that of the rest."""
     flats = [(t, 2, 1.0) for t in (0.1, 0.2, 0.3, 0.4, 0.8, 0.9)]
