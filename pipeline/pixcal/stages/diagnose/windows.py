@@ -100,7 +100,8 @@ def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = 
     """Assign blocks of every array and exposure time to the halves (`TURN`).
 
     A long fringe set contributes `SAMPLES` to each half; without fringes, all frames together do.
-    Flats with full pixels are left out unless all have them.
+    Flats with full pixels are left out unless all have them. The first flat of a series is in both
+    halves: it alone lacks the charge that stays behind.
     """
     learn, test = {}, {}
     every = {name: _groups(name, table, full_flats) for name, table in tables.items()}
@@ -111,10 +112,11 @@ def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = 
         most = _equal_share([len(own) for of_name in every.values() for own in of_name], most)
     for name, of_name in every.items():
         fitted, held_out = [], []
+        shared = int(name == "flat")
         for own in of_name:
-            one, other = _halves(own, most)
+            one, other = _halves(own, most - shared)
             fitted.append(one)
-            held_out.append(other)
+            held_out.append(np.union1d(own[:shared], other))
         learn[name] = np.sort(np.concatenate(fitted))
         test[name] = np.sort(np.concatenate(held_out))
     return Split(learn, test)
