@@ -115,7 +115,7 @@ def _wave(sensor: Sensor, size: float, columns: float, rows: float) -> None:
     phase = 2 * np.pi * (rows * np.arange(ny)[:, None] + columns * np.arange(nx))
 
     def adds(e: F64, _: int) -> F64:
-        return e + np.sqrt(2) * size * np.sin(phase + sensor.rng.uniform(0, 2 * np.pi))
+        return np.asarray(e + np.sqrt(2) * size * np.sin(phase + sensor.rng.uniform(0, 2 * np.pi)))
 
     sensor.amplified.append(adds)
 
