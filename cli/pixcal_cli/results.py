@@ -140,6 +140,14 @@ def show_correction(run: Path) -> None:
         click.echo(f"  difference between {sets}: {apart} px ({expected} px expected from noise)")
     if not correction["pairs"]:
         show_notes(["one set along each axis: a second baseline would verify the correction"])
+    show_notes(
+        [
+            f"{name}: sigma is enlarged by {facts['sigma_enlarged']:.2f}, because after the "
+            "correction the maps from each half of the frames differ by more than their noise"
+            for name, facts in correction["sets"].items()
+            if facts["sigma_enlarged"] > 1
+        ]
+    )
 
 
 def _quadratic_sum(errors: Mapping[str, float | None]) -> str:

@@ -20,7 +20,7 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages import correct, fit
-from pixcal.stages.correct.gain import repeating, worsened
+from pixcal.stages.correct.gain import excess, repeating, worsened
 from pixcal.stages.correct.sweep_to_correct import RestoredSet, corrected
 from pixcal.stages.correct.uncertainty import moved
 from pixcal.stages.reduced_set import ReducedSet
@@ -488,6 +488,14 @@ def test_a_correction_that_leaves_a_larger_pattern_is_refused() -> None:
     assert worsened({"vertical": good | {"rows": None}}, []) == ""
     bad = good | {"columns": _pattern(1e-4, 1e-3)}
     assert "pattern of columns grows" in worsened({"vertical": good, "horizontal": bad}, [])
+
+
+@pytest.mark.parametrize(("after", "factor"), [(0.9e-3, 1.0), (1.04e-3, 1.0), (2.1e-3, 2.1)])
+def test_errors_cover_the_difference_of_the_halves(after: float, factor: float) -> None:
+    halves = {"after_px": after, "after_expected_px": 1e-3}
+    assert excess({"pixels": 10_000, "halves": halves}) == pytest.approx(factor)
+    assert excess({"pixels": 100, "halves": halves | {"after_px": 1.1e-3}}) == 1
+    assert excess({"pixels": 10_000, "halves": None}) == 1
 
 
 def test_a_correction_that_moves_sets_apart_is_refused() -> None:

@@ -137,12 +137,21 @@ class Ipc(Effect):
         errors = {f"couplings[{n}].share": float(s) for n, s in enumerate(sigma)}
         if kernel.per_ke:
             errors |= {f"couplings[{n}].per_ke": kernel.per_ke_error for n in range(len(sigma))}
+        shares = np.array([c.share for c in kernel.couplings])
+        n = int(np.abs(shares).argmax())
+        place, number = (kernel.couplings[n].dy, kernel.couplings[n].dx), len(shares)
         return Estimate(
             cls(kernel.couplings),
             errors,
             kernel.significance,
             _why(kernel),
-            law=f"a kernel of {len(kernel.couplings)} couplings, all significant",
+            law=f"a kernel of {number} couplings, all significant",
+            size={
+                "value": float(shares[n]),
+                "error": float(sigma[n]),
+                "unit": "",
+                "of": f"at (dy, dx) = {place}, the largest of {number} couplings",
+            },
             in_full=cls(_worth_it(kernel.whole)) if kernel.whole else None,
         )
 

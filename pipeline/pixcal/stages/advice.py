@@ -15,6 +15,7 @@ from pixcal.storage.stage import require, without_fringes
 
 Json = Mapping[str, Any]
 
+NEGLIGIBLE = 1e-3  # change of the offsets over their errors below which it is not given
 # share of SIGMA from which an error that SIGMA does not hold limits a map
 MIN_BIAS_OVER_SIGMA = 0.3
 
@@ -156,8 +157,10 @@ def moved_by(cause: Json, sigma: Mapping[str, float]) -> str:
     rms, most = cause["on_map"]["rms_px"], cause["on_map"]["max_px"]
     if not rms or not sigma:
         return "not known" if _unknown({"causes": [cause]}) else "none"
-    in_sigma = number(rms / min(sigma.values()), 2)
-    return f"{number(rms, 2)} px rms ({in_sigma} σ), {number(most, 2)} px maximum"
+    in_sigma = rms / min(sigma.values())
+    if in_sigma < NEGLIGIBLE:
+        return f"below {NEGLIGIBLE:g} σ"
+    return f"{number(rms, 2)} px rms ({number(in_sigma, 2)} σ), {number(most, 2)} px maximum"
 
 
 def _treated(cause: Json, correction: Json | None) -> Json | None:

@@ -22,6 +22,7 @@ from pixcal.storage.cube import ArrayReader
 
 PERIOD = 4  # rows or columns after which patterns repeat (paper, section 5.1: period of four rows)
 WORSE = 4.0  # sigma above which a pattern, or a disagreement of sets, is larger than before
+LARGER = 1.05  # least difference of the halves over its error that enlarges the errors
 ALIGNED = 0.985  # least cosine between axes of sets that measure the same offsets (10 degrees)
 
 
@@ -83,6 +84,19 @@ def measure_gain(maps: Maps, runtime: Runtime) -> dict[str, Any]:
         for n, (a, b, _) in enumerate(maps.pairs)
     ]
     return {"sets": sets, "pairs": pairs}
+
+
+def excess(facts: Mapping[str, Any]) -> float:
+    """Difference of the halves of a set over its error, after the correction; 1 where they agree.
+
+    A correction that does not fit leaves errors that vary with the phases of the frames.
+    """
+    halves = facts["halves"]
+    if halves is None or not halves["after_expected_px"]:
+        return 1.0
+    ratio = float(halves["after_px"] / halves["after_expected_px"])
+    chance = WORSE * np.sqrt(2 / max(facts["pixels"], 1))
+    return ratio if ratio > LARGER and ratio**2 > 1 + chance else 1.0
 
 
 def worsened(sets: Mapping[str, Any], pairs: Sequence[Mapping[str, Any]]) -> str:

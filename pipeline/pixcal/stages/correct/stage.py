@@ -28,7 +28,7 @@ from pixcal.model.options import Sweep
 from pixcal.simulation.effect import Effect
 from pixcal.stages import fit
 from pixcal.stages.correct.correct_maps import correct_sweep, sides_of
-from pixcal.stages.correct.gain import Maps, measure_gain, worsened
+from pixcal.stages.correct.gain import Maps, excess, measure_gain, worsened
 from pixcal.stages.correct.sweep_to_correct import RestoredSet, Swept
 from pixcal.stages.correct.uncertainty import parameter_errors
 from pixcal.stages.diagnose.diagnosis_input import ESTIMATE_BYTES, EVIDENCE_BYTES
@@ -149,14 +149,20 @@ def _corrected_maps(
     group = made.folder / "corrected.zarr"
     totals = write_maps(group, fitted, runtime)
     axes = {name: tuple(before["sets"][name]["axis"]) for name in sets}
-    gain = measure_gain(Maps(run_dir / "fit" / "fit.zarr", group, sets, axes), runtime)
+    maps = Maps(run_dir / "fit" / "fit.zarr", group, sets, axes)
+    gain = measure_gain(maps, runtime)
+    larger = {name: excess(facts) for name, facts in gain["sets"].items()}
+    if max(larger.values()) > 1:
+        fitted = [replace(f, excess=larger[f.name]) for f in fitted]
+        totals = write_maps(group, fitted, runtime)
+        gain = measure_gain(maps, runtime)
     return {
         "outputs": list(totals.outputs),
         "model": model,
         "open_sides": dict(zip(("top", "bottom", "left", "right"), sides, strict=True)),
         "sets": {
             f.name: _of_set(f, totals, gain["sets"][f.name], before["sets"][f.name], plan)
-            | {"parameter_error_px": left[f.name]}
+            | {"parameter_error_px": left[f.name], "sigma_enlarged": larger[f.name]}
             for f in fitted
         },
         "pairs": gain["pairs"],

@@ -60,6 +60,8 @@ class FittedSet:
     evidence: str
     # typical reduced chi-square: the variance of the samples over that of the noise model
     noise: float
+    # difference of maps of the two halves of the frames over its error, if that is too small
+    excess: float = 1.0
 
     @property
     def carrier(self) -> Carrier:
@@ -71,6 +73,11 @@ class FittedSet:
         """Fringe vector (kx, ky) at the centre of the window, rad/px."""
         ny, nx = self.source.shape
         return self.shape.vector((ny - 1) / 2, (nx - 1) / 2)
+
+    @property
+    def sigma_scale(self) -> float:
+        """Errors of the phases over those of the noise model."""
+        return self.excess * float(np.sqrt(self.noise))
 
     @property
     def n_batches(self) -> int:
@@ -233,7 +240,7 @@ def describe(fitted: FittedSet, masked: int, sigma_px: float) -> dict[str, Any]:
         "sigma_median_px": sigma_px,
         "crb_median_px": None if facts["bound_rad"] is None else facts["bound_rad"] / k,
         "chi2_reduced": fitted.noise,
-        "sigma_scale": float(np.sqrt(fitted.noise)),
+        "sigma_scale": fitted.sigma_scale,
         "fringe_vector_moves": facts["moving"],
         "iterations": fit.steps,
         "passes": facts["chunks_read"] / facts["chunks"],

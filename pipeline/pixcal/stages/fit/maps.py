@@ -209,7 +209,7 @@ def offsets(fitted: FittedSet, swept: Swept, at: tuple[int, int], removed: F64) 
     modes = local_modes(fitted.carrier, plane, phase.shape)
     surface = (removed[:, 0] @ modes).reshape(phase.shape)
     k = float(np.hypot(*fitted.shape.vector(*plane.centre)))
-    scale = np.float32(np.sqrt(fitted.noise) / k)
+    scale = np.float32(fitted.sigma_scale / k)
     delta = ((wrapped(phase - plane.on(phase.shape)) - surface) / k).astype(np.float32)
     sigma = np.asarray(swept["sigma"].read(y, x) * scale)
     delta[flags != 0] = sigma[flags != 0] = np.nan
