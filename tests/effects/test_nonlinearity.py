@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from all_frames import frames_of
 
-from pixcal.effects.nonlinearity import CurvePoint, Nonlinearity, _straight_on
+from pixcal.effects.nonlinearity import CurvePoint, Nonlinearity, _bent_by_noise, _straight_on
+from pixcal.estimators.detector.transfer_curve import TransferCurve
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.model.arrays import F64
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Estimate
@@ -283,3 +285,30 @@ def test_beyond_the_brightest_fringe_a_measured_response_goes_straight_on() -> N
     below = np.linspace(0, 17_000, 100, dtype=np.float32)
     np.testing.assert_allclose(whole.response(below), curve.response(below), atol=20)
     assert abs(curve.response(at)[-1] - straight[-1]) > 900
+
+
+def _transfer(signal: Callable[[F64], F64], error: float, levels: int) -> TransferCurve:
+    """Noise of flats behind a response, by its derivative."""
+    charge = np.linspace(0.1, 1, levels) * 1e4
+    at, step = signal(charge), 1.0
+    slope = (signal(charge + step) - signal(charge - step)) / (2 * step)
+    shares = slope**2 * charge / at
+    shares += error * np.random.default_rng(1).standard_normal(levels)
+    return TransferCurve(1.0, error, 0.0, error, float(at[-1]), at, shares, np.full(levels, error))
+
+
+def test_noise_of_many_levels_shows_a_response_of_two_terms() -> None:
+    """As an S: neither term can be left out."""
+    found = _bent_by_noise(
+        _transfer(lambda e: e * (1 + 0.1 * e / 1e4 - 0.15 * (e / 1e4) ** 2), 0.005, 12)
+    )
+    assert found is not None
+    sizes, covariance = found
+    top = 1 + 0.1 - 0.15  # the highest signal over its charge
+    pulls = (sizes - [0.1 * top, -0.15 * top**2]) / np.sqrt(np.diag(covariance))
+    assert np.abs(pulls).max() < 4
+
+
+@pytest.mark.parametrize(("quadratic", "levels"), [(0.0, 12), (-0.03, 12), (-0.1, 5)])
+def test_noise_along_a_line_shows_one_term(quadratic: float, levels: int) -> None:
+    assert _bent_by_noise(_transfer(lambda e: e * (1 + quadratic * e / 1e4), 0.01, levels)) is None

@@ -4,12 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from pixcal.estimators.detector.flat_ladder import ladder, ladder_response
 from pixcal.estimators.detector.ladder_curve import ladder_curve
 from pixcal.estimators.detector.neighbours import shared_charge
 from pixcal.estimators.detector.response import departure, fit_curve, fit_response
-from pixcal.estimators.detector.transfer_curve import transfer_curve
+from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
 from pixcal.estimators.diagnosis.distortions import Agreement
 from pixcal.estimators.diagnosis.evidence import Evidence, central_crop
 from pixcal.kernels.boundaries import boundary_shifts
@@ -31,6 +32,9 @@ TAIL = 1e-3  # share of samples below, and above, the range of levels
 BESIDE = 0.05
 _INVERSE = 1 << 14
 _NOT_TOLD = 1e-3
+_WITH_CUBIC = 6  # fewest levels of flats whose noise shows a cubic term
+_INVERSIONS = 12  # of the response
+_LOWEST, _HIGHEST = (-0.3, -0.3), (0.3, 0.3)
 _OTHER_ORDER = 4
 
 
@@ -296,13 +300,39 @@ def _full_scale(evidence: Evidence, usual: float) -> float:
 
 
 def _of_noise(evidence: Evidence, level_e: float) -> tuple[F64, F64] | None:
-    """(quadratic, 0) and covariance from photon transfer; None with too few levels.
+    """(quadratic, cubic) and covariance from photon transfer; None with too few levels.
 
-    A signal ``S (1 + q u)`` has variance ``S (1 + 2 q u)²``; their ratio rises as 1 + 3 q u.
+    A signal ``S (1 + q u)`` has variance ``S (1 + 2 q u)²``; their ratio rises as 1 + 3 q u. The
+    cubic term is zero unless the ratio bends significantly.
     """
     curve = transfer_curve(evidence)
     if curve is None:
         return None
+    if (bent := _bent_by_noise(curve)) is not None:
+        scales = (level_e / curve.top) ** np.arange(1, 3)
+        return bent[0] * scales, bent[1] * np.outer(scales, scales)
     scale = level_e / (3 * curve.top * curve.share)
     error = scale * curve.slope_error
     return np.array([scale * curve.slope, 0.0]), np.diag([error**2, _NOT_TOLD**2])
+
+
+def _bent_by_noise(curve: TransferCurve) -> tuple[F64, F64] | None:
+    """Quadratic and cubic term at the highest level, and covariance; None without a bend."""
+    signal = curve.levels / curve.top
+
+    def rest(sizes: F64) -> F64:
+        share, quadratic, cubic = sizes
+        u = signal
+        for _ in range(_INVERSIONS):
+            u = signal / (1 + quadratic * u + cubic * u**2)
+        rise = 1 + 2 * quadratic * u + 3 * cubic * u**2
+        ratio = rise**2 * u / signal
+        return np.asarray((share * ratio - curve.shares) / curve.errors)
+
+    if len(signal) < _WITH_CUBIC:
+        return None
+    fit = least_squares(rest, [curve.share, 0.0, 0.0], bounds=([0, *_LOWEST], [np.inf, *_HIGHEST]))
+    covariance = np.linalg.inv(fit.jac.T @ fit.jac)[1:, 1:]
+    if abs(fit.x[2]) < SIGNIFICANT * np.sqrt(covariance[1, 1]):
+        return None
+    return fit.x[1:], covariance
