@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.special import logsumexp
+from scipy.stats import chi2, ncx2
 
-from pixcal.estimators.detector.telegraph.classes import Mixture
+from pixcal.estimators.detector.telegraph.classes import Mixture, log_ratio_of_jumps
 from pixcal.estimators.detector.telegraph.dwell import LitSeries, find_stays
 from pixcal.estimators.detector.telegraph.find import find_telegraph, find_upper, own_levels
 from pixcal.estimators.detector.telegraph.moments import QUIET, Series, moments_of, thinned
@@ -63,6 +64,25 @@ def test_pixels_that_hardly_stand_out_tell_share_amplitude_and_time(
     assert abs(found.switching_s - switching_s) < 4 * found.switching_error < 2 * switching_s
     assert found.signs.significance > 8
     assert found.switching_decades == 0
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_few_frames_do_not_make_equal_jumps_more_frequent(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    series = jumping(rng, 0.01, 5.0, 4 * PERIOD_S, frames_of_series=(10,), n=60_000, tail=1e-9)
+    found = find_telegraph(series)
+    assert found is not None
+    assert abs(found.share - 0.01) < 4 * found.share_error < 0.0025
+    assert abs(found.switching_s - 4 * PERIOD_S) < 4 * found.switching_error < 4 * PERIOD_S
+
+
+@pytest.mark.parametrize("dof", [5, 9, 60, 700])
+def test_a_variance_with_jumps_is_a_noncentral_chi_square(dof: int) -> None:
+    variance, added = np.array([0.5, 1.0, 2.0, 5.0, 12.0]), np.array([0.05, 0.5, 3.0, 10.0])
+    expected = ncx2.logpdf(dof * variance[:, None], dof, dof * added)
+    expected -= chi2.logpdf(dof * variance, dof)[:, None]
+    found, finite = log_ratio_of_jumps(variance, added, dof), np.isfinite(expected)
+    np.testing.assert_allclose(found[finite], expected[finite], atol=0.5 / dof)
 
 
 @pytest.mark.long

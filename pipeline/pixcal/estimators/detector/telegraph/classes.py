@@ -40,9 +40,7 @@ class AmplitudeClasses:
         """Likelihoods of the moments of each pixel."""
         added = (AMPLITUDES * unit / m.sigma / 2) ** 2 / noise
         variance = m.variance / noise
-        levels = variance[:, None] * (added / (1 + added))
-        levels -= np.log1p(added)
-        levels *= m.samples_dof / 2
+        levels = log_ratio_of_jumps(variance, added, m.samples_dof)
         quiet = -(variance + np.log(noise)) * m.samples_dof / 2
         largest = levels.max(axis=1, keepdims=True)
         levels -= largest
@@ -67,6 +65,22 @@ class AmplitudeClasses:
         """Expected products of frames (n, class) at one lag, as in `Moments`."""
         products = (self.likely @ self.products[lag]) * (self.noise * self.added)
         return np.asarray(products / self.mixed())
+
+
+def log_ratio_of_jumps(variance: F64, added: F64, dof: float) -> F64:
+    """Logarithms (n, class) of the likelihoods of variances (n,) with jumps, over those without.
+
+    ``added``: (class,) variance of the jumps over that of the noise. For given states, a sample
+    variance has a noncentral chi-square distribution; its Bessel function is taken for large
+    orders (DLMF 10.41.3), with an error of half of 1 / ``dof`` at most.
+    """
+    order = max(dof / 2 - 1, 0.5)
+    s = np.sqrt(1 + variance[:, None] * (added * (dof / order) ** 2))
+    found = s - 1 - np.log((1 + s) / 2)
+    found *= order
+    found -= np.log(s) / 2
+    found -= dof / 2 * added
+    return np.asarray(found)
 
 
 @dataclass(frozen=True)
