@@ -14,24 +14,25 @@ KINDS: dict[str, type[Effect]] = {"ipc": Ipc, "row_noise": RowNoise}
 
 
 @pytest.mark.parametrize(
-    ("crosstalk", "rows", "made"),
+    ("crosstalk", "rows", "made", "in_the_dark"),
     [
-        (6.0, 1.0, {Ipc}),
-        (6.0, 5.0, {Ipc, RowNoise}),
-        (6.0, 9.0, {RowNoise}),
-        (25.0, 5.0, {RowNoise}),
-        (3.0, 3.0, set()),
+        (6.0, 1.0, {Ipc}, set()),
+        (6.0, 5.0, {Ipc, RowNoise}, {RowNoise}),
+        (6.0, 9.0, {RowNoise}, {RowNoise}),
+        (25.0, 5.0, {RowNoise}, {Ipc, RowNoise}),
+        (25.0, 35.0, {RowNoise}, {RowNoise}),
+        (3.0, 3.0, set(), set()),
     ],
-    ids=["slow alone", "slow is strongest", "slow is weaker", "slow is clear", "none is seen"],
 )
-def test_a_slow_estimate_is_a_statistic_only_if_weak_and_the_strongest(
-    crosstalk: float, rows: float, made: set[type[Effect]]
+def test_a_slow_estimate_is_a_statistic_only_if_the_strongest(
+    crosstalk: float, rows: float, made: set[type[Effect]], in_the_dark: set[type[Effect]]
 ) -> None:
     assert not Ipc.quick
     assert RowNoise.quick
     sizes = {"ipc": crosstalk, "row_noise": rows}
     found = {n: Candidate(n, Estimate(KINDS[n](), {}, s, "")) for n, s in sizes.items()}
     assert set(marginal_candidates(found, KINDS)) == made
+    assert set(marginal_candidates(found, KINDS, fringes=False)) == in_the_dark
 
 
 @pytest.mark.parametrize(("strongest", "tested"), [(90.0, True), (130.0, False)])

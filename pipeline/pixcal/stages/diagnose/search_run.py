@@ -44,7 +44,8 @@ R = TypeVar("R")
 
 REFERENCES = 16  # simulations of the nominal bench
 LEARN_SEED = 900_000
-MAX_SLOW_SIGNIFICANCE = 20.0  # significance above which a slow estimate is no test statistic
+# significance of a slow estimate up to which it is a test statistic, and without fringes from which
+MAX_SLOW_SIGNIFICANCE, MIN_DARK_SIGNIFICANCE = 20.0, 10.0
 # significance over that of the strongest candidate below which a score test, which takes a fifth of
 # a simulation, is none: the strongest effect is likely to produce it
 MIN_RELATIVE_SIGNIFICANCE = 0.05
@@ -78,7 +79,7 @@ def run_search(
         candidates.update(_candidates(evidence, kinds, base, few))
         for candidate in candidates.values():
             candidate.replay = _replayed(candidate, unseen)
-        signatures = marginal_candidates(candidates, kinds, slow=bool(evidence.fringes))
+        signatures = marginal_candidates(candidates, kinds, fringes=bool(evidence.fringes))
         return signatures
 
     inputs = prepare_input(run_dir, runtime, on_evidence)
@@ -223,22 +224,23 @@ def _again(candidate: Candidate) -> Again | None:
 
 
 def marginal_candidates(
-    candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]], *, slow: bool = True
+    candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]], *, fringes: bool = True
 ) -> tuple[Signature, ...]:
-    """Candidates significant in the fitted frames; a slow one only if weak and the strongest.
+    """Candidates significant in the fitted frames; a slow one only if it is the strongest.
 
+    With fringes, a strong one shows in other statistics; flats and darks alone show weak ones too.
     A score test that is faint beside the strongest candidate is left out.
     """
-    # Flats and darks alone show the effects that slow estimates search for in fringes.
     seen = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
     most = max((e.significance for e in seen.values()), default=0.0)
+    strongest = most < MAX_SLOW_SIGNIFICANCE if fringes else most > MIN_DARK_SIGNIFICANCE
     # Sorted by name, since the order of candidates must not affect the curves.
     return tuple(
         estimate.again or kinds[name]
         for name, estimate in sorted(seen.items())
         if estimate.significance >= SIGNIFICANT
         and (estimate.again is None or estimate.significance >= MIN_RELATIVE_SIGNIFICANCE * most)
-        and (kinds[name].quick or (slow and estimate.significance == most < MAX_SLOW_SIGNIFICANCE))
+        and (kinds[name].quick or (strongest and estimate.significance == most))
     )
 
 
