@@ -142,8 +142,8 @@ def show_correction(run: Path) -> None:
         show_notes(["one set along each axis: a second baseline would verify the correction"])
     show_notes(
         [
-            f"{name}: sigma is enlarged by {factor:.2f}, because after the correction the maps "
-            "from each half of the frames differ by more than their noise"
+            f"{name}: sigma is enlarged by {factor:.2f}, because the corrected maps from each half "
+            "of the frames differ by more than their noise"
             for name, facts in correction["sets"].items()
             # Corrections of earlier versions do not have it.
             if (factor := facts.get("sigma_enlarged", 1.0)) > 1

@@ -321,18 +321,19 @@ def _bent_by_noise(curve: TransferCurve) -> tuple[F64, F64] | None:
     signal = curve.levels / curve.top
 
     def rest(sizes: F64) -> F64:
-        share, quadratic, cubic = sizes
+        share, quadratic, cubic, read = sizes
         u = signal
         for _ in range(_INVERSIONS):
             u = signal / (1 + quadratic * u + cubic * u**2)
         rise = 1 + 2 * quadratic * u + 3 * cubic * u**2
-        ratio = rise**2 * u / signal
-        return np.asarray((share * ratio - curve.shares) / curve.errors)
+        ratio = share * rise**2 * u / signal + read * curve.common / curve.levels
+        return np.append((ratio - curve.shares) / curve.errors, read)
 
     if len(signal) < _WITH_CUBIC:
         return None
-    fit = least_squares(rest, [curve.share, 0.0, 0.0], bounds=([0, *_LOWEST], [np.inf, *_HIGHEST]))
-    covariance = np.linalg.inv(fit.jac.T @ fit.jac)[1:, 1:]
+    bounds = [0.0, *_LOWEST, -np.inf], [np.inf, *_HIGHEST, np.inf]
+    fit = least_squares(rest, [curve.share, 0.0, 0.0, 0.0], bounds=bounds)
+    covariance = np.linalg.inv(fit.jac.T @ fit.jac)[1:3, 1:3]
     if abs(fit.x[2]) < SIGNIFICANT * np.sqrt(covariance[1, 1]):
         return None
-    return fit.x[1:], covariance
+    return fit.x[1:3], covariance

@@ -34,7 +34,7 @@ _DISTINCT = 0.7  # least distance of two tones, modes
 _AROUND, _AROUND_SLOW = (8, 8), (32, 1)
 _SLOW = 8  # modes along rows that are low
 # Mains hum hardly changes along a row. Noise of rows has a spectrum of its own, with harmonics of
-# steps between outputs: a tone stands out of every mode within an octave, but those next to it.
+# steps between outputs: a tone stands out of all modes within an octave, but for one other tone.
 _FIRST, _STANDS_OUT = 6, 3.0  # least cycles along columns; least power over the next highest
 # Fewer cycles along columns are drifts; or, with few along rows, steps between outputs.
 _DRIFTS, _STEPS = 4, 24
@@ -47,7 +47,7 @@ class Pickup(Effect):
     A signal of one frequency makes a wave along the order in which pixels are read: a tone along
     rows and columns. It does not keep step with the frames, so its phase differs in each and no
     bias map holds it. A signal of some bandwidth is several tones.
-    Mains hum has no cycles per column.
+    Mains hum has hardly any cycles per column.
     """
 
     name = "pickup"
@@ -208,6 +208,9 @@ def _over_next_highest(power: F64) -> F64:
     found, end = np.zeros(len(power)), (len(power) - 1) // 2 - 1
     for k in range(_FIRST, end):
         about = np.concatenate([power[k // 2 : k - 1], power[k + 2 : min(2 * k, end) + 1]])
+        # But one: hum has a harmonic.
+        top = int(about.argmax())
+        about = np.delete(about, range(max(top - 1, 0), min(top + 2, len(about))))
         if power[k] > _STANDS_OUT * about.max():
             found[k] = power[k] / about.mean()
     return found

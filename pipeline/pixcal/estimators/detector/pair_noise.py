@@ -40,12 +40,18 @@ def shared_by_lines(dark: F64) -> dict[str, Measure]:
     covariance = dict(zip(map(tuple, LAGS.tolist()), total[3:] / total[0], strict=True))
     # Coupling reaches lag 1 only, a repeat of every second row lag 2 only; line noise has both.
     seen = np.array([min(covariance[lag] for lag in own) for own in LINES.values()])
-    # Pairs in different rows hold what neighbouring rows share, less what block means took off:
-    # both drop out of the difference of pairs in one column and in two, which is column noise. The
-    # other way round where columns share noise, or every second row does.
     kept, taken = BLOCK / (BLOCK + 1), (BLOCK - 1) / BLOCK**2
-    of_columns = covariance[1, 2] < covariance[2, 1]
-    smooth, other = (1, 0) if of_columns else (0, 1)
+    # Neighbouring rows share noise, or columns do: that of rows depends on the rows between pixels.
+    near, rows, columns, far = (covariance[lag] for lag in ((1, 1), (1, 2), (2, 1), (2, 2)))
+    of_rows = (near - rows) ** 2 + (columns - far) ** 2
+    of_columns = (near - columns) ** 2 + (rows - far) ** 2
+    smooth, other = (1, 0) if of_columns < of_rows else (0, 1)
+    # Subtracting block means removed part of it, more where every second row repeats it. Waves of
+    # any period have at least as much at one row as at two.
+    repeated = far - abs(columns if smooth else rows)
+    seen[smooth] += 2 * (BLOCK - 2) / (BLOCK**2 - 1) * max(repeated, 0.0)
+    # What rows share, and what block means took off, drops out of the difference of pairs in one
+    # column and in two, which is the noise of columns; or the other way round.
     name, shared = tuple(LINES)[other], np.empty(2)
     pairs = zip(LINES[name], _ASLANT[name], strict=True)
     apart = min(covariance[along] - covariance[aslant] for along, aslant in pairs)

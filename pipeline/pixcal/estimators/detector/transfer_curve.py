@@ -40,6 +40,8 @@ class TransferCurve:
     levels: F64  # levels, shares, errors: (n,) of each level (e-)
     shares: F64
     errors: F64
+    # error (e-²) of the variance of the read noise, common to all levels, if not fitted to them
+    common: float = 0.0
 
 
 @cached_on_evidence
@@ -79,7 +81,9 @@ def transfer_curve(evidence: Evidence, *, whole: bool = False) -> TransferCurve 
     found = covariance @ (design @ weights @ share)
     errors = np.sqrt(np.diag(covariance))
     at_zero, rise = zip(found.tolist(), errors.tolist(), strict=True)
-    return TransferCurve(*at_zero, *rise, top, level, share, np.hypot(error, common / level))
+    return TransferCurve(
+        *at_zero, *rise, top, level, share, np.hypot(error, common / level), common
+    )
 
 
 def _read_alone(sums: F64) -> F64:

@@ -87,9 +87,10 @@ def measure_gain(maps: Maps, runtime: Runtime) -> dict[str, Any]:
 
 
 def excess(facts: Mapping[str, Any]) -> float:
-    """Difference of the halves of a set over its error, after the correction; 1 where they agree.
+    """Difference of the corrected halves of a set over its error; 1 where they agree.
 
-    A correction that does not fit leaves errors that vary with the phases of the frames.
+    A correction that does not fit leaves errors that vary with the phases of the frames, and a
+    drift of the bench does so too.
     """
     halves = facts["halves"]
     if halves is None or not halves["after_expected_px"]:

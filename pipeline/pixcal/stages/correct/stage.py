@@ -120,11 +120,6 @@ def _correct(
     }
     if plan.corrected or plan.curved:
         result |= _corrected_maps(run_dir, made, plan, acquisition, runtime)
-        if worse := worsened(result["sets"], result["pairs"]):
-            raise InputError(
-                f"{run_dir}: correction refused: {worse}; use the maps as fitted, and record a "
-                "second baseline along each axis to measure the effect better"
-            )
     write_json(made.folder / "correction.json", result)
     made.summary = {"outputs": result["outputs"], "corrected": list(plan.corrected)}
 
@@ -151,6 +146,11 @@ def _corrected_maps(
     axes = {name: tuple(before["sets"][name]["axis"]) for name in sets}
     maps = Maps(run_dir / "fit" / "fit.zarr", group, sets, axes)
     gain = measure_gain(maps, runtime)
+    if worse := worsened(gain["sets"], gain["pairs"]):
+        raise InputError(
+            f"{run_dir}: correction refused: {worse}; use the maps as fitted, and record a "
+            "second baseline along each axis to measure the effect better"
+        )
     larger = {name: excess(facts) for name, facts in gain["sets"].items()}
     if max(larger.values()) > 1:
         fitted = [replace(f, excess=larger[f.name]) for f in fitted]

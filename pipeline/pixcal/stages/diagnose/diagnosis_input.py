@@ -126,7 +126,7 @@ def _frames_used(
         {"window": first.part, "frames": frames_of(own.learn)},
         {"windows": tuple(w.part for w in tried), "frames": frames_of(own.test)},
         tuple(left_out),
-        tuple(name for name, some in own.learn.items() if set(some) & set(own.test[name])),
+        own.shared,
         tuple(kind for kind in ("bias", "dark", "flat") if kind in frames.tables),
         {s.name: s.baseline_mm for s in frames.acquisition.frames.fringes},
         missing_frames(frames.acquisition, frames.tables, steps),

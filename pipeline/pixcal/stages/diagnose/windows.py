@@ -94,14 +94,15 @@ class Split:
 
     learn: FrameSubset
     test: FrameSubset
+    shared: tuple[str, ...]  # arrays with exposure times that have too few frames to split
 
 
 def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = ()) -> Split:
     """Assign blocks of every array and exposure time to the halves (`TURN`).
 
     A long fringe set contributes `SAMPLES` to each half; without fringes, all frames together do.
-    Flats with full pixels are left out unless all have them. The first flat of a series is in both
-    halves: it alone lacks the charge that stays behind.
+    Flats with full pixels are left out unless all have them. The first flat of an exposure time is
+    in both halves: in flats recorded level by level it alone lacks the charge that stays behind.
     """
     learn, test = {}, {}
     every = {name: _groups(name, table, full_flats) for name, table in tables.items()}
@@ -112,14 +113,14 @@ def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = 
         most = _equal_share([len(own) for of_name in every.values() for own in of_name], most)
     for name, of_name in every.items():
         fitted, held_out = [], []
-        shared = int(name == "flat")
         for own in of_name:
-            one, other = _halves(own, most - shared)
+            one, other = _halves(own, most)
             fitted.append(one)
-            held_out.append(np.union1d(own[:shared], other))
+            held_out.append(np.union1d(other, own[:1]) if name == "flat" else other)
         learn[name] = np.sort(np.concatenate(fitted))
         test[name] = np.sort(np.concatenate(held_out))
-    return Split(learn, test)
+    short = (name for name, of_name in every.items() if min(map(len, of_name)) < FEWEST)
+    return Split(learn, test, tuple(short))
 
 
 def _groups(name: str, table: Table, full_flats: Sequence[int]) -> list[Indices]:
