@@ -22,6 +22,7 @@ from pixcal.model.errors import InputError
 from pixcal.storage.fits_in import inspect
 from pixcal.storage.frame_file import FrameFile, SampleFormat
 from pixcal.storage.frames import tabulate
+from pixcal.storage.header_values import FIRST_MJD, LAST_MJD
 from pixcal.storage.sources import SourceFile
 from pixcal_cli.click_options import memory_size, region
 from pixcal_cli.main import one_line
@@ -179,7 +180,7 @@ def test_any_value_at_any_key_is_read_or_refused_by_its_key(
 
 # Times and options
 
-stamps = st.none() | st.floats(allow_nan=False, allow_infinity=False)
+stamps = st.none() | st.floats(FIRST_MJD, LAST_MJD)
 
 
 @given(

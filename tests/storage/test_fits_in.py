@@ -195,6 +195,8 @@ def with_header(path: Path, **cards: object) -> FrameFile:
         ({"DATE_OBS": "2024-01-01"}, None),
         ({"DATE_OBS": "yesterday at Ten"}, None),
         ({"MJD_OBS": "unknown"}, None),
+        ({"MJD_OBS": 2e303}, None),
+        ({"MJD_OBS": 2460310.75e3, "DATE_OBS": "2024-01-01T06:00:00"}, 60310.25),
         ({}, None),
     ],
 )

@@ -12,6 +12,7 @@ from typing import Any
 
 from astropy.io import fits
 
+FIRST_MJD, LAST_MJD = -678_575, 2_973_482  # days of the years 1 to 9999
 _MJD_EPOCH = datetime(1858, 11, 17, tzinfo=UTC)
 _SECONDS_A_DAY = 86400.0
 
@@ -109,10 +110,10 @@ def temperature_c(headers: tuple[Header, ...]) -> float | None:
 
 
 def time_stamp_mjd(headers: tuple[Header, ...]) -> float | None:
-    """Time stamp from MJD-OBS, else from DATE-OBS when it holds the time of day."""
+    """Time stamp from MJD-OBS if it is a date, else from DATE-OBS if it has the time of day."""
     for header in headers:
         mjd = number(header, "MJD-OBS")
-        if mjd is not None:
+        if mjd is not None and FIRST_MJD <= mjd <= LAST_MJD:
             return mjd
     for header in headers:
         text, clock = value(header, "DATE-OBS"), value(header, "TIME-OBS")
