@@ -49,6 +49,7 @@ def test_a_tone_is_a_wave_of_another_phase_in_each_frame(
         ((1.5,), (0.0,), (0.089,)),
         ((4.0, 2.0), (0.001, 0.0), (-0.21, 0.36)),
         ((3.0, 2.0), (0.0, 0.0), (0.11, 0.22)),
+        ((3.0, 2.0), (0.083, 0.27), (0.0, 0.02)),
     ],
 )
 def test_tones_are_found(
@@ -156,15 +157,17 @@ def test_noise_that_is_not_white_is_no_tone(
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 2.0])
 @pytest.mark.parametrize("shape", [(2, 192, 100), (8, 128, 90), (16, 311, 80)])
-def test_noise_of_rows_of_any_smooth_spectrum_is_no_tone(
-    exponent: float, shape: tuple[int, int, int]
+@pytest.mark.parametrize("axis", [1, 2])
+def test_noise_of_lines_of_any_smooth_spectrum_is_no_tone(
+    axis: int, exponent: float, shape: tuple[int, int, int]
 ) -> None:
     rng, found = np.random.default_rng(3), []
     spectrum = np.maximum(np.arange(shape[1] // 2 + 1), 1) ** (-exponent / 2)
     for _ in range(20):
         rows = np.fft.irfft(np.fft.rfft(rng.standard_normal(shape[:2])) * spectrum, shape[1])
         rows *= 10 / rows.std()
-        sigmas = Pickup.detect(_evidence(5 * rng.standard_normal(shape) + rows[..., None]))
+        frames = 5 * rng.standard_normal(shape) + rows[..., None]
+        sigmas = Pickup.detect(_evidence(frames if axis == 1 else frames.swapaxes(1, 2)))
         assert sigmas is not None
         found.append(sigmas)
     assert max(found) < 4

@@ -33,9 +33,10 @@ _DISTINCT = 0.7  # least distance of two tones, modes
 # low, as noise is 1/f there.
 _AROUND, _AROUND_SLOW = (8, 8), (32, 1)
 _SLOW = 8  # modes along rows that are low
-# Mains hum hardly changes along a row. Noise of rows has a spectrum of its own, with harmonics of
-# steps between outputs: a tone stands out of all modes within an octave, but for one other tone.
-_FIRST, _STANDS_OUT = 6, 3.0  # least cycles along columns; least power over the next highest
+# Mains hum hardly changes along a row, and a tone whose period divides that of rows not along a
+# column. Noise of rows or columns has a spectrum of its own, with harmonics of steps between
+# outputs: a tone stands out of all modes within an octave, but for one other tone.
+_FIRST, _STANDS_OUT = 6, 3.0  # least cycles; least power over the next highest
 # Fewer cycles along columns are drifts; or, with few along rows, steps between outputs.
 _DRIFTS, _STEPS = 4, 24
 
@@ -113,8 +114,7 @@ class Pickup(Effect):
             ordinates, sigmas = _search(rest)
         tones = tones if len(tones) else first
         size, number = _sizes(frames, good, tones), np.count_nonzero(good)
-        own = rest - rest.mean(axis=2, keepdims=True)
-        white = 2 * float(np.square(own).sum()) / len(frames) / number**2
+        white = 2 * float(np.square(_without_lines(rest)).sum()) / len(frames) / number**2
         power = np.maximum((np.abs(size) ** 2).mean(axis=0) / 2 - white, 0.0)
         # Two waves of random phases, whose difference this is, add up by chance.
         variance = (power**2 / 2 + 2 * power * white + white**2) / len(frames)
@@ -143,7 +143,7 @@ class Pickup(Effect):
 
 
 def _noise(evidence: Evidence) -> tuple[F32, Mask] | None:
-    """Differences of frames (t, y, x) over root two, e-, without what columns share.
+    """Differences of frames (t, y, x) over root two, e-, without what all pixels share.
 
     Zero in bad pixels. None without two frames of a kind whose noise spans a step.
     """
@@ -157,7 +157,7 @@ def _noise(evidence: Evidence) -> tuple[F32, Mask] | None:
             adu = stack.adu[:, *middle].astype(np.float32)
             count = len(adu) // 2 * 2
             for step in (adu[1:count:2] - adu[:count:2]) * np.float32(evidence.gain / 2**0.5):
-                own = _without_columns(step, good)
+                own = np.where(good, step - step[good].mean(), np.float32(0))
                 # Root mean squares, as medians of integers are quantised.
                 own[np.abs(own) > _WILD * np.sqrt(np.square(own).mean())] = 0
                 if own.any():
@@ -165,10 +165,10 @@ def _noise(evidence: Evidence) -> tuple[F32, Mask] | None:
     return (np.stack(some[:_FRAMES]), good) if some else None
 
 
-def _without_columns(frame: F32, good: Mask) -> F32:
-    """A frame without the means of its columns; zero in bad pixels."""
-    mean = np.where(good, frame, 0).sum(axis=0) / np.maximum(good.sum(axis=0), 1)
-    return np.where(good, frame - mean.astype(np.float32), np.float32(0))
+def _without_lines(frames: F32) -> F32:
+    """Frames (t, y, x) without what rows and columns share."""
+    rest = frames - frames.mean(axis=1, keepdims=True)
+    return np.asarray(rest - rest.mean(axis=2, keepdims=True))
 
 
 def _search(frames: F32) -> tuple[F64, F64]:
@@ -177,14 +177,18 @@ def _search(frames: F32) -> tuple[F64, F64]:
     spectra = rfft2(frames)
     power = spectra.real**2 + spectra.imag**2
     # Rows share noise that would give frames other weights.
-    rest = np.square(frames - frames.mean(axis=2, keepdims=True)).sum(axis=(1, 2), keepdims=True)
+    rest = np.square(_without_lines(frames)).sum(axis=(1, 2), keepdims=True)
     power = (power / rest).mean(axis=0, dtype=float)
-    of_rows = _over_next_highest(power[:, 0])
+    # The two halves of the first column are the same.
+    down = np.abs(np.fft.fftfreq(ny)) * ny
+    slow = np.flatnonzero(down < _DRIFTS)
+    half = (ny + 1) // 2
+    of_rows = np.pad(_over_next_highest(power[:half, 0]), (0, ny - half))
+    of_columns = np.array([_over_next_highest(own) for own in power[slow]])
     power[:, _SLOW:] /= _surroundings(power[:, _SLOW:], _AROUND)
     power[:, :_SLOW] /= _surroundings(power[:, :_SLOW], _AROUND_SLOW)
-    down = np.abs(np.fft.fftfreq(ny)) * ny
-    power[down < _DRIFTS] = 0
     power[down < _STEPS, :_DRIFTS] = 0
+    power[slow] = of_columns
     power[:, 0] = of_rows
     if nx % 2 == 0:
         # The two halves of this column are the same.
@@ -201,17 +205,17 @@ def _search(frames: F32) -> tuple[F64, F64]:
 
 
 def _over_next_highest(power: F64) -> F64:
-    """Modes (y,) of the means of rows over the mean of those within an octave; zero for no tone.
+    """Modes (n,) along one axis over the mean of those within an octave; zero for no tone.
 
-    The two halves are the same; the highest modes are differences of even and odd rows.
+    The highest modes are differences of even and odd lines.
     """
-    found, end = np.zeros(len(power)), (len(power) - 1) // 2 - 1
+    found, end = np.zeros(len(power)), len(power) - 2
     for k in range(_FIRST, end):
         about = np.concatenate([power[k // 2 : k - 1], power[k + 2 : min(2 * k, end) + 1]])
         # But one: hum has a harmonic.
         top = int(about.argmax())
-        about = np.delete(about, range(max(top - 1, 0), min(top + 2, len(about))))
-        if power[k] > _STANDS_OUT * about.max():
+        others = np.delete(about, range(max(top - 1, 0), min(top + 2, len(about))))
+        if power[k] > _STANDS_OUT * others.max():
             found[k] = power[k] / about.mean()
     return found
 
