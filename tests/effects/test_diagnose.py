@@ -385,7 +385,7 @@ def test_a_run_that_was_not_reduced_is_told(tmp_path: Path) -> None:
         diagnose.run(tmp_path, diagnose.Config(), SYNC)
 
 
-def test_halves_share_no_frame_but_first_flats() -> None:
+def test_halves_share_no_frame_but_first_flats_without_fringes() -> None:
     table: dict[str, list[Any]] = {
         "exptime_s": [0.1] * 5 + [0.2] * 3 + [None] * 9,
         "time_s": list(range(17)),
@@ -395,8 +395,10 @@ def test_halves_share_no_frame_but_first_flats() -> None:
     learn, test = parts.learn, parts.test
     assert not set(learn["fringes/a"]) & set(test["fringes/a"])
     assert len(learn["fringes/a"]) + len(test["fringes/a"]) == 101
-    # Three frames of an exposure time cannot be parted; the first flat lacks what stays behind.
-    assert set(learn["flat"]) & set(test["flat"]) == {0, 5, 6, 7, 8}
+    # Three frames of an exposure time cannot be parted.
+    assert set(learn["flat"]) & set(test["flat"]) == {5, 6, 7}
+    parts = split({"flat": table}, 128 * 128)
+    assert set(parts.learn["flat"]) & set(parts.test["flat"]) == {0, 5, 6, 7, 8}
 
 
 @pytest.mark.parametrize("count", [32, 200, 600, 732, 9000])

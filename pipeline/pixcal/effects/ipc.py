@@ -137,21 +137,13 @@ class Ipc(Effect):
         errors = {f"couplings[{n}].share": float(s) for n, s in enumerate(sigma)}
         if kernel.per_ke:
             errors |= {f"couplings[{n}].per_ke": kernel.per_ke_error for n in range(len(sigma))}
-        shares = np.array([c.share for c in kernel.couplings])
-        n = int(np.abs(shares).argmax())
-        place, number = (kernel.couplings[n].dy, kernel.couplings[n].dx), len(shares)
         return Estimate(
             cls(kernel.couplings),
             errors,
             kernel.significance,
             _why(kernel),
-            law=f"a kernel of {number} couplings, all significant",
-            size={
-                "value": float(shares[n]),
-                "error": float(sigma[n]),
-                "unit": "",
-                "of": f"at (dy, dx) = {place}, the largest of {number} couplings",
-            },
+            law=f"a kernel of {len(kernel.couplings)} couplings, all significant",
+            size=_size(kernel.couplings, sigma),
             in_full=cls(_worth_it(kernel.whole)) if kernel.whole else None,
         )
 
@@ -230,6 +222,20 @@ class Ipc(Effect):
     @property
     def _at_small_signals(self) -> tuple[Coupling, ...]:
         return tuple(replace(c, per_ke=0.0) for c in self.couplings)
+
+
+def _size(couplings: Sequence[Coupling], errors: F64) -> dict[str, object]:
+    """`Estimate.size` of couplings: the largest share; empty without any."""
+    if not couplings:
+        return {}
+    n = int(np.abs([c.share for c in couplings]).argmax())
+    place = couplings[n].dy, couplings[n].dx
+    return {
+        "value": couplings[n].share,
+        "error": float(errors[n]),
+        "unit": "",
+        "of": f"at (dy, dx) = {place}, the largest of {len(couplings)} couplings",
+    }
 
 
 def _couplings_of(kernel: F64) -> list[Coupling]:

@@ -101,13 +101,14 @@ def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = 
     """Assign blocks of every array and exposure time to the halves (`TURN`).
 
     A long fringe set contributes `SAMPLES` to each half; without fringes, all frames together do.
-    Flats with full pixels are left out unless all have them. The first flat of an exposure time is
-    in both halves: in flats recorded level by level it alone lacks the charge that stays behind.
+    Flats with full pixels are left out unless all have them. Without fringes, the first flat of an
+    exposure time is in both halves: of flats recorded level by level it alone shows lag.
     """
     learn, test = {}, {}
     every = {name: _groups(name, table, full_flats) for name, table in tables.items()}
     most = SAMPLES // pixels
-    if any("/" in name for name in tables):
+    fringes = any("/" in name for name in tables)
+    if fringes:
         most = min(most, MOST_FRAMES)
     else:
         most = _equal_share([len(own) for of_name in every.values() for own in of_name], most)
@@ -116,7 +117,7 @@ def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = 
         for own in of_name:
             one, other = _halves(own, most)
             fitted.append(one)
-            held_out.append(np.union1d(other, own[:1]) if name == "flat" else other)
+            held_out.append(other if fringes or name != "flat" else np.union1d(other, own[:1]))
         learn[name] = np.sort(np.concatenate(fitted))
         test[name] = np.sort(np.concatenate(held_out))
     short = (name for name, of_name in every.items() if min(map(len, of_name)) < FEWEST)
