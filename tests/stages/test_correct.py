@@ -20,6 +20,7 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages import correct, fit
+from pixcal.stages.correct import stage as correct_stage
 from pixcal.stages.correct.gain import excess, repeating, worsened
 from pixcal.stages.correct.sweep_to_correct import RestoredSet, corrected
 from pixcal.stages.correct.uncertainty import moved
@@ -147,6 +148,29 @@ def test_halves_of_the_frames_differ_as_their_errors_say(coupled):
         assert halves["after_px"] > halves["before_px"]
         sigma = found["sets"][name]["sigma_median_px"]
         assert sigma["after"] == pytest.approx(halves["after_px"], rel=0.06)
+
+
+def test_errors_of_a_set_whose_halves_disagree_are_enlarged_and_nothing_else(
+    coupled, tmp_path, monkeypatch
+):
+    _, run, *_ = coupled
+    again = tmp_path / "run"
+    shutil.copytree(run, again)
+    shutil.rmtree(again / "corrected")
+    factors = iter((2.0, 1.0))
+    monkeypatch.setattr(correct_stage, "excess", lambda _: next(factors))
+    correct.run(again, correct.Config(), SYNC)
+    sets = json.loads((again / "products" / "correction.json").read_text())["sets"]
+    assert [own["sigma_enlarged"] for own in sets.values()] == [2.0, 1.0]
+    halves = sets["vertical"]["halves"]
+    assert halves["after_expected_px"] == pytest.approx(2 * halves["after_px"], rel=0.06)
+    for name, factor in (("vertical", 2.0), ("horizontal", 1.0)):
+        file = f"{SETS[name]}_corrected.fits"
+        (delta, sigma, *_), (delta_again, larger, *_) = (
+            read_map(folder / "products" / file) for folder in (run, again)
+        )
+        np.testing.assert_array_equal(delta_again, delta)
+        np.testing.assert_allclose(larger, factor * sigma, rtol=1e-3)
 
 
 def test_what_the_fit_wrote_is_untouched(coupled):
