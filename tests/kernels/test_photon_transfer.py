@@ -265,6 +265,29 @@ def test_dark_frames_of_another_noise_do_not_bias_the_gain(dark: float) -> None:
         assert not known or again.gain == pytest.approx(GAIN, abs=3 * again.error)
 
 
+def test_two_amplifiers_leave_the_gain_as_the_flats_tell_it() -> None:
+    """Dark pixels are read with another amplifier, all flats with a noisier one.
+
+    A curve that is tied to the noise without light would fit the flats too, with a wrong gain.
+    """
+    rng = np.random.default_rng(20)
+    electrons, dof, noisier = np.geomspace(1.2e3, 2.2e4, 24), 1e5, (0.4 * READ_ADU) ** 2 * 100
+    variance = electrons / GAIN**2 + noisier
+    pulls = []
+    for _ in range(40):
+        seen = variance * rng.chisquare(dof, len(variance)) / dof
+        sums = dof * np.stack([np.ones_like(seen), electrons / GAIN, seen], axis=1)
+        fitted = fit_gain(sums, (READ_ADU**2, 0.02), np.inf)
+        assert fitted is not None
+        assert fitted.without_dark
+        assert not fitted.curved
+        pulls.append((fitted.gain - GAIN) / fitted.error)
+        assert fitted.error < 0.01 * GAIN
+    assert abs(np.mean(pulls)) < 4 / np.sqrt(40)
+    # Smaller than one, as the curve might bend.
+    assert np.std(pulls) < 1.3
+
+
 def test_points_off_the_line_widen_the_error() -> None:
     rng = np.random.default_rng(6)
     low, high = (bin_pairs(pair(rng, np.full((256, 256), n))) for n in (1e4, 4e4))

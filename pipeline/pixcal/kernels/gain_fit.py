@@ -9,9 +9,10 @@ remaining uncertainty of the curve is in its error.
 
 A camera that reads bright pixels with another amplifier (dual gain) has a step in the curve, which
 no such term describes. Points that leave the curve by far more than their noise are therefore
-fitted up to lower levels too, and the gain is that of the best-determined range. Where frames
-without light differ in noise from flats (a camera that clips black, or reads darks in another
-way), the same holds for a curve without them.
+fitted up to lower levels too, and the gain is that of the best-determined range.
+
+Frames without light may differ in noise from flats: a camera clips black, or reads dark pixels with
+another amplifier. The curves without them are part of the average, with a small chance before.
 """
 
 import math
@@ -26,6 +27,8 @@ from pixcal.model.arrays import F64
 LADDER = 4  # groups of flats from which the curve may be curved
 
 _TERMS = 4  # terms of curvature
+_CHANCE_APART = 1e-4  # of frames without light whose noise is not on the curve
+_WIDTHS = 6  # of what is then known of the noise at level zero
 _STRAIGHT = 1e-6  # size of terms that is effectively zero
 _SIZES = np.concatenate([[_STRAIGHT], np.geomspace(1e-3, 1.0, 13)])
 _CHANCES = np.concatenate([[0.5], np.full(13, 0.5 / 13)])
@@ -91,19 +94,18 @@ def fit_gain(
     without_dark : leave out the noise without light; by default where it is not on the curve
     """
 
-    def fit(highest: float, known: tuple[float, float] = read_variance) -> GainFit | None:
-        found = _fit_range(sums, known, highest, level_error, uneven, straight)
+    def up_to(highest: float) -> GainFit | None:
+        def fit(without_dark: bool | None) -> GainFit | None:
+            return _fit_range(
+                sums, read_variance, highest, level_error, uneven, straight, without_dark
+            )
+
+        found = fit(without_dark)
+        if found and found.without_dark and not found.chance > _OFF_CURVE:
+            # Flats that are on no curve tell nothing of what is on it.
+            found = fit(bool(without_dark))
         return found and replace(found, error=math.hypot(found.error, common * found.gain))
 
-    def of_flats(highest: float) -> GainFit | None:
-        lit = sums[(sums[:, 0] > 0) & (sums[:, 1] > 0)]
-        if not len(lit):
-            return None
-        # Nothing is known of it but that noise grows with light.
-        found = fit(highest, (read_variance[0], float((lit[:, 2] / lit[:, 0]).max())))
-        return found and replace(found, without_dark=True)
-
-    up_to = of_flats if without_dark else fit
     whole = up_to(highest)
     if whole is None or straight or whole.chance > _OFF_CURVE:
         return whole
@@ -112,10 +114,6 @@ def fit_gain(
         return int(np.count_nonzero((sums[:, 1] > 0) & (sums[:, 1] <= top * sums[:, 0])))
 
     best, top = whole, whole.levels[1] / _SHORTER
-    if without_dark is None and points(1.001 * whole.levels[1]) >= 2 * _SPARE:
-        found = of_flats(highest)
-        if found is not None and found.chance > _OFF_CURVE and found.error < best.error:
-            best = found
     while points(top) >= _SPARE:
         found = up_to(top)
         if found is not None and found.chance > _OFF_CURVE and found.error < best.error:
@@ -131,6 +129,7 @@ def _fit_range(
     level_error: float,
     uneven: float,
     straight: bool,
+    without_dark: bool | None,
 ) -> GainFit | None:
     dof = sums[:, 0]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -143,6 +142,9 @@ def _fit_range(
     bends = not straight and top >= _RANGE * level.min()
     terms = min(_TERMS, max(len(level) - _SPARE, 0)) if bends else 0
     sizes = _SIZES if terms else _SIZES[:1]
+    apart = _CHANCE_APART if without_dark is None else float(without_dark)
+    if without_dark is None and (straight or len(level) < 2 * _SPARE):
+        apart = 0.0
     design = np.stack(
         [np.ones_like(level), *(level * (level / top) ** n for n in range(terms + 1))]
     )
@@ -152,42 +154,49 @@ def _fit_range(
         whole = np.maximum(expected, 0) + read_variance[0]
         weight = 1 / (2 * whole**2 / dof + uneven * np.sqrt(whole / np.pi))
         normal, right = (design * weight) @ design.T / chi2, design @ (weight * shot) / chi2
-        of_offset = read_variance[1] ** 2 + (level_error * slope) ** 2
-        found = [
-            _posterior(normal, right, np.array([1 / of_offset, 0.0, *[(s * slope) ** -2] * terms]))
-            for s in sizes
-        ]
-        evidence = np.array([one[2] for one in found])
-        share = _CHANCES[: len(sizes)] * np.exp(evidence - evidence.max())
+        narrow = math.hypot(read_variance[1], level_error * slope)
+        # Of frames without light that are read in another way nothing is known but that noise
+        # grows with light.
+        widest = max(float((slope * level).max()), 2 * narrow)
+        wide = np.geomspace(narrow, widest, _WIDTHS + 1)[1:]
+        offsets = np.concatenate([[narrow] * (apart < 1), wide[: _WIDTHS * (apart > 0)]])
+        before = np.append([1 - apart] * (apart < 1), [apart / _WIDTHS] * _WIDTHS * (apart > 0))
+        information = np.zeros((len(offsets), len(sizes), terms + 2))
+        information[:, :, 0] = offsets[:, None] ** -2
+        information[:, :, 2:] = (sizes[:, None] * slope) ** -2
+        means, covariances, evidence = _posterior(normal, right, information)
+        share = np.outer(before, _CHANCES[: len(sizes)]) * np.exp(evidence - evidence.max())
         share /= share.sum()
-        mean = share @ np.array([one[0] for one in found])
+        mean = np.tensordot(share, means, 2)
         slope, expected = float(mean[1]), mean @ design
         if not slope > 0 or not mean[1:].sum() > 0:
             return None
         # About the most flexible curve: curvature is no scatter.
-        freedom = len(level) - np.array([np.trace(one[1] @ normal) for one in found])
-        rest = weight @ (shot - found[-1][0] @ design) ** 2
-        chi2 = max(1.0, float(rest / max(freedom[-1], 1)))
-    scatter = share @ [one[1][1, 1] + (one[0][1] - slope) ** 2 for one in found]
-    of_zero = [one[1][0, 0] + (one[0][0] - mean[0]) ** 2 for one in found]
-    misfit, free = float(weight @ (shot - expected) ** 2), max(float(share @ freedom), 1.0)
+        freedom = len(level) - np.einsum("...ij,ij", covariances, normal)
+        rest = weight @ (shot - means[-1, -1] @ design) ** 2
+        chi2 = max(1.0, float(rest / max(freedom[-1, -1], 1)))
+    spread = np.diagonal(covariances, axis1=-2, axis2=-1) + (means - mean) ** 2
+    of_zero, scatter = np.sqrt(np.tensordot(share, spread, 2)[:2])
+    misfit, free = float(weight @ (shot - expected) ** 2), max(float((share * freedom).sum()), 1.0)
     return GainFit(
         1 / slope,
-        math.sqrt(scatter) / slope**2,
+        float(scatter) / slope**2,
         misfit / free,
         (float(level.min()), top),
-        (read_variance[0] + float(mean[0]), math.sqrt(share @ of_zero)),
-        float(mean[2:].sum() / slope) if share[0] < _CURVED else 0.0,
+        (read_variance[0] + float(mean[0]), float(of_zero)),
+        float(mean[2:].sum() / slope) if share[:, 0].sum() < _CURVED else 0.0,
         chance=float(chdtrc(free, misfit)),
+        without_dark=bool(share[offsets > narrow].sum() > 0.5),
     )
 
 
-def _posterior(normal: F64, right: F64, information: F64) -> tuple[F64, F64, float]:
-    """Mean, covariance and log evidence of coefficients about zero, of some prior information."""
-    total = normal + np.diag(information)
-    scale = 1 / np.sqrt(np.diag(total))
-    covariance = np.linalg.inv(total * np.outer(scale, scale)) * np.outer(scale, scale)
-    mean = covariance @ right
-    known = np.log(information[information > 0]).sum()
-    evidence = right @ mean + known + np.linalg.slogdet(covariance)[1]
-    return mean, covariance, float(evidence) / 2
+def _posterior(normal: F64, right: F64, information: F64) -> tuple[F64, F64, F64]:
+    """Means, covariances and log evidences of coefficients about zero, of prior information."""
+    total = normal + information[..., None] * np.eye(len(right))
+    scale = 1 / np.sqrt(np.diagonal(total, axis1=-2, axis2=-1))
+    both = scale[..., None] * scale[..., None, :]
+    covariances = np.linalg.inv(total * both) * both
+    means = covariances @ right
+    known = np.log(information, where=information > 0, out=np.zeros_like(information)).sum(axis=-1)
+    evidence = means @ right + known + np.linalg.slogdet(covariances)[1]
+    return means, covariances, evidence / 2

@@ -69,8 +69,8 @@ def _gain_warnings(fit: GainFit, summary: Summary, used: float) -> list[str]:
     if fit.without_dark:
         warnings.append(
             "frames without light differ in noise from the photon-transfer curve at level zero: "
-            "the gain is that of the flats alone; possible causes: the camera clips its black "
-            "level, or reads dark frames differently"
+            "gain and read noise are those of the flats alone; possible causes: the camera clips "
+            "its black level, or reads dark pixels with another amplifier (dual gain, HDR)"
         )
     clear = [lag for lag, sigmas in fit.neighbours.items() if sigmas > SHARED]
     if clear:
