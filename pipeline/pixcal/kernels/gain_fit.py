@@ -142,9 +142,8 @@ def _fit_range(
     bends = not straight and top >= _RANGE * level.min()
     terms = min(_TERMS, max(len(level) - _SPARE, 0)) if bends else 0
     sizes = _SIZES if terms else _SIZES[:1]
-    apart = _CHANCE_APART if without_dark is None else float(without_dark)
-    if without_dark is None and (straight or len(level) < 2 * _SPARE):
-        apart = 0.0
+    several = not straight and len(level) >= 2 * _SPARE
+    apart = _CHANCE_APART * several if without_dark is None else float(without_dark)
     design = np.stack(
         [np.ones_like(level), *(level * (level / top) ** n for n in range(terms + 1))]
     )
@@ -155,12 +154,7 @@ def _fit_range(
         weight = 1 / (2 * whole**2 / dof + uneven * np.sqrt(whole / np.pi))
         normal, right = (design * weight) @ design.T / chi2, design @ (weight * shot) / chi2
         narrow = math.hypot(read_variance[1], level_error * slope)
-        # Of frames without light that are read in another way nothing is known but that noise
-        # grows with light.
-        widest = max(float((slope * level).max()), 2 * narrow)
-        wide = np.geomspace(narrow, widest, _WIDTHS + 1)[1:]
-        offsets = np.concatenate([[narrow] * (apart < 1), wide[: _WIDTHS * (apart > 0)]])
-        before = np.append([1 - apart] * (apart < 1), [apart / _WIDTHS] * _WIDTHS * (apart > 0))
+        offsets, before = _offsets(narrow, float((slope * level).max()), apart)
         information = np.zeros((len(offsets), len(sizes), terms + 2))
         information[:, :, 0] = offsets[:, None] ** -2
         information[:, :, 2:] = (sizes[:, None] * slope) ** -2
@@ -188,6 +182,16 @@ def _fit_range(
         chance=float(chdtrc(free, misfit)),
         without_dark=bool(share[offsets > narrow].sum() > 0.5),
     )
+
+
+def _offsets(narrow: float, highest: float, apart: float) -> tuple[F64, F64]:
+    """Errors of the variance at level zero, as of frames without light or not, and their chances.
+
+    Of frames that are read in another way nothing is known but that noise grows with light.
+    """
+    wide = np.geomspace(narrow, max(highest, 2 * narrow), _WIDTHS + 1)
+    chances = np.append(1 - apart, np.full(_WIDTHS, apart / _WIDTHS))
+    return wide[chances > 0], chances[chances > 0]
 
 
 def _posterior(normal: F64, right: F64, information: F64) -> tuple[F64, F64, F64]:

@@ -21,6 +21,7 @@ from pixcal.estimators.maps.map_fit import (
     polynomial,
 )
 from pixcal.estimators.maps.structure import stitched_fields, without_outliers
+from pixcal.estimators.maps.two_beams import contrast_surface
 from pixcal.kernels.beams import Light
 from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.scene import DetectorMaps
@@ -128,6 +129,10 @@ class _Lit:
         iota = np.where(good, found.theta[0], 1.0)
         visibility = np.where(good, alpha, 1.0) / iota
         data = np.stack([np.log(iota), np.log(visibility), np.nan_to_num(phase_map(found))])
+        # What two Gaussian beams leave over of both is quadratic: see `two_beams`.
+        beams = np.log(contrast_surface(found.theta, found.good))
+        data[0] += beams
+        data[1] -= beams
         shared = _shared(data[0], data[1], good)
         data[0] -= shared * data[1]
         plain = filled(np.where(good, found.theta, np.nan), found.k)

@@ -14,10 +14,11 @@ from pixcal.estimators.maps.corrected import (
     straight_modes,
     usual_fringe,
 )
-from pixcal.estimators.maps.structure import OffsetModel, smooth_surface, true_offsets
+from pixcal.estimators.maps.structure import OffsetModel, true_offsets
+from pixcal.estimators.maps.two_beams import contrast_surface, light_surface
 from pixcal.kernels.beams import LightMaps, with_margin
 from pixcal.kernels.crosstalk import filled
-from pixcal.model.arrays import F32, F64, Mask
+from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import SimulatedDetector
 from pixcal.simulation.effect import Effect, FittedFrames, FringeMaps
 
@@ -26,9 +27,6 @@ MAP_PHASES = 12  # phases, evenly spread over a fringe, at which an effect on sa
 _PHASES = 2 * np.pi * np.arange(MAP_PHASES) / MAP_PHASES
 _EVEN = np.stack([np.ones(MAP_PHASES), np.cos(_PHASES), np.sin(_PHASES)], axis=1)
 TURNS = 5  # iterations of the fits of pixels and frames: each gains a factor of three or more
-# polynomial degree of the logarithm of the contrast of two Gaussian beams (the ratio of their
-# intensities is the exponential of a quadratic form)
-TWO_BEAMS = 2
 
 
 @dataclass(frozen=True)
@@ -177,8 +175,10 @@ class FittedSet:
             size,
         )
         good = np.asarray(np.isfinite(self.theta).all(axis=0))
-        light = light_surface(maps.theta, good) / light_surface(before.theta, good)
-        contrast = contrast_surface(maps.theta, good) / contrast_surface(before.theta, good)
+        contrast, contrast_before = (contrast_surface(m.theta, good) for m in (maps, before))
+        light = light_surface(maps.theta[0], contrast, good)
+        light /= light_surface(before.theta[0], contrast_before, good)
+        contrast /= contrast_before
         return replace(
             self,
             delta=delta,
@@ -210,17 +210,3 @@ class FittedSet:
     def offsets(self) -> OffsetModel:
         """Model of the possible true offsets."""
         return true_offsets(self.delta, self.sigma, np.arctan2(*self.maps.theta[1:]))
-
-
-def light_surface(theta: F64, good: Mask) -> F64:
-    """Mean light (y, x) of a fit's maps, smooth over the window."""
-    return smooth_surface(np.where(good, theta[0], np.nan), good)
-
-
-def contrast_surface(theta: F64, good: Mask) -> F64:
-    """Contrast (y, x) of a fit's maps, as a smooth surface for two Gaussian beams."""
-    alpha = np.hypot(*theta[1:])
-    used = good & (alpha > 0) & (theta[0] > 0)
-    contrast = np.divide(alpha, theta[0], out=np.full_like(alpha, np.nan), where=used)
-    log = np.log(contrast)
-    return np.asarray(np.exp(smooth_surface(log, used, TWO_BEAMS)))

@@ -9,7 +9,8 @@ import numpy as np
 from pixcal.estimators.detector.amplifiers import relative_gain
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
-from pixcal.estimators.maps.structure import flattened, smooth_surface
+from pixcal.estimators.maps.structure import flattened
+from pixcal.estimators.maps.two_beams import contrast_surface, light_surface
 from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData
 from pixcal.estimators.test_statistics.noise import jumping
 from pixcal.kernels.processes import ramp_step
@@ -19,7 +20,7 @@ from pixcal.kernels.scene import DetectorMaps
 from pixcal.model.arrays import F32, F64, Indices, Mask
 from pixcal.simulation.effect import FittedFrames
 from pixcal.stages.diagnose.description import bench_of, pedestal_of, recordings_of
-from pixcal.stages.diagnose.fitted_set import FittedSet, contrast_surface, light_surface
+from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain
 from pixcal.stages.diagnose.nominal import Measured, NominalBench, SetTruth, uncoupled
@@ -133,7 +134,8 @@ def _response_of_fringes(evidence: Sequence[Evidence]) -> F32:
     for one in evidence:
         for found in one.fringes.values():
             light = np.where(found.good, found.theta[0], np.nan)
-            parts.append(light / smooth_surface(light, found.good))
+            contrast = contrast_surface(found.theta, found.good)
+            parts.append(light / light_surface(light, contrast, found.good))
     if len(parts) < 2:
         return np.ones(evidence[0].good.shape, np.float32)
     mean, seen = np.mean(parts, axis=0) - 1, float(np.nanvar(np.mean(parts, axis=0)))
@@ -226,8 +228,9 @@ def _set_truth(found: Sequence[FringeEvidence], frames: Sequence[Indices], count
     one = found[0]
     good = np.all([f.good for f in found], axis=0)
     iota = np.mean([f.theta[0] * np.mean(f.g[:, 0]) for f in found], axis=0)
-    surface = light_surface(iota[None], good)
-    contrast = np.mean([_contrast(f, good) for f in found], axis=0)
+    contrast = np.mean([contrast_surface(f.theta, good) for f in found], axis=0)
+    surface = light_surface(iota, contrast, good)
+    contrast *= np.mean([np.median(np.hypot(*f.g.T[1:]) / f.g[:, 0]) for f in found])
     ny, nx = good.shape
     y, x = np.arange(ny)[:, None] - (ny - 1) / 2, np.arange(nx)[None, :] - (nx - 1) / 2
     plane = one.k[0] * x + one.k[1] * y
@@ -241,13 +244,6 @@ def _set_truth(found: Sequence[FringeEvidence], frames: Sequence[Indices], count
         step=ramp_step(one.phi),
         phi=_phases(found, frames, count),
     )
-
-
-def _contrast(found: FringeEvidence, good: Mask) -> F64:
-    """Contrast (y, x) of the frames, smooth over the window."""
-    surface = contrast_surface(found.theta, good)
-    of_frames = np.median(np.hypot(found.g[:, 1], found.g[:, 2]) / found.g[:, 0])
-    return np.asarray(surface * of_frames)
 
 
 def _phases(found: Sequence[FringeEvidence], frames: Sequence[Indices], count: int) -> F64:
