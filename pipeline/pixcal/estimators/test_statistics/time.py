@@ -29,6 +29,7 @@ STACKS = (
     ("flat", "relative intensity, rms", ""),
 )
 MIN_FRAMES = 8
+_FOR_TREND = 3  # fewest frames whose level has a trend
 LAGS = (1, 2, 3, -1, -2)
 BATCHES = 8
 # smallest singular value, over the largest, of shapes that a sequence of phases separates; a ramp
@@ -194,7 +195,7 @@ def bias_trend(evidence: Evidence) -> Curve:
     """Slope of the mean of bias and dark frames over their run, last less first."""
     values = []
     for stack in (*evidence.of_kind("bias"), *evidence.of_kind("dark")):
-        if len(stack.adu) >= MIN_FRAMES:
+        if len(stack.adu) >= _FOR_TREND:
             means = frame_means(stack.adu, evidence.good) * evidence.gain
             time = stack.time_s - stack.time_s.mean()
             values.append(float(np.polyfit(time / np.ptp(time), means, 1)[0]))

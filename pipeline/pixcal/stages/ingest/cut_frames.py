@@ -8,7 +8,7 @@ from pixcal.model.arrays import F64
 from pixcal.storage.frame_decoding import BAND
 from pixcal.storage.frames import Frame
 
-_NAMED = 3
+NAMED = 3  # frames that a warning names
 _FULL = 0.98  # least share of a flat's largest sample in a saturated row
 
 
@@ -55,15 +55,19 @@ def cut_warning(
 ) -> list[str]:
     """Warnings on the frames of an array, given the arguments and result of `cut_from`."""
     found = [
-        f"{frame.file.source.name}{f' [{frame.plane}]' * (frame.file.shape[0] > 1)} "
-        f"(all samples {value:g} from row {row} on)"
+        f"{name_of(frame)} (all samples {value:g} from row {row} on)"
         for frame, row, value in zip(frames, first, facts["last"][:, -1], strict=True)
         if row is not None
     ]
     if not found:
         return []
-    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+    more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
     return [
         f"{array}: incomplete frames are left out ({len(found)} of {len(frames)}): "
-        f"{', '.join(found[:_NAMED])}{more}; frames.json lists them (cut_from_row)"
+        f"{', '.join(found[:NAMED])}{more}; frames.json lists them (cut_from_row)"
     ]
+
+
+def name_of(frame: Frame) -> str:
+    """File of a frame, with its plane in a cube."""
+    return f"{frame.file.source.name}{f' [{frame.plane}]' * (frame.file.shape[0] > 1)}"

@@ -29,6 +29,7 @@ from pixcal.model.errors import DamagedError, InputError, RemoteError
 from pixcal.model.options import Ingest as Config
 from pixcal.stages.ingest.arrays import FRAMES_A_PIECE, Writers, find_kept, take_over
 from pixcal.stages.ingest.cut_frames import cut_from, cut_warning
+from pixcal.stages.ingest.repeated_frames import repeat_warning, repeats_of
 from pixcal.stages.steps import run_steps
 from pixcal.storage.artefact import Build, discard
 from pixcal.storage.cube import CHUNK, ArrayReader
@@ -400,10 +401,13 @@ def _close(
         found = by_fact(ArrayReader(made.folder / "catalogue.zarr" / array).read())
         largest = np.fmax.reduce(found["largest"], axis=1)
         cut = cut_from(array, found, frames[0].file.shape[1])
+        repeats = repeats_of(found)
         warnings += cut_warning(array, frames, cut, found)
+        warnings += repeat_warning(array, frames, repeats)
         listed[array] = columns(frames) | {
             "largest_adu": [float(v) if np.isfinite(v) else None for v in largest],
             "cut_from_row": cut,
+            "repeat_of": repeats,
         }
         places[array] = None if copied[array] else describe(_files(frames))
     write_json(made.folder / "frames.json", listed)

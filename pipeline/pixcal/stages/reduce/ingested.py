@@ -53,15 +53,13 @@ class Ingested:
 
     @cached_property
     def _whole(self) -> dict[str, list[int]]:
-        """Numbers of the frames that were not cut off."""
-        return {
-            name: [
-                n
-                for n, cut in enumerate(table.get("cut_from_row", [None] * len(table["time_s"])))
-                if cut is None
-            ]
-            for name, table in self._catalogue.items()
-        }
+        """Numbers of the frames that were not cut off and repeat no other."""
+        found = {}
+        for name, table in self._catalogue.items():
+            count = len(table["time_s"])
+            faults = [table.get(key, [None] * count) for key in ("cut_from_row", "repeat_of")]
+            found[name] = [n for n in range(count) if all(fault[n] is None for fault in faults)]
+        return found
 
     @cached_property
     def _listed(self) -> dict[str, dict[str, list[Any]]]:

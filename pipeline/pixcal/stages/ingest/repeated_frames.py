@@ -1,0 +1,42 @@
+"""Frames that a camera or grabber delivered twice: their noise is not their own."""
+
+from collections.abc import Mapping, Sequence
+
+from pixcal.model.arrays import F64
+from pixcal.stages.ingest.cut_frames import NAMED, name_of
+from pixcal.storage.frames import Frame
+
+_ONE_VALUE = 0.5  # share of a row with one value from which its noise is not seen
+
+
+def repeats_of(facts: Mapping[str, F64]) -> list[int | None]:
+    """Number of the first frame of an array with the same samples as each; None if there is none.
+
+    By the checksums of bands. Frames without noise, or with noise far below one code, are alike
+    anyway: it is no evidence if the last row of a frame has one value in half of its pixels, as in
+    a saturated flat, or if less than half of the frames are different. ``facts``:
+    `pixcal.storage.frame_decoding.FACTS` by name, (time, band).
+    """
+    first: dict[bytes, int] = {}
+    found = [first.setdefault(crc.tobytes(), n) for n, crc in enumerate(facts["crc"])]
+    if 2 * len(first) < len(found):
+        return [None] * len(found)
+    noisy = facts["share"][:, -1] < _ONE_VALUE
+    return [one if one != n and noisy[n] else None for n, one in enumerate(found)]
+
+
+def repeat_warning(array: str, frames: Sequence[Frame], repeats: Sequence[int | None]) -> list[str]:
+    """Warnings on the frames of an array, given the result of `repeats_of`."""
+    found = [
+        f"{name_of(frames[n])} (as {name_of(frames[first])})"
+        for n, first in enumerate(repeats)
+        if first is not None
+    ]
+    if not found:
+        return []
+    more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
+    return [
+        f"{array}: frames that repeat another one, sample by sample, are left out "
+        f"({len(found)} of {len(frames)}): {', '.join(found[:NAMED])}{more}; frames.json lists "
+        "them (repeat_of)"
+    ]
