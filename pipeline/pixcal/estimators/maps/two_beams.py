@@ -22,7 +22,7 @@ _STARTS = tuple((even, *slope) for even in (0, 1) for slope in ((1, 0), (0, 1), 
 _STEPS = 60  # of the fit from each start
 _ANY = 6  # degree of a smooth contrast of any cause
 _TERMS = (_DEGREE + 1) * (_DEGREE + 2) // 2  # polynomials up to the degree
-_OFF = 1e-6  # chance of a misfit beyond which a quadratic logarithm of the contrast is not enough
+_OFF = 0.01  # chance of a misfit beyond which a quadratic logarithm of the contrast is not enough
 # largest share of that misfit that two beams may leave over, beyond noise: the contrast may be
 # theirs, or have another cause, such as light that does not interfere
 _LEFT = 0.01
