@@ -77,6 +77,9 @@ def test_the_size_of_an_effect_is_told_in_its_units():
     own = glow | {"units": {"rate": "e-/s", "reach_px": "px"}, "strengths": ["rate"]}
     assert size_of(own) == "rate 118.0 ± 2.0 e⁻/s"
     assert size_of({"parameters": {"share": 0.0}, **size("share")}) == "-"
+    moved = {"parameters": {"tracks": [{"value": [59, 61]}, {"value": [-1, 1]}]}}
+    drift = moved | {"strengths": ["tracks"], "units": {"tracks": "e-"}}
+    assert size_of(drift) == "1 e⁻ rms, frame by frame, about a mean of 60 e⁻"
 
 
 def test_what_no_cause_explains_has_a_size():

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pixcal.effects import known_effects
 from pixcal.report.text import NO_OFFSETS, digits_apart, number, sigmas, unit, with_error
 from pixcal.stages.treatment import CORRECTED, SUFFIX, fitted_shapes, treatment_of_kind
@@ -232,6 +234,10 @@ def _departure(entry: Json) -> str:
     return f"{entry['title']}, {entry['place']}: {measured} {its_unit} (simulated: {simulated})"
 
 
+# mean of a series over its rms from which it is told: below it is the scatter of few frames
+_LEVEL = 1.0
+
+
 def size_of(cause: Json) -> str:
     """The strengths of an effect with errors and units, or its size where these do not say it."""
     if size := cause.get("size"):
@@ -268,10 +274,16 @@ def _measured(value: float, error: float | None, unit: str) -> str:
 
 
 def _replay(tracks: Sequence[Json], unit: str) -> str:
-    """The rms of a change that has a value for each frame."""
-    values = [float(v) for track in tracks for v in track["value"]]
-    rms = math.hypot(*values) / math.sqrt(max(len(values), 1))
-    return f"{_measured(rms, None, unit)} rms, frame by frame"
+    """The rms of a change that has a value for each frame, and the largest mean of a series."""
+    series = [np.array(track["value"], float) for track in tracks if track["value"]]
+    levels = [float(values.mean()) for values in series]
+    apart = [v - level for v, level in zip(series, levels, strict=True)] or [np.zeros(1)]
+    rms = float(np.std(np.concatenate(apart)))
+    text = f"{_measured(rms, None, unit)} rms, frame by frame"
+    level = max(levels, key=abs, default=0.0)
+    if abs(level) <= _LEVEL * rms:
+        return text
+    return f"{text}, about a mean of {_measured(level, None, unit)}"
 
 
 def _parts(name: str, parts: Sequence[Json]) -> str:
