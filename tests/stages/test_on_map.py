@@ -79,7 +79,7 @@ def test_the_size_of_an_effect_is_told_in_its_units():
     assert size_of({"parameters": {"share": 0.0}, **size("share")}) == "-"
     moved = {"parameters": {"tracks": [{"value": [59, 61]}, {"value": [-1, 1]}]}}
     drift = moved | {"strengths": ["tracks"], "units": {"tracks": "e-"}}
-    assert size_of(drift) == "1 e⁻ rms, frame by frame, about a mean of 60 e⁻"
+    assert size_of(drift) == "1.00 e⁻ rms, frame by frame, about a mean of 60.0 e⁻"
 
 
 def test_what_no_cause_explains_has_a_size():
