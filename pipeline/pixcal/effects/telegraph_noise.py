@@ -251,7 +251,7 @@ def _series(evidence: Evidence) -> Iterator[Series]:
 def _of_stack(stack: Stack, evidence: Evidence) -> Series | None:
     """Bias or dark frames without common noise of rows and without hot pixels."""
     seconds = float(np.nan_to_num(stack.exptime_s))
-    dark = np.maximum(evidence.dark_rate, 0) * seconds
+    dark = evidence.dark_charge_rate * seconds
     pixels = (dark < _HOT * evidence.read_noise**2) & (stack.adu < evidence.saturation_adu).all(0)
     # Medians of samples within a few converter steps are steps too, and hide common row noise.
     rest = (stack.adu - stack.adu.mean(axis=0)).astype(float)

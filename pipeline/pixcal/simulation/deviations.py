@@ -282,7 +282,7 @@ class StackDeviations(_Deviations):
     def residual(self) -> Deviation:
         """Samples (t, n) of good pixels less their mean over time, ADU."""
         e, adu = self._evidence, self._stack.adu[:, self.good]
-        dark = np.maximum(e.dark_rate[self.good], 0) * np.nan_to_num(self._stack.exptime_s)
+        dark = e.dark_charge_rate[self.good] * np.nan_to_num(self._stack.exptime_s)
         variance = (e.read_noise**2 + dark) / e.gain**2 * max(1 - 1 / len(adu), 0.5)
         rest = adu - adu.mean(axis=0)
         weight = np.where(rest**2 < OUTLIER_SIGMA**2 * variance, 1 / variance, 0)

@@ -86,6 +86,7 @@ def evidence_of(
         step_adu=max(int(ingested.quantum), 1),
         neighbours=tuple((y, x) for y, x in used["gain_e_per_adu"]["neighbours"]),
         without_dark=without_dark,
+        subtracted_dark=float(used.get("subtracted_dark_e_s") or 0.0),
     )
 
 

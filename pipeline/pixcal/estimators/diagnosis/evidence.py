@@ -159,6 +159,7 @@ class Evidence:
     photon_transfer: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     # lags (rows, columns) whose covariance that gain includes
     neighbours: tuple[tuple[int, int], ...] = ()
+    subtracted_dark: float = 0.0  # dark signal that the camera subtracts, e-/s
     lowest_adu: float | None = None  # code at which noise is cut off; None: it is not
     # whether the gain of `photon_transfer` leaves out noise without light, which is not that of
     # flats
@@ -178,8 +179,13 @@ class Evidence:
     def level(self, fringes: FringeEvidence, signal: F32) -> F32:
         """Electrons in the pixels for a signal (t, y, x) of a set: with flat and dark again."""
         seconds = fringes.exptime_s if np.isfinite(fringes.exptime_s) else 0.0
-        dark = np.maximum(self.dark_rate, 0) * seconds
+        dark = self.dark_charge_rate * seconds
         return signal * self.flat.astype(np.float32) + dark.astype(np.float32)
+
+    @property
+    def dark_charge_rate(self) -> F64:
+        """Dark signal (y, x) that has shot noise, e-/s, never negative."""
+        return np.maximum(self.dark_rate + self.subtracted_dark, 0)
 
     def dark_noise(self, stack: Stack) -> tuple[F32, F32]:
         """Unlit frames (t, y, x), less medians of pixels and frames; sigma; e-, NaN if flagged."""
@@ -187,7 +193,7 @@ class Evidence:
         rest = np.where(self.good, rest, np.nan)
         rest -= np.nanmedian(rest, axis=(1, 2), keepdims=True) if self.good.any() else 0
         seconds = np.nan_to_num(stack.exptime_s)
-        sigma = np.sqrt(self.read_noise**2 + np.maximum(self.dark_rate, 0) * seconds)
+        sigma = np.sqrt(self.read_noise**2 + self.dark_charge_rate * seconds)
         every = np.broadcast_to(sigma.astype(np.float32), rest.shape)
         return rest.astype(np.float32), every
 

@@ -103,13 +103,14 @@ def prepare_input(
 
 
 def _run_frames(run_dir: Path, ingested: Ingested) -> RunFrames:
-    gain = read_json(run_dir / "reduce" / "reduce.json")["gain_e_per_adu"]
+    found = read_json(run_dir / "reduce" / "reduce.json")
+    gain, subtracted = found["gain_e_per_adu"], float(found.get("subtracted_dark_e_s") or 0.0)
     return RunFrames(
         _acquisition(run_dir, ingested),
         ingested.tables,
         {name: array.dtype for name, array in ingested.arrays.items()},
         _reduction(run_dir),
-        Black(ingested.cut_off, gain.get("without_dark")),
+        Black(ingested.cut_off, gain.get("without_dark"), subtracted / float(gain["used"])),
     )
 
 

@@ -202,7 +202,9 @@ def excess_scatter(found: Sequence[FringeEvidence], good: Mask) -> float:
 
 def _dark_rate(evidence: Sequence[Evidence], halves: Sequence[FrameSubset]) -> F32:
     """Dark signal, e-/s, without the part of its scatter that is noise: simulations add it."""
+    # The shot noise of what the camera subtracts stays; the simulation subtracts it again.
     rate = _mean([uncoupled(e.dark_rate, np.random.default_rng(0)) for e in evidence])
+    rate += np.float32(evidence[0].subtracted_dark)
     own = parted("bias", halves) and parted("dark", halves)
     noise = _rate_variance(evidence[0]) / (len(evidence) if own else 1)
     rest = rate - np.median(rate)
@@ -219,7 +221,7 @@ def _rate_variance(evidence: Evidence) -> float:
     times = np.array([np.nan_to_num(s.exptime_s) for s in stacks for _ in s.adu])
     if not len(times) or np.ptp(times) == 0:
         return 0.0
-    charge = float(np.median(np.maximum(evidence.dark_rate, 0))) * times.max()
+    charge = float(np.median(evidence.dark_charge_rate)) * times.max()
     return float((evidence.read_noise**2 + charge) / (len(times) * times.var()))
 
 

@@ -155,10 +155,16 @@ class NominalBench:
             wanted = np.flatnonzero(np.isin(numbers, half[name]))
             before = None if recording.before is None else taken[recording.before.key]
             own = replace(taken[recording.key], before=before)
+            lifted = self.pedestal + self._subtracted_adu(own.exptime_s)
             for frame, samples in camera.expose(own, wanted.tolist()):
                 at = int(np.searchsorted(half[name], numbers[frame]))
-                arrays[name][at] = samples - np.float32(self.pedestal)
+                arrays[name][at] = samples - np.float32(lifted)
         return self.frames.raw(arrays, half)
+
+    def _subtracted_adu(self, exptime_s: float) -> int:
+        """Dark signal that the camera subtracts, in whole steps of the converter."""
+        black, step = self.frames.black, self.bench.detector.step_adu
+        return step * round(black.subtracted * exptime_s / step) if black else 0
 
     def _of_measured_k(
         self, measured: Measured, bench: Bench, effects: Sequence[Effect]

@@ -74,7 +74,8 @@ def characterise(
     if halves.flat is not None:
         percent = np.stack([100 * without_trend(half, halves.good) for half in halves.flat])
         facts["warnings"] += _spread(found, curves, "prnu", "%", percent, halves.good)
-    _dark_current(found, made, source, gain[0] / facts["gain_e_per_adu"]["used"], middle)
+    scale = gain[0] / facts["gain_e_per_adu"]["used"]
+    _dark_current(found, made, source, job, scale, middle)
     for name, figure in found.items():
         if (
             figure["unit"].startswith("e-")
@@ -237,7 +238,9 @@ def _listed(columns: Any, names: tuple[str, ...]) -> Json:
 # Dark current
 
 
-def _dark_current(found: Json, made: Build, source: Ingested, scale: float, middle: Window) -> None:
+def _dark_current(
+    found: Json, made: Build, source: Ingested, job: Measuring, scale: float, middle: Window
+) -> None:
     """Mean dark signal of good pixels; its error is from frames, bias drift included."""
     if not source.exposures.has_rate:
         return
@@ -253,11 +256,17 @@ def _dark_current(found: Json, made: Build, source: Ingested, scale: float, midd
     if error is not None and slope is not None and source.cut_off:
         corrected = rates[rows][good[rows]].mean(dtype=float)
         error = math.hypot(error, _OF_CORRECTION * (corrected - gain * slope[0]))
-    note = _temperature(source.tables)
+    note, (subtracted, off) = _temperature(source.tables), job.subtracted
+    if subtracted:
+        error = gain * math.hypot(off, slope[1] if slope else 0.0)
+        note = f"by the noise of dark frames: the camera subtracts it from their level; {note}"
     timed = any(source.tables["dark"]["exptime_s"])
     unit = "e-/s" if timed else "e-/exposure"
     found["dark_current"] = _figure(
-        "dark current", unit, (float(rates[good].mean(dtype=float)), error), note
+        "dark current",
+        unit,
+        (float(rates[good].mean(dtype=float)) + gain * subtracted, error),
+        note,
     )
 
 

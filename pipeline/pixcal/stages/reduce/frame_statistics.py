@@ -87,6 +87,7 @@ class Measuring:
     cut_off: Mapping[str, CutOff]  # arrays whose noise is cut off at their lowest code
     # whether the gain leaves out the noise of frames without light; None: to be found
     without_dark: bool | None
+    subtracted: tuple[float, float]  # dark signal that the camera subtracts, and error, ADU/s
     gain: float  # gain, read_noise: rough values (e-/ADU, ADU)
     read_noise: float
     options: Reduce  # limits of outliers and flags
@@ -187,7 +188,8 @@ def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined])
     times = [group.exptime for group in job.dark]
     line = dark_line([c.mean for c in combined], [c.kept for c in combined], times)
     maps["bias"], maps["dark_rate"] = line.bias, line.rate
-    charges = [np.maximum(np.nan_to_num(line.rate) * time, 0) for time in times]
+    rate = np.nan_to_num(line.rate) + job.subtracted[0]
+    charges = [np.maximum(rate * time, 0) for time in times]
     least = int(np.argmin(times))
     read = usual_variance(
         combined[least].variance - charges[least] / job.gain, len(job.dark[least].frames) - 1
@@ -269,7 +271,8 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
         for n, line in enumerate(column.line for column in columns):
             if line is not None:
                 pedestals[n] = line.signal(exptime).astype(np.float32)
-                charges[n] = exptime * usual_rate(line.rate, hot) if exptime else 0.0
+                rate = usual_rate(line.rate, hot) + job.subtracted[0]
+            charges[n] = exptime * rate if exptime else 0.0
     for number, batch in enumerate(_batches(job, group, tuple(c.index for c in columns))):
         for column, combination, pedestal, charge, samples in zip(
             columns, every, pedestals, charges, batch, strict=True

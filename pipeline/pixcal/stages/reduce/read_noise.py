@@ -57,10 +57,14 @@ def lost_in_blocks(job: Measuring) -> Measure:
 
 
 def dark_rate(folder: Place, job: Measuring) -> float:
-    """Mean dark signal (ADU/s) of pixels that are not hot; zero if it was not measured."""
+    """Mean dark signal (ADU/s) of pixels that are not hot; zero if it was not measured.
+
+    What the camera subtracts of it is included.
+    """
     if not job.dark:
         return 0.0
-    return usual_rate(on_grid(folder, job.shape, ("dark_rate",))[0], job.options.hot_sigma)
+    rate = usual_rate(on_grid(folder, job.shape, ("dark_rate",))[0], job.options.hot_sigma)
+    return rate + job.subtracted[0]
 
 
 def read_noise(

@@ -35,6 +35,7 @@ from pixcal.stages.reduce.frame_statistics import (
 )
 from pixcal.stages.reduce.fringe_sets import Bounds, set_warnings, share_at_mean, write_set
 from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.reduce.subtracted import subtracted_rate, subtracted_warnings
 from pixcal.stages.tiles import STRIP, indices, span, strips
 from pixcal.storage.artefact import Build, Workspace
 from pixcal.storage.cube import ArrayReader, create_group
@@ -178,6 +179,7 @@ def _measuring(source: Ingested, config: Config, folder: Place) -> Measuring:
         quantum=source.quantum,
         cut_off=source.cut_off,
         without_dark=None if source.black is None else source.black.without_dark,
+        subtracted=subtracted_rate(source, gain),
         gain=gain,
         read_noise=max(detector.read_noise_e / gain, ROUNDING_ADU),
         options=config,
@@ -230,6 +232,7 @@ def _report(
     job, summary, sets = found.job, found.summary, found.sets
     piled = source.saturation_found if source.detector.saturation_adu is None else None
     warnings = [*source.exposures.warnings, *cut_off_warnings(source.cut_off)]
+    warnings += subtracted_warnings(job.subtracted, found.gain)
     warnings += detector_warnings(summary, found.gain, piled)
     declared = source.detector.saturation_adu is not None
     warnings += _dark_lines(ArrayReader(made.folder / "calibration.zarr" / "mask"), source.shape)
@@ -240,6 +243,7 @@ def _report(
     report = {
         "schema": SCHEMA,
         **found.noise(config),
+        "subtracted_dark_e_s": found.gain * job.subtracted[0],
         "linearity": linearity_report(summary, job, found.gain),
         "saturation_adu": {
             "declared": source.detector.saturation_adu,

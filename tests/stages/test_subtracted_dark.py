@@ -1,0 +1,93 @@
+"""A camera that subtracts its dark level keeps the shot noise of the dark signal."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from pixcal.engine.run import Runtime
+from pixcal.estimators.detector.subtracted_dark import subtracted_dark
+from pixcal.stages import reduce
+from pixcal.stages.ingest import stage as ingest
+
+GAIN, READ, BIAS, DARK = 3.3, 2.6, 128.0, 300.0  # e-/ADU, ADU, ADU, e-/s
+SHAPE = (121, 134)
+YAML = """\
+schema: pixcal/acquisition/1
+detector: {pitch_um: 4.4, gain_e_per_adu: 3.3, read_noise_e: 8.6}
+frames: {bias: ["bias*"], dark: ["dark*"], flat: ["flat*"]}
+"""
+LIT = 12000.0  # e-/s
+
+
+def taken(folder: Path, clamped: bool, falls: float = 0.0) -> Path:
+    """Bias, darks of two and flats of six exposure times; charge ``falls`` after the first dark."""
+    rng = np.random.default_rng(3)
+    folder.mkdir()
+    (folder / "acquisition.yaml").write_text(YAML)
+    groups = [("bias", 0.0, 0.0, 10), ("dark", 0.2, 0.0, 8), ("dark", 1.0, 0.0, 8)]
+    groups += [("flat", t, LIT, 6) for t in (0.05, 0.12, 0.25, 0.4, 0.6, 0.8)]
+    for kind, seconds, light, count in groups:
+        for n in range(count):
+            late = falls * (kind == "dark") * (n == 0)
+            charge = rng.poisson((light + DARK) * seconds + late, SHAPE)
+            level = charge / GAIN - clamped * DARK * seconds / GAIN + BIAS
+            samples = np.rint(level + READ * rng.standard_normal(SHAPE)).astype("u2")
+            header = fits.Header({"EXPTIME": seconds})
+            fits.writeto(folder / f"{kind}_{seconds}_{n}.fits", samples, header)
+    return folder
+
+
+def reduced(folder: Path) -> dict[str, Any]:
+    run = folder.parent / f"{folder.name} run"
+    runtime = Runtime(cluster="sync", quiet=True)
+    ingest.run(folder, run, ingest.Config(), runtime)
+    reduce.run(run, reduce.Config(), runtime)
+    found: dict[str, Any] = json.loads((run / "reduce/reduce.json").read_text())
+    return found
+
+
+@pytest.mark.parametrize("clamped", [True, False])
+def test_dark_current_and_gain_are_those_of_the_noise(tmp_path: Path, clamped: bool) -> None:
+    found = reduced(taken(tmp_path / "camera", clamped))
+    assert any("camera subtracts it" in w for w in found["warnings"]) == clamped
+    assert (found["subtracted_dark_e_s"] > 0) == clamped
+    gain, noise = found["gain_e_per_adu"], found["read_noise_e"]
+    # Without the dark signal in the level, it would be 2.5 % off.
+    assert gain["error"] < 0.01 * GAIN
+    assert gain["measured"] == pytest.approx(GAIN, abs=3 * gain["error"])
+    assert noise["measured"] == pytest.approx(READ * GAIN, rel=0.02)
+    current = found["figures_of_merit"]["dark_current"]
+    assert current["value"] == pytest.approx(DARK, abs=4 * current["error"])
+
+
+def test_a_level_that_falls_is_no_subtracted_dark_signal(tmp_path: Path) -> None:
+    """As after flats, in a detector that lags."""
+    found = reduced(taken(tmp_path / "lagging", clamped=False, falls=500.0))
+    assert found["subtracted_dark_e_s"] == 0
+
+
+@pytest.mark.parametrize("level", [0.0, 0.3, 0.9, 1.0])
+def test_the_noise_must_grow_by_more_than_the_level_explains(level: float) -> None:
+    rng = np.random.default_rng(5)
+    seconds = np.repeat([0.0, 1.0, 4.0], 8)
+    means = BIAS + level * DARK / GAIN * seconds + 0.01 * rng.standard_normal(24)
+    times = np.array([0.0, 1.0, 4.0])
+    variance = READ**2 + DARK * times / GAIN**2
+    error = variance * 0.003
+    found = subtracted_dark((seconds, means), (times, variance, error), GAIN)
+    if level > 0.5:
+        assert found is None
+        return
+    assert found is not None
+    value, off = found
+    assert value == pytest.approx((1 - level) * DARK / GAIN, abs=2 * off)
+
+
+def test_one_exposure_time_tells_nothing() -> None:
+    times, means = np.zeros(4), np.full(4, BIAS)
+    of_series = np.zeros(2), np.full(2, READ**2), np.full(2, 0.01)
+    assert subtracted_dark((times, means), of_series, GAIN) is None
