@@ -202,6 +202,8 @@ def nonlinear(steps: Sequence[ExposureLevel], levels: F64, limit: float) -> Mask
 def _common(off: F64, brightness: F64, used: Mask) -> F64:
     """Part of departures (step, y, x) that pixels of equal brightness (y, x) share."""
     seen = lit(brightness)
+    if not seen.any():
+        return np.zeros_like(off)
     usual, scale = median_and_sigma(brightness[seen])
     x = (brightness - usual) / scale if scale > 0 else 0 * brightness
     powers = np.vander(np.nan_to_num(np.clip(x, -_FARTHEST, _FARTHEST)).ravel(), _DEGREE + 1)

@@ -6,14 +6,14 @@ converter or the well, samples pile up at their highest code.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from pixcal.model.arrays import F64, I64
+from pixcal.model.arrays import F64, I64, Mask
 from pixcal.model.errors import InputError
 from pixcal.storage.frame_reader import Reader
 
@@ -27,6 +27,7 @@ MIN_SHARE = 1e-3  # least share of the samples of a frame at the highest code
 MIN_SAMPLES = 50
 MIN_CHANGES = 3  # fewest frame-to-frame changes to measure a lamp's flicker
 NEIGHBOURS = 16  # codes below the highest that are compared with it
+_LIT = 1.0  # level of a flat, over the noise of a sample without light, from which it is lit
 MIN_DARKS = 5  # fewest steps between levels of darks to separate groups
 # least step between two groups, over the median step and over the noise of a sample
 JUMP, NOTABLE = 20.0, 0.1
@@ -43,12 +44,28 @@ class FlatSurvey:
     levels: F64  # (t,) mean of each frame above the bias (ADU)
     # code (ADU) at which samples pile up; None if none do, or samples are real numbers
     saturation: float | None
+    # noise of a sample without light (ADU); zero without two such frames of one series
+    noise: float = 0.0
+
+    @property
+    def lit(self) -> Mask:
+        """Flats (t,) that hold light: all, if the level without light is unknown, or none does.
+
+        A level within the noise of one sample is no flat: the shutter was closed, or the lamp off.
+        """
+        found = np.abs(self.levels) > _LIT * self.noise
+        return found if found.any() else np.ones(len(found), np.bool_)
+
+    def of_frames(self, numbers: Sequence[int]) -> "FlatSurvey":
+        """The survey of some of the flats."""
+        return replace(self, levels=self.levels[list(numbers)])
 
     @classmethod
     def of(cls, arrays: Mapping[str, Reader]) -> "FlatSurvey":
         """Survey the middle rows of all flats, and of a frame without light."""
         dark = next((arrays[name] for name in ("bias", "dark") if name in arrays), None)
         pedestal = 0.0 if dark is None else float(np.nanmean(middle_rows(dark, 0, 1)))
+        noise = 0.0 if dark is None or dark.shape[0] < 2 else math.sqrt(_noise_of_pair(dark, 0, 1))
         flats = arrays["flat"]
         whole = of_whole_numbers(flats)
         step = code_step([flats]) if whole else 1
@@ -67,7 +84,7 @@ class FlatSurvey:
                 low, high = np.quantile(samples, _ONE_SIGMA)
                 share, spread = float(counts[0] / samples.size), float(high - low) / step
                 tops.append(_Top(top, counts, share, spread))
-        return cls(np.array(levels), _pile(tops, step))
+        return cls(np.array(levels), _pile(tops, step), noise)
 
     def steps(self, exposures: Sequence[float | None]) -> list[int]:
         """Index from 0 of each frame's level among those of its exposure time."""

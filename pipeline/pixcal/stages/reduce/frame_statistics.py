@@ -272,7 +272,7 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
             if line is not None:
                 pedestals[n] = line.signal(exptime).astype(np.float32)
                 rate = usual_rate(line.rate, hot) + job.subtracted[0]
-            charges[n] = exptime * rate if exptime else 0.0
+                charges[n] = exptime * rate if exptime else 0.0
     for number, batch in enumerate(_batches(job, group, tuple(c.index for c in columns))):
         for column, combination, pedestal, charge, samples in zip(
             columns, every, pedestals, charges, batch, strict=True

@@ -1,7 +1,7 @@
 """Contents of ``RUN/ingest`` for the reduction."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -26,6 +26,7 @@ from pixcal.storage.manifest import read_json, read_manifest
 from pixcal.storage.place import Local, Place
 from pixcal.storage.stage import read_acquisition
 
+_NAMED = 3  # frames that a warning names
 MOST_ADU = 2.0**32  # above any converter's range: larger real numbers are not samples
 
 
@@ -62,9 +63,22 @@ class Ingested:
         return found
 
     @cached_property
+    def _all_flats(self) -> FlatSurvey | None:
+        """Survey of the flats, unlit ones included; None without flats."""
+        return FlatSurvey.of(self._chosen(self._whole)) if "flat" in self._catalogue else None
+
+    @cached_property
+    def _used(self) -> dict[str, list[int]]:
+        """Numbers of the frames that are used: no flats without light."""
+        if self._all_flats is None:
+            return self._whole
+        numbers = zip(self._whole["flat"], self._all_flats.lit, strict=True)
+        return self._whole | {"flat": [n for n, lit in numbers if lit]}
+
+    @cached_property
     def _listed(self) -> dict[str, dict[str, list[Any]]]:
         return {
-            name: {key: [column[n] for n in self._whole[name]] for key, column in table.items()}
+            name: {key: [column[n] for n in self._used[name]] for key, column in table.items()}
             for name, table in self._catalogue.items()
         }
 
@@ -94,7 +108,8 @@ class Ingested:
     @cached_property
     def survey(self) -> FlatSurvey | None:
         """Survey of the flats; None without flats."""
-        return FlatSurvey.of(self.arrays) if "flat" in self._listed else None
+        every = self._all_flats
+        return every and every.of_frames(np.flatnonzero(every.lit).tolist())
 
     @cached_property
     def exposures(self) -> Exposures:
@@ -105,18 +120,38 @@ class Ingested:
                 "dark frames have no EXPTIME and are of several levels: not used; write exposure "
                 "times into the headers (for TIFF and PNG into headers.csv)"
             )
+        found.warnings += self._unlit_warning()
         return found
+
+    def _unlit_warning(self) -> list[str]:
+        """Warning on flats that are left out as they hold no light."""
+        unlit = sorted(set(self._whole.get("flat", ())) - set(self._used.get("flat", ())))
+        if not unlit:
+            return []
+        table = self._catalogue["flat"]
+        names = [table["file"][n] for n in unlit[:_NAMED]] if "file" in table else []
+        more = [f"{len(unlit) - len(names)} more"] if len(unlit) > len(names) else []
+        return [
+            f"flat frames without light are left out ({len(unlit)} of {len(self._whole['flat'])}): "
+            f"{', '.join(names + more)}; list them under frames.dark or frames.bias if they are "
+            "to be used"
+        ]
 
     @cached_property
     def arrays(self) -> Mapping[str, Reader]:
-        """A reader of each array without frames that were cut off; InputError if files are gone."""
+        """A reader of the frames of each array that are used; InputError if files are gone."""
+        return self._chosen(self._used)
+
+    def _chosen(self, numbers: Mapping[str, Sequence[int]]) -> dict[str, Reader]:
+        """A reader of some frames of each array."""
         return {
             name: reader
-            if len(self._whole[name]) == reader.shape[0]
-            else ChosenFrames(reader, self._whole[name])
-            for name, reader in self._readers().items()
+            if len(numbers[name]) == reader.shape[0]
+            else ChosenFrames(reader, numbers[name])
+            for name, reader in self._readers.items()
         }
 
+    @cached_property
     def _readers(self) -> Mapping[str, ArrayReader | FrameReader]:
         """A reader of all frames of each array, from its cube or FITS files."""
         manifest = read_manifest(self.folder)
