@@ -11,7 +11,7 @@ from pixcal.effects.bias_drift import BiasDrift
 from pixcal.effects.row_noise import RowNoise
 from pixcal.estimators.detector.noiseless_charge import noiseless_level
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.offset import FEWEST, fringe_offsets
+from pixcal.estimators.frame_series.offset import FEWEST, fringe_offsets, unlit_stacks
 from pixcal.kernels.processes import brownian
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect, FringeMaps
@@ -404,3 +404,21 @@ def test_the_level_of_a_replayed_run_is_no_light() -> None:
     np.testing.assert_allclose(twice.theta[0], 5000 - 400 / 0.8)
     in_the_dark = replace(drift, tracks=(replace(drift.tracks[0], set="bias frames"),))
     assert in_the_dark.undo(maps) is None
+
+
+def test_frames_without_light_that_follow_light_are_left_out(
+    acquired: Callable[..., Evidence],
+) -> None:
+    """Their level may fall for many frames, as charge of the light before is released."""
+    evidence = acquired(None, {})
+    assert {s.kind for s in unlit_stacks(evidence, "bias", "dark")} == {"bias", "dark"}
+    last = max(float(s.start_s + s.time_s[-1]) for s in evidence.of_kind("flat"))
+    moved = tuple(
+        replace(s, start_s=last + 0.1) if s.kind == "dark" else s for s in evidence.stacks
+    )
+    after = replace(evidence, stacks=moved)
+    assert {s.kind for s in unlit_stacks(after, "bias", "dark")} == {"bias"}
+    # Without time stamps, nothing is known to be before.
+    unknown = tuple(replace(s, start_s=np.nan) for s in moved)
+    found = unlit_stacks(replace(evidence, stacks=unknown), "bias", "dark")
+    assert {s.kind for s in found} == {"bias", "dark"}

@@ -16,6 +16,7 @@ from pixcal.estimators.frame_series.offset import (
     fringe_courses,
     fringe_offsets,
     offset_modes,
+    unlit_stacks,
 )
 from pixcal.estimators.frame_series.profiled import Profiled, ProfiledFit, best_shape
 from pixcal.estimators.frame_series.variance_components import (
@@ -257,7 +258,7 @@ class BiasDrift(Effect):
 
 
 def _all_series(evidence: Evidence) -> list[OffsetSeries]:
-    stacks = [s for s in evidence.stacks if s.kind in ("bias", "dark")]
+    stacks = unlit_stacks(evidence, "bias", "dark")
     dark = [dark_offsets(s, evidence.good, evidence.gain, evidence.read_noise) for s in stacks]
     every = [s for s in dark if s is not None]
     for fringes in evidence.fringes.values():

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.offset import unlit_stacks
 from pixcal.estimators.frame_series.variance_components import walk_modes
 from pixcal.kernels.processes import brownian
 from pixcal.kernels.robust import robust_sigma
@@ -131,7 +132,7 @@ class OutputJitter(Effect):
 
 def _outputs(evidence: Evidence) -> "Outputs | None":
     """Outputs in the frames without light, with edges in window coordinates."""
-    stacks = [s for s in evidence.stacks if s.kind in ("bias", "dark") and len(s.adu) >= MIN_FRAMES]
+    stacks = [s for s in unlit_stacks(evidence, "bias", "dark") if len(s.adu) >= MIN_FRAMES]
     gain = np.float32(evidence.gain)
     rests = [(s.adu - s.adu.mean(axis=0)) * gain for s in stacks]
     return find_outputs(rests, [s.time_s for s in stacks], evidence.good)

@@ -156,6 +156,7 @@ _AXES = {
     "frames before": _Axis("other frame", "frame {}"),
     "harmonic (cosine, sine)": _Axis("harmonic", "{}"),
     "exposure time of flats": _Axis("exposure time (s)", "flats of {} s"),
+    "exposure time without light": _Axis("exposure time (s)", "bias and dark frames of {} s"),
     "batches averaged": _Axis("batches averaged", "batches averaged: {}"),
 }
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pixcal.estimators.detector.flat_ladder import level_before
 from pixcal.estimators.diagnosis.evidence import STRIPE, Evidence, FringeEvidence, Stack
 from pixcal.estimators.frame_series.light import LIGHT_PARTS, FrameLight
 from pixcal.estimators.frame_series.variance_components import (
@@ -33,6 +34,8 @@ NOISES = np.array([[1, 1, 1, 1], [1, 1, 0, 0], [1, 0, 1, 0]])
 MIN_NOISE = 0.05
 BELOW = 0.3
 _MIN_VARIANCE = 1e-6  # e-², of samples in pixels that are not good
+# level of the frame before, over the read noise, above which frames without light follow light
+_LIT = 100.0
 KNOTS = 32  # most points of a course of fringes
 
 Course = tuple[str, F64, F64]
@@ -192,11 +195,20 @@ def fringe_courses(light: FrameLight) -> tuple[list[Course], float]:
     return found, float(np.sqrt(np.mean(jitter)))
 
 
+def unlit_stacks(evidence: Evidence, *kinds: str) -> list[Stack]:
+    """Series of frames without light, less those that follow light at once.
+
+    After light the level may fall for many frames, as in a detector that lags: that is no bias.
+    """
+    every = [stack for stack in evidence.stacks if stack.kind in kinds]
+    return [s for s in every if level_before(evidence, s) <= _LIT * evidence.read_noise]
+
+
 def dark_courses(evidence: Evidence) -> list[Course]:
     """Changes of the level of bias and dark frames, where these have one exposure time."""
     found = []
     for kind in ("bias", "dark"):
-        stacks = evidence.of_kind(kind)
+        stacks = unlit_stacks(evidence, kind)
         if len(stacks) != 1:
             continue
         series = dark_offsets(stacks[0], evidence.good, evidence.gain, evidence.read_noise)

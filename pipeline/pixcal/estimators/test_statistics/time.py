@@ -190,13 +190,20 @@ def means_of_frames(kind: str, evidence: Evidence) -> Curve | None:
     return Curve.numbered(value)
 
 
-@of_time("trend of the bias level", "change of level", unit="e-", sets=False)
+@of_time(
+    "trend of the level without light",
+    "change of level",
+    unit="e-",
+    x="exposure time without light",
+    sets=False,
+)
 def bias_trend(evidence: Evidence) -> Curve:
     """Slope of the mean of bias and dark frames over their run, last less first."""
-    values = []
+    times, values = [], []
     for stack in (*evidence.of_kind("bias"), *evidence.of_kind("dark")):
         if len(stack.adu) >= _FOR_TREND:
             means = frame_means(stack.adu, evidence.good) * evidence.gain
             time = stack.time_s - stack.time_s.mean()
+            times.append(float(np.nan_to_num(stack.exptime_s)))
             values.append(float(np.polyfit(time / np.ptp(time), means, 1)[0]))
-    return Curve.numbered(values)
+    return Curve(np.array(times), np.array(values))
