@@ -387,6 +387,20 @@ def test_the_level_of_an_offset_shows_in_the_shot_noise_it_lacks(
     assert abs(none) < 4 * error
 
 
+def test_light_alone_has_no_level_without_noise(acquired: Callable[..., Evidence]) -> None:
+    """What the fit of each pixel takes up of the noise of dark samples is allowed for.
+
+    It would pass for an offset of three over the number of frames of the harmonic mean signal.
+    """
+    off = []
+    for visibility in (None, {"optics.visibility": 0.9}):
+        evidence = acquired(visibility, {})
+        off += [noiseless_level(evidence, fringes) for fringes in evidence.fringes.values()]
+    pulls = [level / error for level, error in off]
+    assert np.mean([level for level, _ in off]) < 3 * np.hypot.reduce([e for _, e in off]) / 4
+    assert max(map(abs, pulls)) < 3
+
+
 def test_the_level_of_a_replayed_run_is_no_light() -> None:
     drift = BiasDrift(**RUN, tracks=(Track("vertical", (0.0, 20.0), (100.0, 300.0)),))
     theta, flat = np.full((3, 4, 5), 5000.0), np.full((4, 5), 0.8)

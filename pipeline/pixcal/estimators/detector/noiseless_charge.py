@@ -4,10 +4,12 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F32, F64
 
+_LEAST_LEFT = 0.1  # share of the variance of a sample that a fit leaves at least
 _CLIP = 25.0  # squared residuals over their variance from which they are excluded (particles)
 
 
@@ -43,11 +45,25 @@ def _last_of(
     right: F64 | float = 0.0
     for fringes in sets:
         flat = evidence.flat[fringes.good].astype(np.float32)
-        square = (fringes.residual[:, fringes.good] * flat) ** 2
         variance = fringes.variance[:, fringes.good] * flat**2
-        weight = np.where(square < _CLIP * variance, 0.5 / variance**2, 0)
+        left = np.maximum(1 - _taken_by_fit(fringes), _LEAST_LEFT)
+        square = (fringes.residual[:, fringes.good] * flat) ** 2 / left
+        kept = square < _CLIP * variance
+        square, weight = np.where(kept, square, 0), np.where(kept, 0.5 / variance**2, 0)
         own = terms(fringes, variance)
         normal = normal + np.array([[np.vdot(weight * a, b) for b in own] for a in own], float)
         right = right + np.array([np.vdot(weight * a, square) for a in own], float)
     covariance = inverse_normal(np.asarray(normal))
     return float(covariance[-1] @ right), float(np.sqrt(covariance[-1, -1]))
+
+
+def _taken_by_fit(fringes: FringeEvidence) -> F32:
+    """Share (t, n) of the variance of samples that the fit of their pixels takes up.
+
+    It is largest in dark samples, which weigh most: an offset of the signal by 3 / t of its
+    harmonic mean would change the variances alike.
+    """
+    freedom = Freedom(fringes)
+    by_pixel = np.einsum("nij,it->njt", freedom.pixel_inverse, freedom.of_time, optimize=True)
+    taken = np.einsum("njt,jt->tn", by_pixel, freedom.of_time, optimize=True)
+    return np.asarray(freedom.weight * taken, np.float32)
