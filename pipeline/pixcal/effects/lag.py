@@ -228,10 +228,12 @@ class Lag(Effect):
             if found is None:
                 return None
             share, error, carried = found
-            before = "charge of the frame before" if carried else "a clear"
-            if not carried and all(len(s.adu) < _TELL_LAMP for s in evidence.ladder):
-                before += "; with flat pairs, a warming lamp looks the same: "
-                before += "take three flats per level"
+            before = "charge of the frame before"
+            if not carried:
+                pairs = all(len(s.adu) < _TELL_LAMP for s in evidence.ladder)
+                before = "a clear; a shutter or lamp that gives the first frame less light looks "
+                before += "the same: take darks at once after flats"
+                before += ", and three flats per level" if pairs else ""
             return Estimate(
                 cls(float(np.clip(share, 0, 0.5)), 0.0, 0.0, carried=carried),
                 {"share": error},
