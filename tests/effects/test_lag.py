@@ -264,6 +264,11 @@ def test_pairs_of_flats_cannot_tell_it_from_a_lamp_that_warms_up() -> None:
     assert "three flats per level" in found.why
     found = Lag.estimate(first_flats_of(4, 0.01, 0.0, 0.0))
     assert found is not None
+    assert "three flats per level" not in found.why
+    assert "take darks at once after flats" in found.why
+    # Charge that the next frame gets, no lamp gives.
+    found = Lag.estimate(first_flats_of(4, 0.01, 1.0, 0.0))
+    assert found is not None
     assert "lamp" not in found.why
 
 
