@@ -230,11 +230,12 @@ def _size(couplings: Sequence[Coupling], errors: F64) -> dict[str, object]:
         return {}
     n = int(np.abs([c.share for c in couplings]).argmax())
     place = couplings[n].dy, couplings[n].dx
+    largest = f", the largest of {len(couplings)} couplings" if len(couplings) > 1 else ""
     return {
         "value": couplings[n].share,
         "error": float(errors[n]),
         "unit": "",
-        "of": f"at (dy, dx) = {place}, the largest of {len(couplings)} couplings",
+        "of": f"at (dy, dx) = {place}{largest}",
     }
 
 

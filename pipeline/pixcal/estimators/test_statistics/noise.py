@@ -131,7 +131,7 @@ def _calm(frames: F32, good: Mask) -> F32:
     return np.asarray(rest * good, np.float32)
 
 
-@of_noise("outliers", "outliers", x="sigma, low then high", unit="2 √number", floor=1.0)
+@of_noise("outliers", "outliers", x="sigma, low then high", unit="(2 √count)", floor=1.0)
 def outliers(data: FringeSetData) -> Curve:
     """Residuals of good pixels beyond 5, 7 and 10 sigma: twice the root of their number."""
     limits = np.array(OUTLIERS)
@@ -142,7 +142,7 @@ def outliers(data: FringeSetData) -> Curve:
     "outliers in bias and dark frames",
     "outliers",
     x="sigma, low then high",
-    unit="2 √number",
+    unit="(2 √count)",
     sets=False,
     floor=1.0,
 )

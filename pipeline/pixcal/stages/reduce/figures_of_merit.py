@@ -108,7 +108,7 @@ def _read_noise(found: Json, summary: Summary, gain: float, step: float) -> Meas
     if whole is None:
         return None
     steps = "ADU" if step == 1 else f"steps of {step:g} ADU"
-    note = f"rounding to {steps} adds {step * gain / math.sqrt(12):.3g} e-"
+    note = f"rounding to {steps} adds {step * gain / math.sqrt(12):.3g} e-" if step else ""
     if own is None:
         note += "; too coarse to measure the noise without it"
     for name, title, noise, said in (
