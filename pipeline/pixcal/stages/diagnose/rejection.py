@@ -9,7 +9,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 
-from pixcal.estimators.test_statistics import Key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.candidates import Candidate
@@ -27,8 +26,6 @@ from pixcal.stages.diagnose.thresholds import (
 UNTRIED = ("not decided", "not tested", "cannot be simulated")  # how such reasons begin
 
 Rejection = tuple[str, str]  # name of a cause, and why it is rejected
-# fraction of the gap that a cause closes alone, below which it only changes what others close
-_NOTHING = 0.01
 STRONGEST = 3  # candidates that are tried as replacements
 
 
@@ -80,14 +77,6 @@ def possible_proxy(closed: float, still_open: float) -> str:
     )
 
 
-def only_compensates(still_open: float) -> str:
-    """Why a cause is rejected that closes nothing alone."""
-    return (
-        f"closes nothing alone, and {100 * still_open:.0f} % of the gap stays open with it; it may "
-        "only compensate for other causes"
-    )
-
-
 def _weighted(closed: float) -> str:
     return f"{100 * max(closed, 0):.1f} % of the gap weighted by significance"
 
@@ -113,19 +102,6 @@ def all_close_little(
         one < MIN_SHARE_OF_RESIDUAL * (1 - MIN_JOINT_GAP_CLOSED) for one in closed.values()
     )
     return closed if little and sum(closed.values()) < MIN_JOINT_GAP_CLOSED else {}
-
-
-def _compensating(
-    comparison: Comparison,
-    where: set[Key],
-    candidates: Mapping[str, Candidate],
-    names: Iterable[str],
-) -> list[str]:
-    """Causes that close nothing alone, and all if none does: they only compensate each other."""
-    alone = {name: candidates[name].alone for name in names}
-    left = {n: 0.0 if one is None else comparison.residual(one, where) for n, one in alone.items()}
-    least = MIN_GAP_CLOSED if min(left.values(), default=0.0) > 1 - MIN_GAP_CLOSED else _NOTHING
-    return [name for name, rest in left.items() if rest > 1 - least]
 
 
 def doubtful(
@@ -155,11 +131,13 @@ def doubtful(
         for name in closed
     }
     among = [name for name in closed if closed[name] < needed[name]]
+    alone = [candidates[name].alone for name in closed]
+    # Causes that only compensate each other.
+    if open_still > MAX_RESIDUAL_GAP and all(
+        one is not None and comparison.residual(one, where) > 1 - MIN_GAP_CLOSED for one in alone
+    ):
+        among = list(closed)
     least = min(among, key=lambda name: closed[name], default=None)
-    if least is None and open_still > MAX_RESIDUAL_GAP:
-        idle = _compensating(comparison, where, candidates, closed)
-        if idle:
-            return min(idle, key=lambda name: closed[name]), only_compensates(open_still)
     # A candidate that was not tried may cause the largest difference.
     strong = [one for one in candidates.values() if one.significance >= SIGNIFICANT]
     tried = not any(one.reason.startswith(UNTRIED) for one in strong)
