@@ -121,11 +121,9 @@ class BrighterFatter(Effect):
                 size, variance, gain = boundaries_beside(evidence, falloff, known)
                 significance = float(np.copysign(np.sqrt(max(gain, 0.0)), size))
                 why += ", and a second harmonic of the fringes that depends on their direction"
-        *by_axis, along_y, of_axes = _by_axis(noise)
+        along_y = 1.0
         if not evidence.fringes:
-            (size, variance), significance = by_axis, of_axes
-        else:
-            size *= 2 / (1 + along_y)  # the harmonics tell the mean of both axes
+            size, variance, along_y, significance = _by_axis(noise)
         error = float(np.sqrt(variance))
         errors: dict[str, float] = {"shift_px_per_e": error}
         together: tuple[dict[str, float], ...] = ()
