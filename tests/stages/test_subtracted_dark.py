@@ -11,6 +11,7 @@ from astropy.io import fits
 from pixcal.engine.run import Runtime
 from pixcal.estimators.detector.subtracted_dark import subtracted_dark
 from pixcal.stages import reduce
+from pixcal.stages.evidence import load_evidence
 from pixcal.stages.ingest import stage as ingest
 
 GAIN, READ, BIAS, DARK = 3.3, 2.6, 128.0, 300.0  # e-/ADU, ADU, ADU, e-/s
@@ -23,11 +24,18 @@ frames: {bias: ["bias*"], dark: ["dark*"], flat: ["flat*"]}
 LIT = 12000.0  # e-/s
 
 
-def taken(folder: Path, clamped: bool, falls: float = 0.0) -> Path:
-    """Bias, darks of two and flats of six exposure times; charge ``falls`` after the first dark."""
+def taken(
+    folder: Path, clamped: bool, falls: float = 0.0, jitter: float = 0.0, declared: float = GAIN
+) -> Path:
+    """Bias, darks of two and flats of six exposure times.
+
+    Charge ``falls`` after the first dark; the level of darks scatters by ``jitter`` (ADU).
+    """
     rng = np.random.default_rng(3)
     folder.mkdir()
-    (folder / "acquisition.yaml").write_text(YAML)
+    (folder / "acquisition.yaml").write_text(
+        YAML.replace("gain_e_per_adu: 3.3", f"gain_e_per_adu: {declared}")
+    )
     groups = [("bias", 0.0, 0.0, 10), ("dark", 0.2, 0.0, 8), ("dark", 1.0, 0.0, 8)]
     groups += [("flat", t, LIT, 6) for t in (0.05, 0.12, 0.25, 0.4, 0.6, 0.8)]
     for kind, seconds, light, count in groups:
@@ -35,6 +43,7 @@ def taken(folder: Path, clamped: bool, falls: float = 0.0) -> Path:
             late = falls * (kind == "dark") * (n == 0)
             charge = rng.poisson((light + DARK) * seconds + late, SHAPE)
             level = charge / GAIN - clamped * DARK * seconds / GAIN + BIAS
+            level = level + jitter * (kind == "dark") * rng.standard_normal()
             samples = np.rint(level + READ * rng.standard_normal(SHAPE)).astype("u2")
             header = fits.Header({"EXPTIME": seconds})
             fits.writeto(folder / f"{kind}_{seconds}_{n}.fits", samples, header)
@@ -64,9 +73,27 @@ def test_dark_current_and_gain_are_those_of_the_noise(tmp_path: Path, clamped: b
     assert current["value"] == pytest.approx(DARK, abs=4 * current["error"])
 
 
-def test_a_level_that_falls_is_no_subtracted_dark_signal(tmp_path: Path) -> None:
-    """As after flats, in a detector that lags."""
-    found = reduced(taken(tmp_path / "lagging", clamped=False, falls=500.0))
+def test_the_diagnosis_allows_for_its_noise(tmp_path: Path) -> None:
+    folder = taken(tmp_path / "camera", clamped=True)
+    run = folder.parent / "run"
+    runtime = Runtime(cluster="sync", quiet=True)
+    ingest.run(folder, run, ingest.Config(), runtime)
+    reduce.run(run, reduce.Config(), runtime)
+    evidence = load_evidence(run)
+    own = np.median(evidence.dark_charge_rate)
+    assert own == pytest.approx(DARK, rel=0.05)
+    assert abs(np.median(evidence.dark_rate)) < 0.1 * DARK
+    (dark,) = (s for s in evidence.of_kind("dark") if s.exptime_s == 1.0)
+    rest, sigma = evidence.dark_noise(dark)
+    assert np.nanmedian(np.abs(rest / sigma)) == pytest.approx(0.6745 * np.sqrt(7 / 8), rel=0.1)
+
+
+@pytest.mark.parametrize("other", [{"falls": 500.0}, {"jitter": 2.5}, {"declared": 7.5}])
+def test_changes_of_the_level_or_a_wrong_gain_are_no_subtracted_dark_signal(
+    tmp_path: Path, other: dict[str, float]
+) -> None:
+    """A level that falls after flats, or jumps from frame to frame, is no noise of samples."""
+    found = reduced(taken(tmp_path / "other", clamped=False, **other))
     assert found["subtracted_dark_e_s"] == 0
 
 

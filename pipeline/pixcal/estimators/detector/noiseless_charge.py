@@ -64,6 +64,7 @@ def _taken_by_fit(fringes: FringeEvidence) -> F32:
     harmonic mean would change the variances alike.
     """
     freedom = Freedom(fringes)
-    by_pixel = np.einsum("nij,it->njt", freedom.pixel_inverse, freedom.of_time, optimize=True)
-    taken = np.einsum("njt,jt->tn", by_pixel, freedom.of_time, optimize=True)
-    return np.asarray(freedom.weight * taken, np.float32)
+    i, j = np.indices((len(freedom.of_time),) * 2).reshape(2, -1)
+    pairs = (freedom.of_time[i] * freedom.of_time[j]).T.astype(np.float32)
+    taken = pairs @ freedom.pixel_inverse[:, i, j].T.astype(np.float32)
+    return np.asarray(freedom.weight * taken)

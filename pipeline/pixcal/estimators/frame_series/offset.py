@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.estimators.detector.flat_ladder import level_before
 from pixcal.estimators.diagnosis.evidence import STRIPE, Evidence, FringeEvidence, Stack
 from pixcal.estimators.frame_series.light import LIGHT_PARTS, FrameLight
 from pixcal.estimators.frame_series.variance_components import (
@@ -34,8 +33,7 @@ NOISES = np.array([[1, 1, 1, 1], [1, 1, 0, 0], [1, 0, 1, 0]])
 MIN_NOISE = 0.05
 BELOW = 0.3
 _MIN_VARIANCE = 1e-6  # e-², of samples in pixels that are not good
-# level of the frame before, over the read noise, above which frames without light follow light
-_LIT = 100.0
+_SOON_S = 600.0  # time after light within which traps may still release charge
 KNOTS = 32  # most points of a course of fringes
 
 Course = tuple[str, F64, F64]
@@ -196,12 +194,18 @@ def fringe_courses(light: FrameLight) -> tuple[list[Course], float]:
 
 
 def unlit_stacks(evidence: Evidence, *kinds: str) -> list[Stack]:
-    """Series of frames without light, less those that follow light at once.
+    """Series of frames without light, less those that begin soon after light.
 
     After light the level may fall for many frames, as in a detector that lags: that is no bias.
     """
-    every = [stack for stack in evidence.stacks if stack.kind in kinds]
-    return [s for s in every if level_before(evidence, s) <= _LIT * evidence.read_noise]
+    flats = [s.start_s + s.time_s for s in evidence.of_kind("flat")]
+    times = np.concatenate([*flats, *(f.start_s + f.time_s for f in evidence.fringes.values()), []])
+
+    def soon(stack: Stack) -> bool:
+        since = stack.start_s + stack.time_s[0] - times
+        return bool(((since > 0) & (since < _SOON_S)).any())
+
+    return [s for s in evidence.stacks if s.kind in kinds and not soon(s)]
 
 
 def dark_courses(evidence: Evidence) -> list[Course]:

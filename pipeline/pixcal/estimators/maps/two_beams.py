@@ -42,9 +42,10 @@ def contrast_surface(theta: F64, good: Mask) -> F64:
     log = np.where(np.isfinite(clipped(log - alike)), log, np.nan)
     terms = legendre(log.shape, _ANY)
     cells, weight = _cells(np.concatenate([[log], terms]))
-    if len(weight) <= len(cells):
+    noise = robust_sigma(np.diff(log, axis=1)) / np.sqrt(2)
+    if len(weight) <= len(cells) or not noise > 0:
         return np.asarray(np.exp(alike))
-    weight /= robust_sigma(np.diff(log, axis=1)) / np.sqrt(2)
+    weight /= noise
     data, of_any, of_terms = cells[0], cells[1:], cells[1 : _TERMS + 1]
 
     def chi2(design: F64) -> float:

@@ -201,7 +201,7 @@ def bias_trend(evidence: Evidence) -> Curve:
     """Slope of the mean of bias and dark frames over their run, last less first."""
     times, values = [], []
     for stack in (*evidence.of_kind("bias"), *evidence.of_kind("dark")):
-        if len(stack.adu) >= _FOR_TREND:
+        if len(stack.adu) >= _FOR_TREND and np.ptp(stack.time_s) > 0:
             means = frame_means(stack.adu, evidence.good) * evidence.gain
             time = stack.time_s - stack.time_s.mean()
             times.append(float(np.nan_to_num(stack.exptime_s)))

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
@@ -155,16 +156,27 @@ class NominalBench:
             wanted = np.flatnonzero(np.isin(numbers, half[name]))
             before = None if recording.before is None else taken[recording.before.key]
             own = replace(taken[recording.key], before=before)
-            lifted = self.pedestal + self._subtracted_adu(own.exptime_s)
+            top = detector.top_adu
             for frame, samples in camera.expose(own, wanted.tolist()):
                 at = int(np.searchsorted(half[name], numbers[frame]))
-                arrays[name][at] = samples - np.float32(lifted)
+                arrays[name][at] = self._as_recorded(samples, own.exptime_s, top, name)
         return self.frames.raw(arrays, half)
 
-    def _subtracted_adu(self, exptime_s: float) -> int:
-        """Dark signal that the camera subtracts, in whole steps of the converter."""
-        black, step = self.frames.black, self.bench.detector.step_adu
-        return step * round(black.subtracted * exptime_s / step) if black else 0
+    def _as_recorded(
+        self, samples: NDArray[np.uint16], exptime_s: float, top_adu: float, name: str
+    ) -> F32:
+        """Samples without the pedestal, and without dark signal that the camera subtracts."""
+        found = samples - np.float32(self.pedestal)
+        black = self.frames.black
+        if black is None or not black.subtracted:
+            return found
+        # In whole steps of the converter; saturated samples stay so.
+        step = self.bench.detector.step_adu
+        lost = step * round(black.subtracted * exptime_s / step)
+        full = samples >= top_adu
+        dtype = self.frames.dtypes[name]
+        lowest = -np.inf if dtype.kind == "f" else float(np.iinfo(dtype).min)
+        return np.where(full, found, np.maximum(found - lost, np.float32(lowest)))
 
     def _of_measured_k(
         self, measured: Measured, bench: Bench, effects: Sequence[Effect]

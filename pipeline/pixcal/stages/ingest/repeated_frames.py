@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from pixcal.model.arrays import F64
 from pixcal.stages.ingest.cut_frames import NAMED, name_of
 from pixcal.storage.frames import Frame
@@ -12,13 +14,14 @@ _ONE_VALUE = 0.5  # share of a row with one value from which its noise is not se
 def repeats_of(facts: Mapping[str, F64]) -> list[int | None]:
     """Number of the first frame of an array with the same samples as each; None if there is none.
 
-    By the checksums of bands. Frames without noise, or with noise far below one code, are alike
-    anyway: it is no evidence if the last row of a frame has one value in half of its pixels, as in
-    a saturated flat, or if less than half of the frames are different. ``facts``:
+    By the checksums and largest samples of bands. Frames without noise, or with noise far below one
+    code, are alike anyway: it is no evidence if the last row of a frame has one value in half of
+    its pixels, as in a saturated flat, or if less than half of the frames are different. ``facts``:
     `pixcal.storage.frame_decoding.FACTS` by name, (time, band).
     """
     first: dict[bytes, int] = {}
-    found = [first.setdefault(crc.tobytes(), n) for n, crc in enumerate(facts["crc"])]
+    content = np.stack([facts[name] for name in ("crc", "largest", "last", "share")], axis=1)
+    found = [first.setdefault(own.tobytes(), n) for n, own in enumerate(content)]
     if 2 * len(first) < len(found):
         return [None] * len(found)
     noisy = facts["share"][:, -1] < _ONE_VALUE

@@ -109,7 +109,7 @@ def _read_noise(found: Json, summary: Summary, gain: float, step: float) -> Meas
         return None
     steps = "ADU" if step == 1 else f"steps of {step:g} ADU"
     note = f"rounding to {steps} adds {step * gain / math.sqrt(12):.3g} e-" if step else ""
-    if own is None:
+    if own is None and note:
         note += "; too coarse to measure the noise without it"
     for name, title, noise, said in (
         ("read_noise_with_rounding", "read noise with rounding", whole, note),

@@ -44,8 +44,7 @@ class FlatSurvey:
     levels: F64  # (t,) mean of each frame above the bias (ADU)
     # code (ADU) at which samples pile up; None if none do, or samples are real numbers
     saturation: float | None
-    # noise of a sample without light (ADU); zero without two such frames of one series
-    noise: float = 0.0
+    noise: float = 0.0  # of a sample in bias frames (ADU); zero without two of them
 
     @property
     def lit(self) -> Mask:
@@ -65,7 +64,8 @@ class FlatSurvey:
         """Survey the middle rows of all flats, and of a frame without light."""
         dark = next((arrays[name] for name in ("bias", "dark") if name in arrays), None)
         pedestal = 0.0 if dark is None else float(np.nanmean(middle_rows(dark, 0, 1)))
-        noise = 0.0 if dark is None or dark.shape[0] < 2 else math.sqrt(_noise_of_pair(dark, 0, 1))
+        bias = arrays.get("bias")
+        noise = 0.0 if bias is None or bias.shape[0] < 2 else math.sqrt(_noise_of_pair(bias, 0, 1))
         flats = arrays["flat"]
         whole = of_whole_numbers(flats)
         step = code_step([flats]) if whole else 1

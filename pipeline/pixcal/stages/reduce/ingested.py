@@ -69,8 +69,11 @@ class Ingested:
 
     @cached_property
     def _used(self) -> dict[str, list[int]]:
-        """Numbers of the frames that are used: no flats without light."""
-        if self._all_flats is None:
+        """Numbers of the frames that are used: no flats without light.
+
+        Parts of a run, and simulations, keep the flats of the whole.
+        """
+        if self._all_flats is None or self.black is not None:
             return self._whole
         numbers = zip(self._whole["flat"], self._all_flats.lit, strict=True)
         return self._whole | {"flat": [n for n, lit in numbers if lit]}
@@ -109,7 +112,9 @@ class Ingested:
     def survey(self) -> FlatSurvey | None:
         """Survey of the flats; None without flats."""
         every = self._all_flats
-        return every and every.of_frames(np.flatnonzero(every.lit).tolist())
+        if every is None or self.black is not None:
+            return every
+        return every.of_frames(np.flatnonzero(every.lit).tolist())
 
     @cached_property
     def exposures(self) -> Exposures:

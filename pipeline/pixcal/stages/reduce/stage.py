@@ -87,8 +87,8 @@ class Reduction:
     bounds: Bounds  # extremes over the good pixels
     sets: dict[str, dict[str, Any]]  # entry of each fringe set in ``reduce.json``
 
-    def noise(self, config: Config) -> dict[str, dict[str, Any]]:
-        """Entries of ``reduce.json`` on gain and read noise."""
+    def noise(self, config: Config) -> dict[str, Any]:
+        """Entries of ``reduce.json`` on gain, read noise and subtracted dark signal."""
         summary, gain, fitted = self.summary, self.gain, self.summary.gain
         noise = summary.noise_measured_e(summary.before_rounding, gain)
         total = summary.noise_measured_e(summary.read_noise, gain)
@@ -113,6 +113,7 @@ class Reduction:
                 "used": self.bounds.read_noise,
                 "used_error": gain * summary.read_noise[1] if summary.read_noise else None,
             },
+            "subtracted_dark_e_s": gain * self.job.subtracted[0],
         }
 
 
@@ -243,7 +244,6 @@ def _report(
     report = {
         "schema": SCHEMA,
         **found.noise(config),
-        "subtracted_dark_e_s": found.gain * job.subtracted[0],
         "linearity": linearity_report(summary, job, found.gain),
         "saturation_adu": {
             "declared": source.detector.saturation_adu,

@@ -7,7 +7,8 @@ import numpy as np
 from pixcal.estimators.detector.calibration import usual_variance
 from pixcal.estimators.detector.emva import Measure
 from pixcal.estimators.detector.subtracted_dark import subtracted_dark
-from pixcal.stages.reduce.flat_survey import middle_rows
+from pixcal.model.errors import InputError
+from pixcal.stages.reduce.flat_survey import middle_rows, rough_gain
 from pixcal.stages.reduce.ingested import Ingested
 
 _FRAMES = 16  # of each exposure time
@@ -17,8 +18,8 @@ _HOT = 5.0  # errors of a sample from the median beyond which a pixel is not a u
 def subtracted_rate(source: Ingested, gain: float) -> Measure:
     """Dark signal (ADU/s) that the camera subtracts, and its error; zero if it is not seen.
 
-    From the middle rows. Noise that is cut off at the lowest code tells nothing. ``gain``: rough,
-    e-/ADU.
+    From the middle rows. Noise that is cut off at the lowest code tells nothing. ``gain``: e-/ADU;
+    as a declared one may be wrong, it must agree with that of two flats on what is subtracted.
     """
     if source.black is not None:
         return source.black.subtracted, 0.0
@@ -32,11 +33,9 @@ def subtracted_rate(source: Ingested, gain: float) -> Measure:
         middle = np.median(frames, axis=0)
         usual = np.abs(middle - np.median(middle)) <= _HOT * max(np.std(frames[0] - middle), 1.0)
         levels += [(group.exptime, float(frame[usual].mean())) for frame in frames]
-        # A level that falls, as after flats, is no noise: of pairs, the usual one counts.
-        pairs = [
-            usual_variance((second - first) ** 2 / 2, 1)
-            for first, second in zip(frames[::2], frames[1::2], strict=False)
-        ]
+        # A level that changes from frame to frame is no noise of samples.
+        changes = [b - a for a, b in zip(frames[::2], frames[1::2], strict=False)]
+        pairs = [usual_variance((c - np.median(c)) ** 2 / 2, 1) for c in changes]
         if pairs:
             variance = float(np.median(pairs))
             error = variance * math.sqrt(2 / (len(pairs) * frames[0].size))
@@ -45,7 +44,22 @@ def subtracted_rate(source: Ingested, gain: float) -> Measure:
         return 0.0, 0.0
     times, means = np.array(levels).T
     of_series, variance, error = np.array(noise).T
-    return subtracted_dark((times, means), (of_series, variance, error), gain) or (0.0, 0.0)
+    found = [
+        subtracted_dark((times, means), (of_series, variance, error), one)
+        for one in (gain, *_of_flats(source))
+    ]
+    return found[0] if found[0] and all(found) else (0.0, 0.0)
+
+
+def _of_flats(source: Ingested) -> list[float]:
+    """Rough gain (e-/ADU) from two flats, if any tell it."""
+    if source.survey is None:
+        return []
+    groups = [group.frames for group in source.exposures.flat]
+    try:
+        return [rough_gain(source.arrays, source.survey.levels, groups)]
+    except InputError:
+        return []
 
 
 def subtracted_warnings(subtracted: Measure, gain: float) -> list[str]:
@@ -54,7 +68,7 @@ def subtracted_warnings(subtracted: Measure, gain: float) -> list[str]:
     if not value:
         return []
     return [
-        f"the noise of frames without light grows with exposure time as that of {value:.3g} ± "
-        f"{error:.2g} e-/s more dark current than their level shows: the camera subtracts it "
+        f"the noise of frames without light grows with exposure time as with {value:.3g} ± "
+        f"{error:.2g} e-/s of dark current that their level does not show: the camera subtracts it "
         "(black-level clamp, dark-current compensation). Its noise is allowed for"
     ]
