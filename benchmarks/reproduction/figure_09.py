@@ -197,7 +197,7 @@ def make(lab: Lab) -> Outcome:
         run=f"{len(lines)} fringe periods, {number(frames[-1])} frames of {side} × {side} px each, "
         "and the finest fringes again with laser noise. Other points use the first frames. The "
         "paper does not state its window, and simulates sums of frames above 10 000.",
-        caption="Left: errors against the truth without degenerate modes; dashed: Cramér–Rao "
+        caption="Left: errors relative to the truth, degenerate modes removed; dashed: Cramér–Rao "
         "bounds. Right: pixcal and the paper's iterations (five, without weights) on the same "
         "frames; hollow: with laser noise. From the paper's maps only piston and slopes are "
         "removed.",

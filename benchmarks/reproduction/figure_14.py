@@ -202,8 +202,8 @@ def make(lab: Lab) -> Outcome:
         "each direction with noise, crosstalk and a fringe vector that varies, "
         f"{number(counts[1])} with none of them{sized}.",
         caption="Above: the paper's iterations, all effects. Middle: exact fringes without noise, "
-        "fitted as straight ones (`--model paraxial`). Below: the same frames with `--model auto`, "
-        "same colours.",
+        "fitted as straight ones (`--model paraxial`). Below: the middle frames with "
+        "`--model auto`, same colour scale.",
         rows=(
             Row(
                 "crest of δx, straight model, peak to peak", f"{number(dx.crest.reach)} px", "crest"

@@ -351,7 +351,7 @@ def test_an_effect_of_the_users_own_is_asked_for(coupled, tmp_path):
     ).every
     assert glow.why == "its file has no method to correct it"
     diagnosed(again, glow.effect)
-    with pytest.raises(InputError, match=r"'glow' is an effect of your own; .* --own FILE"):
+    with pytest.raises(InputError, match=r"'glow' is not an effect of pixcal; .* --own FILE"):
         correct.run(again, correct.Config(), SYNC)
     spoilt = GLOW + "\n    def undo(self, maps):\n        return None\n"
     file.write_text(spoilt)

@@ -24,7 +24,7 @@ def test_repeats_are_as_if_never_recorded(tmp_path: Path, suffix: str) -> None:
     found = []
     for name, cubes in (("repeats", taken), ("less", less)):
         run, manifest = ingested(tmp_path / name, cubes, suffix)
-        named = [w for w in manifest.summary["warnings"] if "repeat another one" in w]
+        named = [w for w in manifest.summary["warnings"] if "identical to an earlier one" in w]
         assert len(named) == (len(KINDS) if name == "repeats" else 0)
         assert all("(3 of 9)" in sentence for sentence in named)
         source = Ingested(run / "ingest")

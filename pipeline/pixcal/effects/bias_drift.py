@@ -275,7 +275,7 @@ def _ramp(series: OffsetSeries) -> F64:
 
 
 def _rise(full: Components, less: Components) -> float:
-    """Gain in log-likelihood by further known shapes."""
+    """Rise in log-likelihood from further known shapes."""
     return max(full.profile - less.profile, 0.0)
 
 

@@ -42,7 +42,7 @@ ALIKE, ALIKE_SIGMAS = 0.1, 5.0
 
 @dataclass(frozen=True)
 class GhostWave(Scalable):
-    """One ghost as it is measured in the maps of a fringe set, with no assumption on its origin."""
+    """One ghost as measured in the maps of a fringe set, with no assumption about its origin."""
 
     strengths = ("static", "forward", "backward")
 

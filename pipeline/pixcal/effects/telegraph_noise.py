@@ -193,7 +193,7 @@ def _pixels(
     upper: float,
     measured: tuple[MeasuredPixels, ...],
 ) -> tuple[Indices, Indices, F32, F32, F32]:
-    """Jumping pixels of a block: rows, columns, amplitudes, dwell times, shares of time above."""
+    """Telegraph pixels of a block: rows, columns, amplitudes, dwell times, shares of time above."""
     rows = block * BLOCK_ROWS, min((block + 1) * BLOCK_ROWS, detector.shape[0])
 
     def draw(rng: np.random.Generator) -> F64:

@@ -114,8 +114,7 @@ def treatments(
     for _, name, _, _ in entries:
         if name not in known:
             raise InputError(
-                f"{where}: {name!r:.80} is an effect of your own; give its file again with "
-                "--own FILE"
+                f"{where}: {name!r:.80} is not an effect of pixcal; give its file with --own FILE"
             )
     effects = []
     for origin, name, parameters, errors in entries:

@@ -372,7 +372,7 @@ def flat_error(bench: Bench) -> float | None:
 
 
 def flats_needed(errors: WeightErrors, level: float, variance: float) -> int:
-    """Flats of a level (e-) needed for a cost below `NEGLIGIBLE` of the fringe frames.
+    """Flats at a level (e-) that add less than `NEGLIGIBLE` to the fringe frames.
 
     An error of the flat does not change the phase; it only affects weights from neighbours.
     """

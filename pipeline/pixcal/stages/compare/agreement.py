@@ -221,7 +221,7 @@ def strongest_period(difference: F64, sigma: F64) -> Period | None:
 def three_cornered_hat(
     pairs: Sequence[tuple[int, int]], excess: Sequence[VarianceEstimate]
 ) -> list[VarianceEstimate]:
-    """Individual errors of three or more maps, from the differences of all pairs."""
+    """Variance beyond noise of each of three or more maps, from all pairs."""
     # A difference's variance beyond noise (`Part.beyond_noise`) is the sum of those of its maps
     # (Gray and Allan 1974).
     values, errors = np.array(excess).T

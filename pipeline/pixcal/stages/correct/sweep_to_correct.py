@@ -216,7 +216,7 @@ class RestoredSet(ReducedSet):
         return {name: ArrayReader(self.calibration / name) for name in ("flat", "dark_rate")}
 
     def codes(self, tile: tuple[int, int], block: int, *, keep: bool = False) -> U16:
-        """Codes (t, y, x) of one block of frames of a tile, of `coding`."""
+        """Codes (t, y, x), in `coding`, of one block of frames in a tile."""
         if keep:
             self.signal.keep((block, *tile))
         part, halo = self.ranges(tile), self.halo

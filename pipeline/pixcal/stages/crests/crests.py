@@ -74,7 +74,7 @@ class CrestPaths:
         return (self.frame[0] - 1) / 2, (self.frame[1] - 1) / 2
 
     def take(self, use: NDArray[Any]) -> "CrestPaths":
-        """The points that a mask or a list of numbers chooses."""
+        """The points that a mask or indices select."""
         some = {n: getattr(self, n)[use] for n in ("x", "y", "k", "sigma", "slope")}
         return replace(self, **some)
 
@@ -190,7 +190,7 @@ def _wrapped(phase: F64) -> F64:
 
 
 def _window_phases(sums: F64, windows: Windows) -> tuple[F64, F64, F64]:
-    """Phases relative to the carrier, errors (infinite where not usable), light (across, along)."""
+    """Phases relative to the carrier, errors (infinite if unusable), light: (across, along)."""
     phase, sigma, light = (np.stack(part) for part in zip(*map(solve_windows, sums), strict=True))
     y, x = windows.centres
     inside = (y > -0.5) & (y < windows.frame[0] - 0.5) & (x > -0.5) & (x < windows.frame[1] - 0.5)

@@ -210,7 +210,7 @@ def _view(
 
 
 def _extract_at(source: ReducedSet, frame: int, paths: CrestPaths, k: int) -> Extract:
-    """A few fringes of the first frame about the middle of a path."""
+    """A few fringes of a frame, around the path point nearest its centre."""
     on = np.flatnonzero(paths.k == k)
     ry, rx = paths.reference
     near = on[np.argmin((paths.x[on] - rx) ** 2 + (paths.y[on] - ry) ** 2)]

@@ -100,7 +100,7 @@ class _Description:
 
     @cached_property
     def final(self) -> Shrinkage:
-        """The gap with all causes."""
+        """How much of the gap all causes close."""
         return self._with(self.found.final)
 
     def _with(self, trial: Trial) -> Shrinkage:

@@ -31,7 +31,7 @@ def repeats_of(facts: Mapping[str, F64]) -> list[int | None]:
 def repeat_warning(array: str, frames: Sequence[Frame], repeats: Sequence[int | None]) -> list[str]:
     """Warnings on the frames of an array, given the result of `repeats_of`."""
     found = [
-        f"{name_of(frames[n])} (as {name_of(frames[first])})"
+        f"{name_of(frames[n])} (same as {name_of(frames[first])})"
         for n, first in enumerate(repeats)
         if first is not None
     ]
@@ -39,7 +39,7 @@ def repeat_warning(array: str, frames: Sequence[Frame], repeats: Sequence[int | 
         return []
     more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
     return [
-        f"{array}: frames that repeat another one, sample by sample, are left out "
+        f"{array}: frames identical to an earlier one are left out "
         f"({len(found)} of {len(frames)}): {', '.join(found[:NAMED])}{more}; frames.json lists "
         "them (repeat_of)"
     ]

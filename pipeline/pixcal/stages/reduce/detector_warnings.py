@@ -83,7 +83,7 @@ def _gain_warnings(fit: GainFit, summary: Summary, used: float) -> list[str]:
         warnings.append(
             "parts of the flats vary in brightness from frame to frame, as rows of a rolling "
             "shutter do under a flickering lamp (mains, dimmed LED). This biases gain and "
-            "diagnosis; take flats with a steady (DC) lamp, or exposures of many periods"
+            "diagnosis; take flats with a steady (DC) lamp, or expose for many flicker periods"
         )
     if fit.curved:
         warnings.append(

@@ -151,7 +151,7 @@ def _time_fringes(found: Exposures, name: str, times: list[float | None]) -> Non
     found.fringes[name] = np.array([t or 0.0 for t in times], np.float32)
     if found.has_rate and unknown:
         found.warnings.append(
-            f"{name}: {unknown} of {len(times)} frames have no EXPTIME, their dark signal is taken "
+            f"{name}: {unknown} of {len(times)} frames have no EXPTIME: their dark signal is taken "
             "as zero"
         )
     if len(found.dark) == 1 and found.dark[0].array == "dark":

@@ -141,8 +141,8 @@ def rough_gain(arrays: Mapping[str, Reader], levels: F64, groups: Sequence[Seque
     photons, level = max(found, default=(0.0, 0.0))
     if not (photons > 0 and level > 0):
         raise InputError(
-            "detector.gain_e_per_adu: missing, and cannot be measured, because no two flats of one "
-            "level show photon noise; give it in e-/ADU"
+            "detector.gain_e_per_adu: missing, and not measurable, because no two flats at the "
+            "same level show photon noise; give it in e-/ADU"
         )
     return level / photons
 

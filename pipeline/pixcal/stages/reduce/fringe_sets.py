@@ -28,7 +28,7 @@ _CONVERTERS = (8, 10, 12, 14)
 
 @dataclass(frozen=True)
 class Bounds:
-    """Extremes over the good pixels."""
+    """Extreme flat, bias and dark rate of the good pixels; typical read noise."""
 
     flat: tuple[float, float]  # least and largest relative response
     bias: float  # bias, dark_rate: largest (ADU; e-/s)
