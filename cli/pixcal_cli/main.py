@@ -133,8 +133,8 @@ def invoke(args: Sequence[str]) -> int:
         code = _run(args)
         sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as raised:
-        # Libraries that are interrupted while they load raise various errors.
-        by_it = isinstance(raised, ImportError) or isinstance(raised.__cause__, KeyboardInterrupt)
+        # Libraries that are interrupted, most of all while they load, raise various errors.
+        by_it = not isinstance(raised, PixcalError | click.ClickException)
         error = KeyboardInterrupt() if by_it and _interrupted.is_set() else raised
         if os.environ.get("PIXCAL_DEBUG"):
             traceback.print_exc()

@@ -222,12 +222,12 @@ def test_an_error_inside_a_stage_is_one_line(
         assert name in err
 
 
+@pytest.mark.parametrize("said_of_it", ["Error calling __set_name__", "release unlocked lock"])
 def test_an_interruption_is_one_whatever_a_library_makes_of_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], said_of_it: str
 ) -> None:
-    """As Python 3.11 does with one that comes while a class is made."""
-    error = RuntimeError("Error calling __set_name__")
-    error.__cause__ = KeyboardInterrupt()
+    """As Python 3.11 does with one that comes while a class is made, or a lock is taken."""
+    error = RuntimeError(said_of_it)
     replace_body(monkeypatch, "reduce", error)
     for asked, said in ((False, "internal error"), (True, "interrupted; ")):
         if asked:
