@@ -230,7 +230,8 @@ def _check(acq: Path, run: Path) -> None:
     """Hold the ingested frames against what astropy reads."""
     from pixcal.stages.reduce.ingested import Ingested
 
-    reader = Ingested(run / "ingest").arrays["bias"]
+    source = Ingested(run / "ingest")
+    reader, used = source.arrays["bias"], source.tables["bias"]
     table = json.loads((run / "ingest" / "frames.json").read_text())["bias"]
     for column in ("mjd", "exptime_s", "temperature_c", "time_s"):
         if not all(v is None or np.isfinite(v) for v in table[column]):
@@ -238,7 +239,8 @@ def _check(acq: Path, run: Path) -> None:
     if np.any(np.diff(table["time_s"]) < 0) and not _warned(run):
         raise Broken("frames are not in the order of time")
     frames = reader.read()
-    for frame, name, plane in zip(frames, table["file"], table["plane"], strict=True):
+    # Without frames that repeat another one, as those of an equal file beside it.
+    for frame, name, plane in zip(frames, used["file"], used["plane"], strict=True):
         theirs = _astropy(acq / name)
         if theirs is None:
             continue  # astropy gives up on some headers that are clear enough
