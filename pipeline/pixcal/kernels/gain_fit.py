@@ -27,8 +27,8 @@ from pixcal.model.arrays import F64
 LADDER = 4  # groups of flats from which the curve may be curved
 
 _TERMS = 4  # terms of curvature
-_CHANCE_APART = 1e-4  # of frames without light whose noise is not on the curve
-_WIDTHS = 6  # of what is then known of the noise at level zero
+_CHANCE_APART = 1e-4  # prior probability that noise without light is not on the curve
+_WIDTHS = 6  # prior errors of the noise at level zero that are tried then
 _STRAIGHT = 1e-6  # size of terms that is effectively zero
 _SIZES = np.concatenate([[_STRAIGHT], np.geomspace(1e-3, 1.0, 13)])
 _CHANCES = np.concatenate([[0.5], np.full(13, 0.5 / 13)])

@@ -234,7 +234,7 @@ def _departure(entry: Json) -> str:
     return f"{entry['title']}, {entry['place']}: {measured} {its_unit} (simulated: {simulated})"
 
 
-# mean of a series over its rms from which it is told: below it is the scatter of few frames
+# least mean of a series, over the rms about it, that is reported: smaller ones are its scatter
 _LEVEL = 1.0
 
 

@@ -12,6 +12,8 @@ from pixcal.storage.frame_file import FrameFile
 from pixcal.storage.sources import HEADERS, SourceFile
 from pixcal.storage.tiff_png import inspect_picture, is_picture
 
+_NAMED = 3  # frames that a warning names
+
 
 def inspect(source: SourceFile) -> FrameFile:
     """Read the description of a file's frames, and check it against the file's length."""
@@ -42,6 +44,17 @@ class Frame:
     time_s: float  # seconds since the array's first frame (its number where no time is known)
     # `header`; `frame_period_s` or `exptime_s`: added up from there; `number`
     time_source: TimeSource
+
+    @property
+    def name(self) -> str:
+        """Its file, with its plane in a cube."""
+        return f"{self.file.source.name}{f' [{self.plane}]' * (self.file.shape[0] > 1)}"
+
+
+def first_few(names: Sequence[str]) -> str:
+    """The first names of some frames, and how many more there are."""
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more
 
 
 def natural_key(name: str) -> tuple[list[tuple[int, str]], str]:

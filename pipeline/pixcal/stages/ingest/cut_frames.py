@@ -6,9 +6,8 @@ import numpy as np
 
 from pixcal.model.arrays import F64
 from pixcal.storage.frame_decoding import BAND
-from pixcal.storage.frames import Frame
+from pixcal.storage.frames import Frame, first_few
 
-NAMED = 3  # frames that a warning names
 _FULL = 0.98  # least share of a flat's largest sample in a saturated row
 
 
@@ -55,19 +54,13 @@ def cut_warning(
 ) -> list[str]:
     """Warnings on the frames of an array, given the arguments and result of `cut_from`."""
     found = [
-        f"{name_of(frame)} (all samples {value:g} from row {row} on)"
+        f"{frame.name} (all samples {value:g} from row {row} on)"
         for frame, row, value in zip(frames, first, facts["last"][:, -1], strict=True)
         if row is not None
     ]
     if not found:
         return []
-    more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
     return [
         f"{array}: incomplete frames are left out ({len(found)} of {len(frames)}): "
-        f"{', '.join(found[:NAMED])}{more}; frames.json lists them (cut_from_row)"
+        f"{first_few(found)}; frames.json lists them (cut_from_row)"
     ]
-
-
-def name_of(frame: Frame) -> str:
-    """File of a frame, with its plane in a cube."""
-    return f"{frame.file.source.name}{f' [{frame.plane}]' * (frame.file.shape[0] > 1)}"

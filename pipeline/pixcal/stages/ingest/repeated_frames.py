@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pixcal.model.arrays import F64
-from pixcal.stages.ingest.cut_frames import NAMED, name_of
-from pixcal.storage.frames import Frame
+from pixcal.storage.frames import Frame, first_few
 
 _ONE_VALUE = 0.5  # share of a row with one value from which its noise is not seen
 
@@ -31,15 +30,14 @@ def repeats_of(facts: Mapping[str, F64]) -> list[int | None]:
 def repeat_warning(array: str, frames: Sequence[Frame], repeats: Sequence[int | None]) -> list[str]:
     """Warnings on the frames of an array, given the result of `repeats_of`."""
     found = [
-        f"{name_of(frames[n])} (same as {name_of(frames[first])})"
+        f"{frames[n].name} (same as {frames[first].name})"
         for n, first in enumerate(repeats)
         if first is not None
     ]
     if not found:
         return []
-    more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
     return [
         f"{array}: frames identical to an earlier one are left out "
-        f"({len(found)} of {len(frames)}): {', '.join(found[:NAMED])}{more}; frames.json lists "
+        f"({len(found)} of {len(frames)}): {first_few(found)}; frames.json lists "
         "them (repeat_of)"
     ]

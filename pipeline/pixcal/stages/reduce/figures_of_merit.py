@@ -256,18 +256,18 @@ def _dark_current(
     if error is not None and slope is not None and source.cut_off:
         corrected = rates[rows][good[rows]].mean(dtype=float)
         error = math.hypot(error, _OF_CORRECTION * (corrected - gain * slope[0]))
-    note, (subtracted, off) = _temperature(source.tables), job.subtracted
+    note, rate = _temperature(source.tables), float(rates[good].mean(dtype=float))
+    subtracted, off = job.subtracted
     if subtracted:
-        error = gain * math.hypot(off, slope[1] if slope else 0.0)
+        # A variance in electrons goes with the square of the gain; that was found by a rough one.
+        better = gain / job.gain
+        rate = better * (rate + gain * subtracted)
+        of_gain = (found["conversion_gain"]["error"] or 0.0) / gain
+        error = math.hypot(better * gain * off, rate * of_gain)
         note = f"by the noise of dark frames: the camera subtracts it from their level; {note}"
     timed = any(source.tables["dark"]["exptime_s"])
     unit = "e-/s" if timed else "e-/exposure"
-    found["dark_current"] = _figure(
-        "dark current",
-        unit,
-        (float(rates[good].mean(dtype=float)) + gain * subtracted, error),
-        note,
-    )
+    found["dark_current"] = _figure("dark current", unit, (rate, error), note)
 
 
 def _dark_means(source: Ingested, middle: Window, good: Mask) -> tuple[F64, F64]:

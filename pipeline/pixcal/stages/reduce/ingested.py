@@ -22,11 +22,11 @@ from pixcal.stages.reduce.flat_survey import (
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.frame_reader import ChosenFrames, FrameReader, Reader
+from pixcal.storage.frames import first_few
 from pixcal.storage.manifest import read_json, read_manifest
 from pixcal.storage.place import Local, Place
 from pixcal.storage.stage import read_acquisition
 
-_NAMED = 3  # frames that a warning names
 MOST_ADU = 2.0**32  # above any converter's range: larger real numbers are not samples
 
 
@@ -134,12 +134,11 @@ class Ingested:
         if not unlit:
             return []
         table = self._catalogue["flat"]
-        names = [table["file"][n] for n in unlit[:_NAMED]] if "file" in table else []
-        more = [f"{len(unlit) - len(names)} more"] if len(unlit) > len(names) else []
+        cubes = any(table["plane"])
+        names = [table["file"][n] + f" [{table['plane'][n]}]" * cubes for n in unlit]
         return [
             f"flat frames without light are left out ({len(unlit)} of {len(self._whole['flat'])}): "
-            f"{', '.join(names + more)}; list them under frames.dark or frames.bias if they are "
-            "to be used"
+            f"{first_few(names)}; list them under frames.dark or frames.bias if they are to be used"
         ]
 
     @cached_property

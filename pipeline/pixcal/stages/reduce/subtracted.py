@@ -7,12 +7,15 @@ import numpy as np
 from pixcal.estimators.detector.calibration import usual_variance
 from pixcal.estimators.detector.emva import Measure
 from pixcal.estimators.detector.subtracted_dark import subtracted_dark
+from pixcal.kernels.robust import median_and_sigma
+from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
+from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.flat_survey import middle_rows, rough_gain
 from pixcal.stages.reduce.ingested import Ingested
 
 _FRAMES = 16  # of each exposure time
-_HOT = 5.0  # errors of a sample from the median beyond which a pixel is not a usual one
+_HOT = 5.0  # standard deviations from the median beyond which a pixel is hot
 
 
 def subtracted_rate(source: Ingested, gain: float) -> Measure:
@@ -25,30 +28,46 @@ def subtracted_rate(source: Ingested, gain: float) -> Measure:
         return source.black.subtracted, 0.0
     if source.cut_off or not source.exposures.has_rate:
         return 0.0, 0.0
-    levels, noise = [], []
+    times, levels, noise = [], [], []
     for group in source.exposures.dark:
-        reader = source.arrays[group.array]
-        numbers = group.frames[:_FRAMES]
-        frames = np.concatenate([middle_rows(reader, n, n + 1) for n in numbers]).astype(float)
-        middle = np.median(frames, axis=0)
-        usual = np.abs(middle - np.median(middle)) <= _HOT * max(np.std(frames[0] - middle), 1.0)
-        levels += [(group.exptime, float(frame[usual].mean())) for frame in frames]
-        # A level that changes from frame to frame is no noise of samples.
-        changes = [b - a for a, b in zip(frames[::2], frames[1::2], strict=False)]
-        pairs = [usual_variance((c - np.median(c)) ** 2 / 2, 1) for c in changes]
-        if pairs:
-            variance = float(np.median(pairs))
-            error = variance * math.sqrt(2 / (len(pairs) * frames[0].size))
-            noise.append((group.exptime, variance, error))
+        means, variances, samples = _of_pairs(source, group)
+        times += [group.exptime] * len(means)
+        levels += means
+        if variances:
+            variance = float(np.median(variances))
+            noise.append((group.exptime, variance, variance * math.sqrt(2 / samples)))
     if len(noise) < 2:
         return 0.0, 0.0
-    times, means = np.array(levels).T
     of_series, variance, error = np.array(noise).T
     found = [
-        subtracted_dark((times, means), (of_series, variance, error), one)
+        subtracted_dark((np.array(times), np.array(levels)), (of_series, variance, error), one)
         for one in (gain, *_of_flats(source))
     ]
     return found[0] if found[0] and all(found) else (0.0, 0.0)
+
+
+def _of_pairs(source: Ingested, group: Group) -> tuple[list[float], list[float], int]:
+    """Mean of each frame without hot pixels, variance of each pair of frames, number of samples."""
+    reader, numbers = source.arrays[group.array], group.frames[:_FRAMES]
+    means: list[float] = []
+    variances: list[float] = []
+    samples = 0
+    for first in range(0, len(numbers), 2):
+        pair = [middle_rows(reader, n, n + 1).ravel() for n in numbers[first : first + 2]]
+        frames: F64 = np.stack(pair).astype(float)
+        frames = frames[:, np.isfinite(frames).all(axis=0)]
+        if not frames.size:
+            continue
+        for frame in frames:
+            middle, sigma = median_and_sigma(frame)
+            near = np.abs(frame - middle) <= _HOT * max(sigma, source.quantum or 1.0)
+            means.append(float(frame[near].mean()))
+        if len(frames) == 2:
+            # A level that changes from frame to frame is no noise of samples.
+            change = frames[1] - frames[0]
+            variances.append(usual_variance((change - np.median(change)) ** 2 / 2, 1))
+            samples += change.size
+    return means, variances, samples
 
 
 def _of_flats(source: Ingested) -> list[float]:
