@@ -1,5 +1,7 @@
 """Sums of the products of neighbours, against NumPy, whatever is summed together."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -42,8 +44,8 @@ def steady(frames: int, seed: int) -> Residuals:
 def test_frames_of_one_charge_give_the_sums_of_any_frames() -> None:
     parts, links = [steady(20, 1), steady(2, 2), steady(35, 3)], np.array(LINKS)
     usual, quick = ([np.zeros((3, n, 7, 21), np.float32) for n in (5, 14)] for _ in range(2))
-    covariance._add_changing(parts, links, *usual)
-    covariance._add_steady(parts, links, *quick)
+    covariance._add([replace(part, steady=False) for part in parts], links, *usual)
+    covariance._add(parts, links, *quick)
     for one, other in zip(usual, quick, strict=True):
         np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-5 * np.abs(one).max())
 

@@ -1,4 +1,4 @@
-"""Sums over all samples (t, y, x) of some frames, each in one sweep and without copies of them."""
+"""Sums over all samples (t, y, x) of some frames."""
 
 from typing import Any
 
@@ -91,20 +91,10 @@ def _count(rest: float, variance: float, limits: F64, beyond: F64) -> None:
 
 def count_beyond(rest: F32, variance: F32, good: Mask, limits: F64) -> F64:
     """How many residuals of good pixels are below and above (2, n) ascending limits, in sigmas."""
-    beyond = np.zeros((2, len(limits)))
-    _count_beyond(rest, variance, good, limits, beyond)
-    return beyond
-
-
-@kernel()
-def _count_beyond(rest: F32, variance: F32, good: Mask, limits: F64, beyond: F64) -> None:
-    least = np.float32(limits[0] ** 2)
-    for t in range(rest.shape[0]):
-        for y in range(rest.shape[1]):
-            for x in range(rest.shape[2]):
-                one = rest[t, y, x]
-                if one * one > least * variance[t, y, x] and good[y, x]:
-                    _count(one, variance[t, y, x], limits, beyond)
+    far = good & (rest * rest > np.float32(limits[0] ** 2) * variance)
+    some = rest[far]
+    beyond = (some * some)[:, None] > limits**2 * variance[far][:, None]
+    return np.stack([beyond[some < 0].sum(axis=0), beyond[some > 0].sum(axis=0)]).astype(float)
 
 
 @kernel()
@@ -129,51 +119,25 @@ def level_sums(
 
 def count_remainders(codes: Any, good: Mask, divisor: int) -> Indices:
     """How often whole numbers (t, y, x) of good pixels have each remainder on division by 2ⁿ."""
-    count = np.zeros(divisor, np.int64)
-    _count_remainders(codes, good, divisor, count)
-    return count
-
-
-@kernel()
-def _count_remainders(codes: Any, good: Mask, divisor: int, count: Indices) -> None:
-    for t in range(codes.shape[0]):
-        for y in range(codes.shape[1]):
-            for x in range(codes.shape[2]):
-                count[codes[t, y, x] & (divisor - 1)] += good[y, x]
+    # Frame by frame: NumPy counts in a copy of 64 bits.
+    counts = (np.bincount(frame[good] & (divisor - 1), minlength=divisor) for frame in codes)
+    return np.sum(list(counts), axis=0)
 
 
 def pixel_moments(values: F32) -> tuple[F64, F64]:
     """Mean square and mean fourth power (y, x) of the samples (t, y, x) of each pixel."""
     second, fourth = np.zeros((2, *values.shape[1:]))
-    _add_powers(values, second, fourth)
+    for frame in values:
+        square = frame.astype(float) ** 2
+        second += square
+        fourth += square * square
     return second / len(values), fourth / len(values)
-
-
-@kernel()
-def _add_powers(values: F32, second: F64, fourth: F64) -> None:
-    for t in range(values.shape[0]):
-        for y in range(values.shape[1]):
-            for x in range(values.shape[2]):
-                square = np.float64(values[t, y, x]) ** 2
-                second[y, x] += square
-                fourth[y, x] += square * square
 
 
 def frame_means(values: Any, good: Mask) -> F64:
     """Mean (t,) over the good pixels of each frame (t, y, x); what others hold may be NaN."""
-    sums = np.empty(len(values))
-    _sum_frames(values, good, sums)
+    sums: F64 = np.sum(values, axis=(1, 2), dtype=float, where=good)
     return sums / max(int(np.count_nonzero(good)), 1)
-
-
-@kernel(fastmath=_FAST)
-def _sum_frames(values: Any, good: Mask, sums: F64) -> None:
-    for t in range(values.shape[0]):
-        total = 0.0
-        for y in range(values.shape[1]):
-            for x in range(values.shape[2]):
-                total += np.float64(values[t, y, x]) if good[y, x] else 0.0
-        sums[t] = total
 
 
 def neighbour_products(values: F32, pairs: F32, steps: Indices, every: int = 1) -> F64:

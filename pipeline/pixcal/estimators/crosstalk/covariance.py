@@ -39,7 +39,6 @@ NORMAL = {(0, 0): 0, (0, 1): 1, (1, 1): 2, (0, 2): 3, (1, 2): 4, (2, 2): 5, (0, 
           (1, 3): 7, (3, 3): 8, (2, 3): 1, (0, 4): 9, (1, 4): 10, (2, 4): 11, (3, 4): 12,
           (4, 4): 13}  # fmt: skip
 NORMALS = 14
-_STEADY_COLUMNS = 256  # columns processed at a time
 
 
 @dataclass(frozen=True)
@@ -72,8 +71,7 @@ def products(
             brightest = max(brightest, part.brightness)
             own, own_right = _variance(part)
             line, line_right = line + own, line_right + own_right
-        add = _add_steady if parts[0].steady else _add_changing
-        add(parts, steps, right, normal)
+        _add(parts, steps, right, normal)
         # Freed before the next ones, as they are large.
         del parts, part
     if brightest < min(MIN_CHARGE, ABOVE_READ * evidence.read_noise**2 / UNIT):
@@ -85,12 +83,22 @@ def products(
     return Products(right, normal, shot, error, curved / shot, curved_error / shot, read)
 
 
-def _add_changing(parts: Sequence[Residuals], steps: Indices, right: F32, normal: F32) -> None:
+def _add(parts: Sequence[Residuals], steps: Indices, right: F32, normal: F32) -> None:
     noise = [frames for p in parts for frames in ((p.e, p.charge, p.one), p.taken)]
     for piece in _pieces(noise):
         _add_right_sums(*_powers(piece, 2), steps, right)
-    for piece in _pieces([(p.one, p.charge, p.one) for p in parts]):
+    for piece in _pieces([_weights(p) for p in parts]):
         _add_normal_sums(*_powers(piece, 4), steps, normal)
+
+
+def _weights(part: Residuals) -> Frames:
+    """Frames whose products are the normal sums; one stands for all with the same charge."""
+    if not part.steady:
+        return part.one, part.charge, part.one
+    one = part.one.max(axis=0, keepdims=True)
+    # Both pixels of a pair count in a share of the frames; in all if neither is ever clipped.
+    weight = (part.one**2).sum(axis=0, keepdims=True) / np.float32(np.sqrt(len(part.one)))
+    return weight / np.maximum(one, TINY), part.charge.max(axis=0, keepdims=True), one
 
 
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
@@ -103,7 +111,7 @@ def _gathered(parts: Iterable[Residuals]) -> Iterator[list[Residuals]]:
     some: list[Residuals] = []
     for part in parts:
         joined = [*some, part]
-        if some and (sum(len(p.e) for p in joined) > _LONG or part.steady != some[0].steady):
+        if some and sum(len(p.e) for p in joined) > _LONG:
             yield some
             some = []
         some.append(part)
@@ -232,101 +240,3 @@ def _variance(part: Residuals) -> tuple[F64, F64]:
     removed_variance = (part.modes**2).sum(axis=0).ravel()
     right = terms @ (part.e**2).ravel() + some @ removed_variance
     return (terms @ terms.T).astype(float), right.astype(float)
-
-
-# Frames with the same charge in every frame: one sum over them gives all terms
-
-
-@dataclass(frozen=True)
-class _Level:
-    """One sequence of frames and the modes that were removed from it."""
-
-    e: F32  # (t, y, x) residuals over their variance
-    charge: F32  # (y, x) 10⁴ e-
-    weight: F32  # (y, x); the product of two pixels' values is the sum of the frames' weights
-
-    @classmethod
-    def of(cls, part: Residuals) -> "_Level":
-        one = part.one.max(axis=0)
-        at_one = np.divide(part.charge.max(axis=0), one, out=np.zeros_like(one), where=one > 0)
-        # Both pixels of a pair count in a share of the frames; in all if neither is ever clipped.
-        weight = (part.one**2).sum(axis=0) / np.float32(np.sqrt(len(part.one)))
-        modes, _, of_modes = part.taken
-        return cls(np.concatenate([part.e * part.one, modes * of_modes]), at_one, weight)
-
-
-def _add_steady(parts: Sequence[Residuals], links: Indices, right: F32, normal: F32) -> None:
-    """Add to the sums ``right`` and ``normal`` of `Products` for links (n, 2)."""
-    levels = [_Level.of(part) for part in parts]
-    _add(
-        np.concatenate([level.e for level in levels]),
-        np.cumsum([0, *(len(level.e) for level in levels)]),
-        np.stack([level.charge for level in levels]),
-        np.stack([level.weight for level in levels]),
-        links, right, normal,
-    )  # fmt: skip
-
-
-@kernel(fastmath=_FAST)
-def _add(
-    e: F32, ends: Indices, charge: F32, weight: F32, links: Any, right: F32, normal: F32
-) -> None:
-    """Frames (t, y, x) of level n are those from ``ends[n]`` to ``ends[n + 1]``."""
-    _, ny, nx = e.shape
-    terms = right.shape[1]
-    sums = np.empty((terms + normal.shape[1], _STEADY_COLUMNS), np.float32)
-    products = np.empty(_STEADY_COLUMNS, np.float32)
-    for n in range(len(links)):
-        dy, dx = links[n, 0], links[n, 1]
-        for y in range(ny - dy):
-            for first in range(max(-dx, 0), nx - max(dx, 0), _STEADY_COLUMNS):
-                last = min(first + _STEADY_COLUMNS, nx - max(dx, 0))
-                v, left, end = y + dy, first + dx, last + dx
-                # Loops: assigning the slices takes longer to compile.
-                for i in range(len(sums)):
-                    for x in range(last - first):
-                        sums[i, x] = 0
-                for level in range(len(charge)):
-                    for x in range(last - first):
-                        products[x] = 0
-                    for t in range(ends[level], ends[level + 1]):
-                        here, there = e[t, y, first:last], e[t, v, left:end]
-                        for x in range(len(here)):
-                            products[x] += here[x] * there[x]
-                    own, partner = charge[level, y, first:last], charge[level, v, left:end]
-                    of_own, of_partner = weight[level, y, first:last], weight[level, v, left:end]
-                    _add_terms(products, own, partner, of_own, of_partner, sums)
-                for i in range(len(sums)):
-                    out = right[n, i, y] if i < terms else normal[n, i - terms, y]
-                    for x in range(last - first):
-                        out[first + x] += sums[i, x]
-
-
-@inner(fastmath=_FAST)
-def _add_terms(
-    products: F32, own: F32, partner: F32, of_own: F32, of_partner: F32, sums: F32
-) -> None:
-    """Add a row's products of one level with each term, and the terms' with each other."""
-    for x in range(len(own)):
-        d, other, s, w = own[x], partner[x], products[x], of_own[x] * of_partner[x]
-        both, squares = d * other, d * d + other * other
-        sums[0, x] += s * d
-        sums[1, x] += s * other
-        sums[2, x] += s
-        sums[3, x] += s * both
-        sums[4, x] += s * squares
-        # In the order of `NORMAL`.
-        sums[5, x] += w * d * d
-        sums[6, x] += w * both
-        sums[7, x] += w * other * other
-        sums[8, x] += w * d
-        sums[9, x] += w * other
-        sums[10, x] += w
-        sums[11, x] += w * d * both
-        sums[12, x] += w * other * both
-        sums[13, x] += w * both * both
-        sums[14, x] += w * d * squares
-        sums[15, x] += w * other * squares
-        sums[16, x] += w * squares
-        sums[17, x] += w * both * squares
-        sums[18, x] += w * squares * squares
