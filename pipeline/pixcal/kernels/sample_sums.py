@@ -121,7 +121,7 @@ def count_remainders(codes: Any, good: Mask, divisor: int) -> Indices:
     """How often whole numbers (t, y, x) of good pixels have each remainder on division by 2ⁿ."""
     # Frame by frame: NumPy counts in a copy of 64 bits.
     counts = (np.bincount(frame[good] & (divisor - 1), minlength=divisor) for frame in codes)
-    return np.sum(list(counts), axis=0)
+    return np.asarray(np.sum(list(counts), axis=0))
 
 
 def pixel_moments(values: F32) -> tuple[F64, F64]:

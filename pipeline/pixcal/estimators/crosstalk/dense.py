@@ -20,6 +20,7 @@ from pixcal.estimators.crosstalk.links import PixelClasses, Place, links
 from pixcal.estimators.crosstalk.pattern import pattern_information
 from pixcal.estimators.crosstalk.support import coupling_of
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.fringe_fit.combine import weighted_mean
 from pixcal.kernels.crosstalk import Coupling, outflow
 from pixcal.model.arrays import F64, Indices
 
@@ -95,10 +96,9 @@ class CouplingFrames:
         for _ in range(ROUNDS):
             now = [replace(c, share=float(k)) for c, k in zip(every, shares, strict=True)]
             measured = self.measured(now, per_ke)
-            information = measured.of_period(classes)
             methods = {
-                method: (block_diag(*normal), information.right[method].ravel())
-                for method, normal in information.normal.items()
+                method: (block_diag(*normal), right.ravel())
+                for method, (normal, right) in measured.of_period(classes).items()
             }
             if measured.products is not None:
                 methods["covariance"] = _any_gain(methods["covariance"], measured.products, shares)
@@ -169,24 +169,18 @@ def _sum(found: Sequence[Products | None]) -> Products | None:
     some = [one for one in found if one is not None]
     if len(some) < 2:
         return some[0] if some else None
-    shot, shot_error = _mean([(one.shot, one.shot_error) for one in some])
-    curve, curve_error = _mean([(one.curve, one.curve_error) for one in some])
+    shots = np.array([(one.shot, one.curve) for one in some])
+    errors = np.array([(one.shot_error, one.curve_error) for one in some])
+    (shot, curve), (shot_error, curve_error), _ = weighted_mean(shots, errors)
     return replace(
         some[0],
         right=np.sum([one.right for one in some], axis=0),
         normal=np.sum([one.normal for one in some], axis=0),
-        shot=shot,
-        shot_error=shot_error,
-        curve=curve,
-        curve_error=curve_error,
+        shot=float(shot),
+        shot_error=float(shot_error),
+        curve=float(curve),
+        curve_error=float(curve_error),
     )
-
-
-def _mean(found: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Weighted mean of values, and its error."""
-    values, errors = np.array(found).T
-    weight = errors**-2
-    return float(weight @ values / weight.sum()), float(weight.sum() ** -0.5)
 
 
 def _shares_of(every: Sequence[Coupling], known: Sequence[Coupling]) -> F64:

@@ -29,27 +29,16 @@ BACKED = 2.5  # sigmas of the share from noise that confirm a single hot pixel
 _ONE_LAW = (0, 1, 2, 4)  # `TERMS` without brighter-fatter's own
 
 
-@dataclass(frozen=True)
-class Information:
-    """Least-squares sums of shares, by method of measurement."""
+# Least-squares sums of shares, by method of measurement: normal (link, u, u) and right (link, u).
+# Unknown `2 c` is the share that pixels of class c give over the link, `2 c + 1` the share that
+# their partners give back.
+Information = dict[str, tuple[F64, F64]]
 
-    # normal, right: (..., u, u), (..., u): unknown `2 c` is the share that pixels of class c give
-    # over the link, `2 c + 1` the share that their partners give back. With a leading axis for
-    # many links
-    normal: dict[str, F64]
-    right: dict[str, F64]
 
-    def of(self, link: int) -> "Information":
-        """That of one link, where arrays hold many."""
-        return Information(
-            {method: m[link] for method, m in self.normal.items()},
-            {method: r[link] for method, r in self.right.items()},
-        )
-
-    @property
-    def total(self) -> tuple[F64, F64]:
-        """Sum over all methods."""
-        return np.sum([*self.normal.values()], axis=0), np.sum([*self.right.values()], axis=0)
+def total(information: Information) -> tuple[F64, F64]:
+    """Sums over all methods."""
+    normal, right = zip(*information.values(), strict=True)
+    return np.sum(normal, axis=0), np.sum(right, axis=0)
 
 
 @dataclass(frozen=True)
@@ -94,29 +83,27 @@ class MeasuredLinks:
         """All links for each period; single hot pixels are taken with `DOUBT`."""
         every = (class_sums(sums, self.first) for sums in self._sums)
         for (classes, products), (_, terms) in zip(*every, strict=True):
-            normal, right = self._of_noise(products, terms)
+            found = self._of_noise(products, terms)
             if self.hot is not None:
-                shown = self.hot.by_class(classes, self.links, DOUBT)
-                normal["hot pixels"], right["hot pixels"] = shown.sums()
-            yield classes, Information(normal, right)
+                found["hot pixels"] = self.hot.by_class(classes, self.links, DOUBT).sums()
+            yield classes, found
 
     def of_period(self, classes: PixelClasses) -> Information:
         """All links for one period, without `DOUBT` for hot pixels that agree."""
         # A single hot pixel of a class counts where the noise confirms it.
-        normal, right = self._of_noise(*(sums_of(sums, classes) for sums in self._sums))
+        found = self._of_noise(*(sums_of(sums, classes) for sums in self._sums))
         if self.hot is not None:
             shown = self.hot.by_class(classes, self.links)
             alone = (shown.count == 1) & (shown.value**2 * shown.weight > MARKED**2)
-            if "covariance" in normal:
-                alone &= ~_backed(shown.value, normal["covariance"], right["covariance"])
-            normal["hot pixels"], right["hot pixels"] = shown.without(alone).sums()
-        return Information(normal, right)
+            if "covariance" in found:
+                alone &= ~_backed(shown.value, *found["covariance"])
+            found["hot pixels"] = shown.without(alone).sums()
+        return found
 
-    def _of_noise(self, products: F64, terms: F64) -> tuple[dict[str, F64], dict[str, F64]]:
+    def _of_noise(self, products: F64, terms: F64) -> Information:
         if self.products is None:
-            return {}, {}
-        normal, right = _shares(products, terms, self.products.read)
-        return {"covariance": normal}, {"covariance": right}
+            return {}
+        return {"covariance": _shares(products, terms, self.products.read)}
 
 
 def _backed(value: F64, normal: F64, right: F64) -> Mask:

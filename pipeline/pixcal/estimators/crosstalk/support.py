@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr, ndtri, ndtri_exp
 
-from pixcal.estimators.crosstalk.information import MeasuredLinks
+from pixcal.estimators.crosstalk.information import MeasuredLinks, total
 from pixcal.estimators.crosstalk.links import PixelClasses, Place, periods
 from pixcal.kernels.crosstalk import Coupling
 from pixcal.model.arrays import F64
@@ -79,14 +79,15 @@ def choose(measured: MeasuredLinks, pattern: Callable[[PixelClasses], float]) ->
     """
     tests = len(measured.links) * sum(3 * n * m for n, m in periods(measured.shape))
     critical = _critical(tests)
-    totals = [i.total for _, i in measured.every_period()]
-    gains = np.stack([_best_gains(*total) for total in totals])
+    totals = [total(information) for _, information in measured.every_period()]
+    gains = np.stack([_best_gains(*sums) for sums in totals])
     best = gains.max(axis=0)
     close = [n for n, step in enumerate(measured.links) if max(map(abs, step)) == 1]
     nearest = [n for n in close if measured.links[n] in NEAREST]
     # Each link there, back and both; and the nearest ones as one number.
     few = 3 * len(close) + 1
-    alike = _gain_alike(*(part[nearest] for part in totals[0]))
+    weight, value = (part[nearest].sum() for part in totals[0])
+    alike = float(_fall(value, weight))
     taken = best > critical
     taken[close] |= gains[0, close] > _critical(few)
     taken[nearest] |= alike > _critical(few)
@@ -117,8 +118,8 @@ def _period(
     for classes, information in present.every_period():
         directions = _directions(classes)
         score = pattern(classes) - WORTH * (classes.count - 1)
-        for n in range(len(present.links)):
-            basis, gain = _greedy(*information.of(n).total, directions)
+        for normal, right in zip(*total(information), strict=True):
+            basis, gain = _greedy(normal, right, directions)
             score += gain - WORTH * basis.shape[1]
         scores.append((score, classes))
     enough = max(score for score, _ in scores) - critical
@@ -144,11 +145,6 @@ def _best_gains(normal: F64, right: F64) -> F64:
     weight = np.concatenate([own[..., ::2] + own[..., 1::2] + 2 * mixed, own], axis=-1)
     value = np.concatenate([right[..., ::2] + right[..., 1::2], right], axis=-1)
     return np.asarray(_fall(value, weight).max(axis=-1))
-
-
-def _gain_alike(normal: F64, right: F64) -> float:
-    """Fall in chi-square where all shares (link, u) of all links are one number."""
-    return float(_fall(right.sum(), normal.sum()))
 
 
 def _fall(value: F64, weight: F64) -> F64:

@@ -39,7 +39,6 @@ _CLIP = 6.0
 _ITERATIONS = 4
 _SMOOTH = 3  # degree of the patterns of beams and lamp in the maps
 LIGHT = "the mean light"
-STATIC, FORWARD, BACKWARD = slice(0, 2), slice(2, 4), slice(4, 6)
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class WaveFit:
     forward: complex
     backward: complex
     # (5,) float: of s, f, b (of the real and of the imaginary part), then of q
-    errors: tuple[float, float, float, float, float]
+    errors: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -187,7 +186,7 @@ def _less(maps: Maps, waves: Sequence[WaveFit]) -> Maps:
     """Maps minus given waves."""
     remaining = dict(maps)
     for w in waves:
-        six = [p for v in (w.static, w.forward, w.backward) for p in (v.real, v.imag)]
+        six = np.array([w.static, w.forward, w.backward]).view(float)
         remaining[w.set] = [
             replace(m, data=m.data - np.tensordot(six, m.signals(np.array(w.q)), 1))
             for m in remaining[w.set]
@@ -255,8 +254,8 @@ def _fitted(
             signals = np.zeros((size + 2, *m.good.shape))
             signals[own] = m.signals(q)
             # d/dq of Re(row s e) is the same with s rotated by 90 degrees, times x or y.
-            turned = _quarter(six[own])
-            slope = np.tensordot(turned, signals[own], 1)
+            turned = six[own].view(complex) * [1j, 1j, -1j]
+            slope = np.tensordot(turned.view(float), signals[own], 1)
             signals[size], signals[size + 1] = x * slope, y * slope
             model = np.tensordot(six[own], signals[own], 1)
             parts.append(
@@ -269,26 +268,12 @@ def _fitted(
     errors = np.sqrt(np.diag(fit_maps(parts).covariance))
     waves = []
     for n, name in enumerate(names):
-        s, f, b = (complex(*six[6 * n : 6 * n + 6][part]) for part in (STATIC, FORWARD, BACKWARD))
-        own_errors = errors[6 * n : 6 * n + 6]
-        spread = [float(own_errors[part].max()) for part in (STATIC, FORWARD, BACKWARD)]
-        waves.append(
-            WaveFit(
-                name,
-                (float(q[0]), float(q[1])),
-                s,
-                f,
-                b,
-                (spread[0], spread[1], spread[2], float(errors[size]), float(errors[size + 1])),
-            )
-        )
+        own = slice(6 * n, 6 * n + 6)
+        spread = errors[own].reshape(3, 2).max(axis=1)
+        every = (*spread.tolist(), *errors[size:].tolist())
+        static, forward, backward = six[own].view(complex).tolist()
+        waves.append(WaveFit(name, (float(q[0]), float(q[1])), static, forward, backward, every))
     return waves, q
-
-
-def _quarter(six: F64) -> F64:
-    """The numbers times i (those of e) or -i (those of 1 / e)."""
-    s, f, b = (complex(*six[part]) for part in (STATIC, FORWARD, BACKWARD))
-    return np.array([v for w in (1j * s, 1j * f, -1j * b) for v in (w.real, w.imag)])
 
 
 def _plain_gain(m: _Map, q: F64) -> float:

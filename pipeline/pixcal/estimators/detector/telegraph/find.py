@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from scipy.special import logit, logsumexp
@@ -25,6 +26,8 @@ from pixcal.estimators.detector.telegraph.population import (
 )
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F32, F64, Indices
+
+Reals = TypeVar("Reals", F32, F64)
 
 ROUNDS = 3  # most iterations between population and dwell time
 # range (decades) of unequal dwell times, and the chi-square by which frames further apart must
@@ -249,7 +252,8 @@ def own_levels(series: Sequence[LitSeries], noise: float) -> OwnLevels:
     longest = max(len(s.frame) for s in series)
     for one in series:
         at = np.searchsorted(pixels, one.pixel)
-        each = _two_levels(one, noise * OWN_AMPLITUDES)
+        charge, weight = one.charge.astype(np.float32), one.weight.astype(np.float32)
+        each = _two_levels(charge, weight, OWN_SHARES, noise * OWN_AMPLITUDES)
         # Or it stayed in one level all along.
         likely[:, at] += np.logaddexp(logsumexp(each, axis=0), 0) - np.log(len(OWN_SHARES) + 1)
         if 2 * len(one.frame) > longest:
@@ -266,24 +270,27 @@ def own_levels(series: Sequence[LitSeries], noise: float) -> OwnLevels:
     return OwnLevels(pixels[two], amplitude[two], upper[two])
 
 
-def _two_levels(series: LitSeries, amplitudes: F64) -> F32:
-    """Logarithms (share, amplitude, n) of the likelihoods of two levels relative to one."""
-    charge, weight = series.charge.astype(np.float32), series.weight.astype(np.float32)
-    found = np.empty((len(OWN_SHARES), len(amplitudes), charge.shape[1]), np.float32)
-    for of_share, upper in zip(found, OWN_SHARES.astype(np.float32), strict=True):
-        for own, a in zip(of_share, amplitudes.astype(np.float32), strict=True):
+def _two_levels(charge: Reals, weight: Reals, shares: F64, amplitudes: F64) -> Reals:
+    """Logarithms (share, amplitude, n) of the likelihoods of two levels relative to one.
+
+    ``charge, weight``: as in `LitSeries`, of the type to compute in.
+    """
+    kind = charge.dtype.type
+    found = np.empty((len(shares), len(amplitudes), charge.shape[1]), kind)
+    for of_share, upper in zip(found, shares.astype(kind), strict=True):
+        for own, a in zip(of_share, amplitudes.astype(kind), strict=True):
             # Of the lower level, and by how much the upper one is likelier.
             lower = -(upper * a * charge + (upper * a) ** 2 / 2) * weight
-            more = (a * charge + (upper - np.float32(0.5)) * a**2) * weight
+            more = (a * charge + (upper - kind(0.5)) * a**2) * weight
             own[:] = (lower + np.logaddexp(np.log1p(-upper), np.log(upper) + more)).sum(axis=0)
     return found
 
 
 def _by_share(series: LitSeries, amplitudes: F64) -> F64:
-    """Logarithms (share, n) of the likelihoods of some pixels, relative to quiet ones."""
+    """Logarithms (share, n) of the likelihoods of some pixels with any of the amplitudes."""
     each = -(-series.charge.shape[1] // MOST_PIXELS)
-    charge, weight = series.charge[:, ::each], series.weight[:, ::each]
-    return np.stack([_log_likelihoods(charge, weight, p, amplitudes) for p in SHARES])
+    some = _two_levels(series.charge[:, ::each], series.weight[:, ::each], SHARES, amplitudes)
+    return np.asarray(logsumexp(some, axis=1) - np.log(len(amplitudes)))
 
 
 def _mixed(jumps: F64) -> tuple[float, float, float]:
@@ -297,13 +304,3 @@ def _mixed(jumps: F64) -> tuple[float, float, float]:
     total = logsumexp(every + log_share[:, None], axis=0)
     last, before = np.exp(log_share[[-1, -2]])
     return float(total.sum()), float(last), float(before)
-
-
-def _log_likelihoods(charge: F64, weight: F64, upper: float, amplitudes: F64) -> F64:
-    """Logarithms (n,) for pixels (t, n) that have any of the amplitudes, relative to no jumps."""
-    total = np.empty((len(amplitudes), charge.shape[1]))
-    for own, amplitude in zip(total, amplitudes, strict=True):
-        levels = -upper * amplitude, (1 - upper) * amplitude
-        low, high = ((level * charge - level**2 / 2) * weight for level in levels)
-        own[:] = np.logaddexp(np.log1p(-upper) + low, np.log(upper) + high).sum(axis=0)
-    return np.asarray(logsumexp(total, axis=0) - np.log(len(amplitudes)))
