@@ -26,16 +26,9 @@ def allan_deviation(series: NDArray[np.floating], lengths: Sequence[int]) -> F64
     .. math:: \sigma^2(m) = \tfrac12 \langle (\bar y_{k+m} - \bar y_k)^2 \rangle_k
 
     with :math:`\bar y_k` the mean of ``m`` batches from ``k`` on. Means with a missing batch are
-    left out; batches on both sides of a gap are never joined.
-
-    Parameters
-    ----------
-    series : (batch, pixel) evenly spaced in time; NaN where there is no batch
-    lengths : averaging lengths, batches
-
-    Returns
-    -------
-    (length, pixel) float64; NaN where there is no pair of means
+    left out; batches on both sides of a gap are never joined. ``series``: (batch, pixel) evenly
+    spaced in time; NaN where there is no batch. ``lengths``: of averages, batches. Returns (length,
+    pixel); NaN where there is no pair of means.
     """
     out = np.empty((len(lengths), series.shape[1]))
     # Outside compiled code, because numpy's functions take longer to compile than loops.

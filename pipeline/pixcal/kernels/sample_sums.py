@@ -15,19 +15,15 @@ def calm_residuals(
 ) -> tuple[F32, F32, F64, F64]:
     """Residuals with and without division by their noise, and sums from the same sweep.
 
-    Parameters
-    ----------
     samples, model : (t, y, x)
     shot, read : (y, x) the variance of a sample is ``shot * max(model, 0) + read``
     good : (y, x)
     most : standard deviations beyond which a residual is an outlier
     limits : (n,) standard deviations beyond which residuals are counted, ascending
 
-    Returns
-    -------
-    calm, kept : (t, y, x) float32, zero for outliers, for NaN and in pixels that are not good
-    variance : (t,) float64 mean over the good pixels
-    beyond : (2, n) float64 residuals of good pixels that are below and above each limit
+    Returns the residuals (t, y, x), float32, zero for outliers, for NaN and in pixels that are not
+    good; the mean variance (t,) of the good pixels; the number (2, n) of residuals of good pixels
+    below and above each limit.
     """
     # Not in compiled code, where large arrays come without huge pages: that takes as long again.
     calm, kept = np.empty_like(samples), np.empty_like(samples)

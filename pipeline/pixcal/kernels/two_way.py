@@ -19,8 +19,6 @@ def left_over(
 ) -> F32:
     """Residuals of a table (t, n) after the fit; zero where a sample has no weight.
 
-    Parameters
-    ----------
     table, weight : (t, n) the weight is one over the variance, or zero
     of_place, covariance : (j, n), (t, j, j) free functions of each frame, and the covariance of
         their coefficients in each frame

@@ -80,11 +80,6 @@ def shared_by_blocks(difference: F32, quantum: float) -> float:
     return float(blocks.mean(axis=1).var(ddof=1) - own) / 2
 
 
-def lines_with_noise(dark: F64) -> tuple[str, ...]:
-    """Kinds of lines whose pixels share noise, by sums over pairs of frames without light."""
-    return tuple(name for name, (shared, _) in shared_by_lines(dark).items() if shared)
-
-
 def dark_pair_sums(
     frames: F32, read_noise: float, quantum: float, without: tuple[str, ...] = ()
 ) -> F64:
@@ -149,8 +144,8 @@ def _blocks(
         second = second + _common(first - second, name)
     blocks = pair_statistics(first, second, gain=gain, read_noise=read_noise, quantum=quantum)
     for name in without:
-        taken = _MEDIAN_TAKES / first.shape[1 if name == "row" else 0] * blocks[:, 2]
         across = 0 if name == "row" else 1
+        taken = _MEDIAN_TAKES / first.shape[1 - across] * blocks[:, 2]
         blocks[:, 2] += taken
         blocks[:, 3:] += np.outer(taken, LAGS[:, across] == 0)
     return blocks
@@ -173,7 +168,7 @@ class LineNoise:
     def add(self, frames: F32, sums: F64, read_noise: float, quantum: float) -> None:
         """Add frames as in `dark_pair_sums`, and its ``sums``; the first decide which lines."""
         if self.lines is None:
-            self.lines = lines_with_noise(sums)
+            self.lines = tuple(name for name, (own, _) in shared_by_lines(sums).items() if own)
         if self.lines:
             self._whole += sums.sum(axis=0)
             self._rest += dark_pair_sums(frames, read_noise, quantum, self.lines).sum(axis=0)

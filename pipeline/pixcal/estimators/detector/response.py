@@ -145,13 +145,9 @@ def boundaries_alone(
     fine = _of_fine_falloffs()
     sums = [(fine @ normal @ fine.T, fine @ right) for normal, right in sums]
     found = np.array([_alone(sums, POWERS + n) for n in range(len(_FINE_PX))])
-    return _best_falloff(found, otherwise_px, _of_any_shape(sums))
-
-
-def _of_any_shape(sums: Sequence[tuple[F64, F64]]) -> float:
-    """Chi-square explained by boundaries alone whose shift is any sum of all falloffs."""
-    every = [(normal[POWERS:, POWERS:], right[POWERS:]) for normal, right in sums]
-    return float(sum(right @ inverse_normal(normal) @ right for normal, right in every))
+    shifts = [(normal[POWERS:, POWERS:], right[POWERS:]) for normal, right in sums]
+    of_any_shape = sum(float(right @ inverse_normal(normal) @ right) for normal, right in shifts)
+    return _best_falloff(found, otherwise_px, of_any_shape)
 
 
 def _of_fine_falloffs() -> F64:

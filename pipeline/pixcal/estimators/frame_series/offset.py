@@ -100,7 +100,7 @@ def offset_modes(every: Sequence[OffsetSeries], shapes: Sequence[F64]) -> Modes:
         at += widths[i]
         part = np.zeros((2 + 3 * len(every), n, 4, 4))
         part[0, :, 0, 0], part[1, :, 0, 0] = 1.0, basis.walk
-        part[2 + 3 * i : 5 + 3 * i] = _diagonals(NOISES * s.noise)[:, None]
+        part[2 + 3 * i : 5 + 3 * i] = (NOISES * s.noise)[:, None, :, None] * np.eye(4)
         values.append(basis.of(s.values))
         designs.append(design)
         parts.append(part)
@@ -168,10 +168,6 @@ def _series(
         noise=np.concatenate([noise[:1], CONTRASTS**2 @ noise[1:]]),
         nuisance=nuisance,
     )
-
-
-def _diagonals(values: F64) -> F64:
-    return np.asarray(values[:, :, None] * np.eye(values.shape[1]))
 
 
 def fringe_courses(light: FrameLight) -> tuple[list[Course], float]:

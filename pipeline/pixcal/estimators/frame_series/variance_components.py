@@ -123,7 +123,12 @@ def estimate_components(
     """Sizes of the parts by restricted maximum likelihood; ``absent`` ones are fixed at zero."""
     free = np.ones(len(modes.parts), bool)
     free[list(absent)] = False
-    state = _begin(modes, free, start)
+    state: _State | None = None
+    if start is not None:
+        # Negative sizes of another fit may be too low here.
+        with suppress(np.linalg.LinAlgError):
+            state = _State(modes, np.where(free, np.maximum(start.size, modes.least), 0.0))
+    state = state or _State(modes, np.where(free, modes.start, 0.0))
     # Far from the maximum, a step of all sizes attributes signal to noise.
     signals = free & (modes.start == 0)
     state, gained = _climbed(state, signals, 1) if steps and signals.any() else (state, 0.0)
@@ -159,15 +164,6 @@ def _climbed(state: "_State", free: Mask, steps: int) -> tuple["_State", float]:
         if gain < CONVERGED:
             break
     return state, gain
-
-
-def _begin(modes: Modes, free: Mask, start: Components | None) -> "_State":
-    if start is not None:
-        try:
-            return _State(modes, np.where(free, np.maximum(start.size, modes.least), 0.0))
-        except np.linalg.LinAlgError:
-            pass  # Negative sizes of another fit may be too low here: use the default start.
-    return _State(modes, np.where(free, modes.start, 0.0))
 
 
 class _State:
