@@ -9,7 +9,6 @@ case took to make.
 import os
 import secrets
 import shutil
-from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -55,9 +54,13 @@ def write_examination(out: Path, sealed: Path, examination: Examination, runtime
     with lock(aside):
         items = list(zip(range(len(benches)), benches, examination.truths, strict=True))
         run_tasks(partial(_case, aside, examination.size), items, runtime, label="cases")
-        made = _copied(aside, [case_name(n) for n in range(len(benches))])
+        made = aside / "made"
+        shutil.rmtree(made, ignore_errors=True)
+        for name in map(case_name, range(len(benches))):
+            shutil.copytree(aside / name, made / name)
         write_manifest(made, examination, write_seal(sealed, examination, benches))
-        _same_times(made)
+        for path in sorted(made.rglob("*"), reverse=True):
+            os.utime(path, (MOMENT, MOMENT))
         out.parent.mkdir(parents=True, exist_ok=True)
         made.rename(out)
     for stale in out.parent.glob(f"{partial_ones}*"):
@@ -98,17 +101,3 @@ def effects_of(truth: Truth, bench: Bench) -> tuple[Effect, ...]:
     for effect in effects:
         effect.check(replace(bench, effects=plain))
     return effects
-
-
-def _copied(aside: Path, names: Sequence[str]) -> Path:
-    """Folder with all cases, copied so that copying times reveal nothing."""
-    made = aside / "made"
-    shutil.rmtree(made, ignore_errors=True)
-    for name in names:
-        shutil.copytree(aside / name, made / name)
-    return made
-
-
-def _same_times(folder: Path) -> None:
-    for path in sorted(folder.rglob("*"), reverse=True):
-        os.utime(path, (MOMENT, MOMENT))

@@ -121,7 +121,7 @@ def _part(part: int, count: int, size: str, rng: np.random.Generator) -> Iterato
         many = 1 if part != SEVERAL else 3 if number % 3 == 2 else 2
         chosen = _distinct(turns, many)
         least = 1.0 if part == ONE else CLEAR
-        drawn = [_drawn(_any(variants_of()[name], rng), size, least, rng) for name in chosen]
+        drawn = [_drawn(variants_of()[name], size, least, rng) for name in chosen]
         left_out = chosen[0] if part == LEFT_OUT else _absent(chosen, rng)
         yield Truth(part, left_out, tuple(drawn))
 
@@ -170,11 +170,8 @@ def _absent(present: Sequence[str], rng: np.random.Generator) -> str:
     return str(rng.choice([name for name in effects() if name not in present]))
 
 
-def _any(variants: Sequence[Variant], rng: np.random.Generator) -> Variant:
-    return variants[int(rng.integers(len(variants)))]
-
-
-def _drawn(variant: Variant, size: str, least: float, rng: np.random.Generator) -> Drawn:
+def _drawn(variants: Sequence[Variant], size: str, least: float, rng: np.random.Generator) -> Drawn:
+    variant = variants[int(rng.integers(len(variants)))]
     times = float(np.exp(rng.uniform(np.log(least), np.log(STRONGEST))))
     strength = times * variant.threshold(size)
     made = variant.make(strength, rng)

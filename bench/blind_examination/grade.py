@@ -23,6 +23,10 @@ BLAMED = 0.5  # share of the gap above which an absent effect is blamed for most
 WITHIN = (1, 2, 3)  # allowed deviations of a parameter, in errors
 WORST = 3  # number of worst statistics that should include the domain of an effect
 
+# what a grade keeps of a cause, and of a statistic that differs
+CLAIM = ("effect", "sigmas", "gap_closed", "p_value")
+PLACE = ("domain", "statistic", "set", "place")
+
 Diagnosis = Mapping[str, Any]
 
 
@@ -86,25 +90,18 @@ def grade(case: str, truth: Truth, diagnosis: Diagnosis | None, error: str = "")
     why = "" if answers[0] else _why(truth, diagnosis, named)
     closed = 1 - float(diagnosis["gap"]["after"]) if named else None
     parameters = () if truth.second else tuple(_parameters(truth, diagnosis))
+    worst = diagnosis["gap"]["where"][:WORST]
     return Grade(
         *about,
         diagnosis["verdict"],
         named,
         marks,
         why,
-        claims=tuple(_claim(cause) for cause in diagnosis["causes"]),
-        worst=tuple(_place(one) for one in diagnosis["gap"]["where"][:WORST]),
+        claims=tuple({key: cause.get(key) for key in CLAIM} for cause in diagnosis["causes"]),
+        worst=tuple({key: str(one.get(key, "")) for key in PLACE} for one in worst),
         parameters=parameters,
         closed=closed,
     )
-
-
-def _claim(cause: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: cause.get(key) for key in ("effect", "sigmas", "gap_closed", "p_value")}
-
-
-def _place(one: Mapping[str, Any]) -> dict[str, str]:
-    return {key: str(one.get(key, "")) for key in ("domain", "statistic", "set", "place")}
 
 
 def _answers(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> tuple[bool, ...]:
@@ -123,56 +120,46 @@ def _answers(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> tuple[
     honest = verdict in ("unexplained", "partly explained")
     blamed = any(cause["gap_closed"] > BLAMED for cause in diagnosis["causes"])
     answers = honest and not blamed, honest, not blamed
-    return answers if truth.part == SECOND_OTHER else (*answers, _domain_seen(truth, diagnosis))
-
-
-def _domain_seen(truth: Truth, diagnosis: Diagnosis) -> bool:
-    """Whether the worst statistics include a domain in which the effect is visible."""
-    known = effects()
-    domains = {domain for name in truth.names for domain in known[name].domains}
-    worst = diagnosis["gap"]["where"][:WORST]
-    return any(one["domain"] in domains for one in worst)
+    if truth.part == SECOND_OTHER:
+        return answers
+    # Whether the worst statistics include a domain in which the effect is visible.
+    domains = {domain for name in truth.names for domain in effects()[name].domains}
+    return *answers, any(one["domain"] in domains for one in diagnosis["gap"]["where"][:WORST])
 
 
 def _parameters(truth: Truth, diagnosis: Diagnosis) -> list[dict[str, Any]]:
     causes = {cause["effect"]: cause for cause in diagnosis["causes"]}
     rows = []
-    for drawn in truth.drawn:
-        cause = causes.get(drawn.effect)
-        if cause is None:
-            continue
-        for one in check_parameters(
-            drawn.effect, drawn.parameters, cause["parameters"], cause["uncertainty"]
-        ):
-            rows.append(
-                {
-                    "effect": drawn.effect,
-                    "name": one.name,
-                    "true": one.true,
-                    "found": one.estimate,
-                    "error": one.error,
-                    "within": [one.within(errors) for errors in WITHIN],
-                }
-            )
+    for drawn in (drawn for drawn in truth.drawn if drawn.effect in causes):
+        found = (causes[drawn.effect][key] for key in ("parameters", "uncertainty"))
+        rows += [
+            {
+                "effect": drawn.effect,
+                "name": one.name,
+                "true": one.true,
+                "found": one.estimate,
+                "error": one.error,
+                "within": [one.within(errors) for errors in WITHIN],
+            }
+            for one in check_parameters(drawn.effect, drawn.parameters, *found)
+        ]
     return rows
 
 
 def _why(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> str:
     """Reason of a wrong answer, from the diagnosis."""
-    reasons = []
+    verdict, causes = f"verdict {diagnosis['verdict']!r}", diagnosis["causes"]
     if truth.part in (NOTHING, SECOND_NOTHING):
-        return (
-            "; ".join(
-                f"{c['effect']} claimed (p = {c['p_value']:.1e}, closes {c['gap_closed']:.2f})"
-                for c in diagnosis["causes"]
-            )
-            or f"verdict {diagnosis['verdict']!r}"
-        )
+        reasons = [
+            f"{c['effect']} claimed (p = {c['p_value']:.1e}, closes {c['gap_closed']:.2f})"
+            for c in causes
+        ]
+        return "; ".join(reasons) or verdict
     if truth.part in (LEFT_OUT, SECOND_OTHER):
-        blamed = [c for c in diagnosis["causes"] if c["gap_closed"] > BLAMED]
+        blamed = [c for c in causes if c["gap_closed"] > BLAMED]
         reasons = [f"{c['effect']} credited with {c['gap_closed']:.2f} of the gap" for c in blamed]
-        return "; ".join(reasons) or f"verdict {diagnosis['verdict']!r}"
-    about = {c["effect"]: c for c in diagnosis["candidates"]}
+        return "; ".join(reasons) or verdict
+    reasons, about = [], {c["effect"]: c for c in diagnosis["candidates"]}
     for name in truth.names:
         if name not in named:
             tried = about.get(name, {})
@@ -185,6 +172,4 @@ def _why(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> str:
     invented = [name for name in named if name not in truth.names]
     if invented:
         reasons.append(f"invented: {', '.join(invented)}")
-    if not named:
-        reasons.append(f"verdict {diagnosis['verdict']!r}")
-    return "; ".join(reasons)
+    return "; ".join(reasons if named else [*reasons, verdict])

@@ -23,8 +23,6 @@ from pixcal.model.errors import DamagedError, InputError, PixcalError, PlanError
 from pixcal.storage.manifest import read_json, write_json
 
 SCHEMA = "pixcal/blind-score/4"
-PRODUCT = "score.json"
-TABLE = "score.md"
 _TIMED = ("diagnosis", "maps")
 
 
@@ -40,7 +38,6 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
         # Check this first, as scoring takes minutes.
         around_table(config.write, read_manifest(folder).size)
     marked = [_marked(own, truth, config, runtime) for own, truth in exams]
-    first = marked[0]
     named = [one.named(apart=len(marked) > 1) for one in marked]
     missing = [case for _, own in named for case in own]
     seeds = [one.opened.examination.seed for one in marked]
@@ -50,7 +47,7 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
         "purpose": "development" if "development" in purposes else "examination",
         # With the seed, anybody could draw the cases still to be run.
         "seed": None if missing else seeds[0] if len(seeds) == 1 else seeds,
-        "size": first.manifest.size,
+        "size": marked[0].manifest.size,
         "made": sum(len(one.manifest.cases) for one in marked),
         "missing": missing,
         "runs": _summary_of_runs(
@@ -58,11 +55,11 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
         ),
         "notes": list(dict.fromkeys(n for one in marked for n in one.opened.examination.notes)),
     }
-    write_json(folder / PRODUCT, result)
+    write_json(folder / "score.json", result)
     text = as_markdown(result)
-    (folder / TABLE).write_text(text, encoding="utf-8")
+    (folder / "score.md").write_text(text, encoding="utf-8")
     if config.write is not None:
-        write_between(config.write, first.manifest.size, text)
+        write_between(config.write, result["size"], text)
     return result
 
 
@@ -108,7 +105,12 @@ def _marked(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -
             f"{folder / FILE}: lists {len(manifest.cases)} cases, --sealed {sealed} of "
             f"{len(opened.examination.truths)}; one of them is damaged"
         )
-    done = [n for n, name in enumerate(manifest.cases) if _is_done(folder / RUNS / name)]
+    # Diagnosed, or failed.
+    done = [
+        n
+        for n, name in enumerate(manifest.cases)
+        if any((folder / RUNS / name / file).is_file() for file in (DIAGNOSIS, FAILED))
+    ]
     if not done:
         raise InputError(f"{folder}: no case was diagnosed; run 'pixcal blind run {folder}'")
     mark = partial(_graded, folder, manifest, opened)
@@ -117,11 +119,6 @@ def _marked(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -
         grades = _with_oracle(folder, opened, dict(zip(done, grades, strict=True)), config, runtime)
     missing = [name for n, name in enumerate(manifest.cases) if n not in done]
     return _Marked(folder, manifest, opened, grades, missing)
-
-
-def _is_done(run_dir: Path) -> bool:
-    """Whether a case was diagnosed, or failed."""
-    return (run_dir / DIAGNOSIS).is_file() or (run_dir / FAILED).is_file()
 
 
 @contextmanager

@@ -8,7 +8,6 @@ import math
 import shutil
 import time
 import traceback
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -85,7 +84,7 @@ def _case(
         shutil.rmtree(run_dir, ignore_errors=True)
     run_dir.mkdir(parents=True, exist_ok=True)
     write_json(run_dir / BEGUN, {"code": code})
-    start = time.perf_counter()
+    start, without_maps = time.perf_counter(), ""
     try:
         ingest.run(folder / name, run_dir, ingest.Config(), runtime)
         reduce.run(run_dir, reduce.Config(), runtime)
@@ -95,16 +94,17 @@ def _case(
     except Exception as error:
         facts = {"error": f"{type(error).__name__}: {error}", "where": traceback.format_exc()}
         write_json(run_dir / FAILED, facts)
-        seconds = {"diagnosis": time.perf_counter() - start, "maps": 0.0}
-        _write_done(run_dir, code, seconds, "not diagnosed")
-        return True
+        without_maps = "not diagnosed"
     diagnosed = time.perf_counter()
-    without_maps = _fit_maps(run_dir, runtime)
-    if not config.keep:
-        _clear(run_dir, LARGE)
+    if not (failed := bool(without_maps)):
+        without_maps = _fit_maps(run_dir, runtime)
+        for name in () if config.keep else LARGE:
+            shutil.rmtree(run_dir / name, ignore_errors=True)
     seconds = {"diagnosis": diagnosed - start, "maps": time.perf_counter() - diagnosed}
-    _write_done(run_dir, code, seconds, without_maps)
-    return False
+    rounded = {what: round(value, 1) for what, value in seconds.items()}
+    done = {"code": code, "seconds": rounded, "no_maps": without_maps}
+    write_json(run_dir / DONE, done)
+    return failed
 
 
 def _begun_by(run_dir: Path) -> str | None:
@@ -113,11 +113,6 @@ def _begun_by(run_dir: Path) -> str | None:
         return str(read_json(run_dir / BEGUN)["code"])
     except (DamagedError, FileNotFoundError, LookupError, TypeError):
         return None
-
-
-def _write_done(run_dir: Path, code: str, seconds: Mapping[str, float], no_maps: str) -> None:
-    rounded = {what: round(value, 1) for what, value in seconds.items()}
-    write_json(run_dir / DONE, {"code": code, "seconds": rounded, "no_maps": no_maps})
 
 
 def _fit_maps(run_dir: Path, runtime: Runtime) -> str:
@@ -129,8 +124,3 @@ def _fit_maps(run_dir: Path, runtime: Runtime) -> str:
     except Exception as error:
         return f"{type(error).__name__}: {error}"
     return ""
-
-
-def _clear(run_dir: Path, names: Sequence[str]) -> None:
-    for name in names:
-        shutil.rmtree(run_dir / name, ignore_errors=True)

@@ -75,11 +75,8 @@ def catalogue() -> tuple[tuple[str, ...], tuple[SecondLaw, ...], tuple[str, ...]
     listing = json.loads(_asked("--list", "--json"))
     laws = [SecondLaw(**facts) for facts in listing["laws"]]
     absent = sorted({law.needs for law in laws if not _there(law.needs)})
-    return (
-        tuple(listing["variations"]),
-        tuple(n for n in laws if n.needs not in absent),
-        tuple(absent),
-    )
+    available = tuple(law for law in laws if law.needs not in absent)
+    return tuple(listing["variations"]), available, tuple(absent)
 
 
 def _asked(*line: str | Path) -> str:
@@ -96,23 +93,9 @@ def _options(case: SecondCase, layout: Layout) -> Sequence[str]:
     # The case may come from a file, and must not be taken for an option.
     if not re.fullmatch(r"[a-z0-9_]+(/[a-z0-9_]+)?(\+[a-z0-9_]+(/[a-z0-9_]+)?)*", case.case):
         raise InputError(f"{case.case!r}: not a case of the second bench; give another sealed file")
-    many = min(FLATS, layout.frames // 2)
-    return (
-        case.case,
-        "--seed",
-        str(case.seed),
-        "--strength",
-        str(case.strength),
-        "--size",
-        str(layout.shape[0]),
-        str(layout.shape[1]),
-        "--frames",
-        str(layout.frames),
-        "--bias",
-        str(min(BIAS, many)),
-        "--flats",
-        str(many),
-    )
+    (ny, nx), many = layout.shape, min(FLATS, layout.frames // 2)
+    line = f"{case.case} --seed {case.seed} --strength {case.strength} --size {ny} {nx}"
+    return f"{line} --frames {layout.frames} --bias {min(BIAS, many)} --flats {many}".split()
 
 
 def record_second(case: SecondCase, layout: Layout, out: Path) -> None:

@@ -65,10 +65,6 @@ def _vibration(s: float, rng: np.random.Generator) -> Plain:
     return {"rms": [0.0, 0.0], "vibration": along, "vibration_hz": float(rng.uniform(0.3, 3.0))}
 
 
-def _jitter(s: float, rng: np.random.Generator) -> Plain:
-    return {"rms": [s, float(s * rng.uniform(0.3, 1))]}
-
-
 def _ghost(s: float, rng: np.random.Generator) -> Plain:
     beat = _around(rng.uniform(0.15, 1.0), rng)
     turn, parent = float(rng.uniform(-np.pi, np.pi)), str(rng.choice(tuple(PARENTS)))
@@ -90,10 +86,6 @@ def _nearest(s: float, rng: np.random.Generator) -> Plain:
 def _every_other_row(s: float, rng: np.random.Generator) -> Plain:
     row = int(rng.integers(2))
     return {"couplings": [{"dy": 1, "dx": 0, "share": s, "every_rows": 2, "row": row}]}
-
-
-def _bent(s: float, rng: np.random.Generator) -> Plain:
-    return {"quadratic": _either(s, rng), "cubic": float(s * rng.uniform(-0.4, 0.4))}
 
 
 _BIAS = ("jitter_rms", "ramp_e_h", "walk_e_h", "settle_e")
@@ -119,7 +111,8 @@ VARIANTS = (
         lambda s, rng: {"pixel_rms": 0.0, "smooth_rms": s, "scale_px": _between(3, 12, rng)}),
     Variant("fringe_drift", "random walk, rad/(px h^0.5)", 1.9e-4, 2.5e-5, _walk),
     Variant("fringe_drift", "ramp, rad/(px h)", 0.0018, 1.4e-4, _ramp),
-    Variant("fringe_jitter", "vector, rad/px", 7.5e-6, 1.3e-6, _jitter),
+    Variant("fringe_jitter", "vector, rad/px", 7.5e-6, 1.3e-6,
+        lambda s, rng: {"rms": [s, float(s * rng.uniform(0.3, 1))]}),
     Variant("fringe_jitter", "vibration, rad/px", 4.7e-6, 1.1e-6, _vibration),
     Variant("gain_error", "relative", 0.024, 0.0085, lambda s, rng: {"relative": _either(s, rng)}),
     Variant("ghost_fringes", "share", 2.7e-4, 1.3e-4, _ghost),
@@ -134,7 +127,8 @@ VARIANTS = (
     Variant("ipc", "share from every other row", 0.0023, 9.8e-4, _every_other_row),
     Variant("lag", "share", 3.3e-5, 1.4e-5,
         lambda s, rng: {"share": s, "decay_frames": float(rng.choice([0.0, rng.uniform(1, 3)]))}),
-    Variant("nonlinearity", "quadratic", 0.0011, 4.3e-4, _bent),
+    Variant("nonlinearity", "quadratic", 0.0011, 4.3e-4,
+        lambda s, rng: {"quadratic": _either(s, rng), "cubic": float(s * rng.uniform(-0.4, 0.4))}),
     Variant("quantisation", "step beyond 1 ADU, ADU", 1.0, 1.0, _only("coarse_adu", _CODES)),
     Variant("quantisation", "scatter of the codes", 0.012, 0.0036, _only("dnl_rms", _CODES)),
     Variant("quantisation", "ripple of the codes", 0.007, 0.0027,

@@ -85,8 +85,11 @@ def _percent(count: Plain) -> tuple[str, str]:
 def _target(count: Plain) -> tuple[str, str]:
     if "target" not in count:
         return "", ""
-    text = f"≥ {100 * count['target']:.0f} %"
-    return text, "yes" if count["share"] >= count["target"] else "**no**"
+    return f"≥ {100 * count['target']:.0f} %", _yes_no(count["share"] >= count["target"])
+
+
+def _yes_no(reached: bool) -> str:
+    return "yes" if reached else "**no**"
 
 
 def _medians(medians: Mapping[str, float | None]) -> str:
@@ -106,20 +109,12 @@ def _maps(maps: Plain) -> str:
         if not errors["maps"]:
             rows.append((title, 0, "", "", "", "", ""))
             continue
-        of_target = ("", "")
-        if which == "biased":
-            reached = "yes" if errors["after"] <= maps["target"] else "**no**"
-            of_target = (f"≤ {maps['target']}", reached)
+        of_target = (f"≤ {maps['target']}", _yes_no(errors["after"] <= maps["target"]))
         within = errors["within_target"]
+        medians = (f"{errors[when]:.2f}" for when in ("before", "after"))
+        few = f"{within['right']} ({_percent(within)[1]})"
         rows.append(
-            (
-                title,
-                errors["maps"],
-                f"{errors['before']:.2f}",
-                f"{errors['after']:.2f}",
-                f"{within['right']} ({_percent(within)[1]})",
-                *of_target,
-            )
+            (title, errors["maps"], *medians, few, *(of_target if which == "biased" else ("", "")))
         )
     header = (
         "maps along x or y",

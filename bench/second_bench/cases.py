@@ -1,11 +1,10 @@
 """A case: a bench with its effects."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from second_bench.effects import LAWS, Law, laws_of
+from second_bench.effects import LAWS, Law
 from second_bench.model import Bench, stream
 from second_bench.ordinary import VARIATIONS, Layout, draw_bench, draw_phases, draw_variations
 
@@ -17,14 +16,6 @@ class CaseError(ValueError):
     """A case that does not exist."""
 
 
-@dataclass(frozen=True)
-class Chosen:
-    """A law of an effect and its strength, in the unit of the law."""
-
-    law: Law
-    size: float
-
-
 def make_case(
     case: str, seed: int, layout: Layout, strength: float | None = None, plain: bool = False
 ) -> tuple[Bench, dict[str, Any]]:
@@ -34,7 +25,7 @@ def make_case(
     ``+``. ``strength``: from 0 (barely visible) to 1 (strong); by default drawn from the seed.
     ``plain``: without ordinary variations besides the effects.
     """
-    chosen: list[Chosen] = []
+    chosen: list[tuple[Law, float]] = []
     varied = set() if plain else draw_variations(seed)
     if case.partition("/")[0] == ORDINARY:
         only = case.partition("/")[2]
@@ -45,31 +36,32 @@ def make_case(
         rng = stream(seed, "effects")
         chosen = [_choose(name, strength, rng) for name in case.split("+")]
     bench = draw_bench(layout, seed, varied)
-    if any(c.law.varied_phases for c in chosen):
+    if any(law.varied_phases for law, _ in chosen):
         for run in bench.fringe_runs():
             run.phase = draw_phases("random", run.frames, stream(seed, "phases", run.name))
             bench.notes[run.name]["phases"] = "random"
     effects = []
-    for c in chosen:
-        parameters = c.law.apply(bench, c.size, stream(seed, "effect", c.law.effect))
+    for law, size in chosen:
+        parameters = law.apply(bench, size, stream(seed, "effect", law.effect))
         effects.append(
             {
-                "effect": c.law.effect,
-                "law": c.law.name,
-                "size": c.size,
-                "unit": c.law.unit,
-                "range": [c.law.weak, c.law.strong],
+                "effect": law.effect,
+                "law": law.name,
+                "size": size,
+                "unit": law.unit,
+                "range": [law.weak, law.strong],
                 "parameters": parameters,
-                "known": c.law.known,
-                "decidable": c.law.decidable,
+                "known": law.known,
+                "decidable": law.decidable,
             }
         )
     return bench, {"schema": SCHEMA, "case": case, "seed": seed, "effects": effects}
 
 
-def _choose(name: str, strength: float | None, rng: np.random.Generator) -> Chosen:
+def _choose(name: str, strength: float | None, rng: np.random.Generator) -> tuple[Law, float]:
+    """A law of an effect and its strength, in the unit of the law."""
     effect, _, law = name.partition("/")
-    laws = laws_of(effect)
+    laws = [one for one in LAWS if one.effect == effect]
     if not laws:
         known = ", ".join(dict.fromkeys(one.effect for one in LAWS))
         raise CaseError(f"{name}: no such effect; there are {known}")
@@ -78,4 +70,4 @@ def _choose(name: str, strength: float | None, rng: np.random.Generator) -> Chos
     of = [one for one in laws if law in ("", one.name)]
     found = of[int(rng.integers(len(of)))]
     share = rng.uniform() if strength is None else strength
-    return Chosen(found, float(found.weak * (found.strong / found.weak) ** share))
+    return found, float(found.weak * (found.strong / found.weak) ** share)

@@ -31,11 +31,7 @@ def vary_camera(bench: Bench, varied: set[str]) -> None:
         bench.read_noise_e *= (1 + rng.exponential(tail, shape)) * rng.lognormal(0, 0.1, shape)
         bench.notes["noise_tail"] = tail
     if "coarse_gain" in varied:
-        coarse = stream(bench.seed, "coarse gain").uniform(10, 16) / bench.gain_e_per_adu
-        bench.gain_e_per_adu *= coarse
-        bench.declared_gain *= coarse
-        bench.bias_adu = 100 + (bench.bias_adu - bench.bias_adu.mean()) / coarse
-        bench.notes["gain_e_per_adu"] = bench.gain_e_per_adu
+        bench.coarsen(stream(bench.seed, "coarse gain").uniform(10, 16) / bench.gain_e_per_adu)
     if "hot_clusters" in varied:
         rng = stream(bench.seed, "hot clusters")
         count = int(rng.integers(2, 7))

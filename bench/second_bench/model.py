@@ -148,6 +148,13 @@ class Bench:
         """Runs of the fringe sets."""
         return [run for run in self.runs if run.kind == "fringes"]
 
+    def coarsen(self, factor: float) -> None:
+        """Enlarge the steps of the converter; the level stays well above the first code."""
+        self.gain_e_per_adu *= factor
+        self.declared_gain *= factor
+        self.bias_adu = 100 + (self.bias_adu - self.bias_adu.mean()) / factor
+        self.notes["gain_e_per_adu"] = self.gain_e_per_adu
+
     def grid(self) -> tuple[F64, F64]:
         """Column and row from the centre of the window: (1, x) and (y, 1), px."""
         ny, nx = self.shape

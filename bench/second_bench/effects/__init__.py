@@ -1,7 +1,7 @@
 """Faults of a bench."""
 
 from second_bench.effects import charge, electronics, fringes, light, outside, particles, response
-from second_bench.effects.law import LAWS, Law, laws_of
+from second_bench.effects.law import LAWS, Law
 
 __all__ = [
     "LAWS",
@@ -9,7 +9,6 @@ __all__ = [
     "charge",
     "electronics",
     "fringes",
-    "laws_of",
     "light",
     "outside",
     "particles",

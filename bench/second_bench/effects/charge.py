@@ -145,21 +145,16 @@ def _deflecting(model: Any) -> Step:
     return moves
 
 
-def _power_law(size: float, rng: np.random.Generator) -> tuple[Any, _Drawn]:
+@law("brighter_fatter", "power_law", 5e-8, 6e-7, "px/e- of the next border")
+def power_law(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """Shifts of borders by charge, a power law of distance (Antilogus et al. 2014)."""
     across, alpha = float(rng.uniform(0.6, 1.4)), float(rng.uniform(1.8, 3))
     far = size * 0.2
     model = galsim.cdmodel.PowerLawCD(
         3, size, size * across, far / 2, far / 2 * across, far, far * across, alpha
     )
-    return model, {"ratio_y_x": across, "alpha": alpha}
-
-
-@law("brighter_fatter", "power_law", 5e-8, 6e-7, "px/e- of the next border")
-def power_law(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Shifts of borders by charge, a power law of distance (Antilogus et al. 2014)."""
-    model, drawn = _power_law(size, rng)
     bench.charge.append(_deflecting(model))
-    return drawn
+    return {"ratio_y_x": across, "alpha": alpha}
 
 
 @law("brighter_fatter", "table", 5e-8, 6e-7, "px/e- of the next border")

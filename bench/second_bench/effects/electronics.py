@@ -5,32 +5,28 @@ from typing import Any
 import numpy as np
 
 from second_bench.effects.fringes import SLOW
-from second_bench.effects.law import law
-from second_bench.model import F64, Bench, Frame, Run, Step, stream
+from second_bench.effects.law import Apply, law
+from second_bench.model import F64, Bench, Frame, Run, stream
 
 _Drawn = dict[str, Any]
 
 
-def _lines(size: float, axis: int) -> Step:
-    def adds(e: F64, frame: Frame) -> F64:
-        one: F64 = frame.rng.standard_normal((e.shape[0], 1) if axis == 0 else (1, e.shape[1]))
-        return e + size * one
+def _lines(axis: int) -> Apply:
+    """Every row (axis 0) or column of every frame has an offset."""
 
-    return adds
+    def applies(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+        def adds(e: F64, frame: Frame) -> F64:
+            one: F64 = frame.rng.standard_normal((e.shape[0], 1) if axis == 0 else (1, e.shape[1]))
+            return e + size * one
+
+        bench.offset.append(adds)
+        return {}
+
+    return applies
 
 
-@law("row_noise", "rows", 0.5, 10, "e- rms")
-def rows(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Every row of every frame has an offset."""
-    bench.offset.append(_lines(size, 0))
-    return {}
-
-
-@law("row_noise", "columns", 0.5, 10, "e- rms")
-def columns(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Every column of every frame has an offset."""
-    bench.offset.append(_lines(size, 1))
-    return {}
+for _axis, _name in enumerate(("rows", "columns")):
+    law("row_noise", _name, 0.5, 10, "e- rms")(_lines(_axis))
 
 
 @law("row_noise", "correlated", 0.5, 10, "e- rms")
@@ -50,7 +46,7 @@ def correlated(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     return {"correlation": kept}
 
 
-def _drifting(course: str) -> Any:
+def _drifting(course: str) -> Apply:
     def drifts(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
         for run in bench.runs:
             moved = size * rng.uniform(0.7, 1.3) * SLOW[course](run.frames, rng)
@@ -136,12 +132,7 @@ def spikes(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 def _coarse(bench: Bench, rng: np.random.Generator) -> None:
     """A converter of about 12 bits with steps similar to the noise."""
-    coarse = float(rng.uniform(8, 30)) / bench.gain_e_per_adu
-    bench.gain_e_per_adu *= coarse
-    bench.declared_gain *= coarse
-    # The level stays well above the first code.
-    bench.bias_adu = 100 + (bench.bias_adu - bench.bias_adu.mean()) / coarse
-    bench.notes["gain_e_per_adu"] = bench.gain_e_per_adu
+    bench.coarsen(float(rng.uniform(8, 30)) / bench.gain_e_per_adu)
 
 
 def _codes(bench: Bench) -> int:

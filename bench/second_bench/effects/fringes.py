@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from second_bench.effects.law import law
+from second_bench.effects.law import Apply, law
 from second_bench.model import F64, Bench, Run
 
 _Drawn = dict[str, Any]
@@ -90,7 +90,7 @@ SLOW = {"ramp": _ramp, "walk": _walk, "settling": _settling}
 """Slow courses of a run, with a range of about one."""
 
 
-def _drifting(course: str) -> Any:
+def _drifting(course: str) -> Apply:
     def drifts(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
         for run in bench.fringe_runs():
             moved = size * rng.uniform(0.7, 1.3) * SLOW[course](run.frames, rng)

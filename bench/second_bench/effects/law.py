@@ -40,8 +40,3 @@ def law(
         return apply
 
     return entered
-
-
-def laws_of(effect: str) -> list[Law]:
-    """Laws of an effect; none if there is no such effect."""
-    return [one for one in LAWS if one.effect == effect]

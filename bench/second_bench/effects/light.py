@@ -7,26 +7,26 @@ import numpy as np
 from scipy.special import j0
 
 from second_bench.effects.fringes import SLOW
-from second_bench.effects.law import law
+from second_bench.effects.law import Apply, law
 from second_bench.model import F64, Beam, Bench
 
 _Drawn = dict[str, Any]
 
 
-@law("intensity_noise", "laser", 3e-4, 0.03, "rms")
-def laser(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Both fibres follow the laser."""
-    for run in bench.fringe_runs():
-        run.power = run.power * np.maximum(1 + size * rng.standard_normal((run.frames, 1)), 0.1)
-    return {}
+def _white(sources: int) -> Apply:
+    """Light of the laser (1 source), or the coupling into each fibre (2), varies independently."""
+
+    def applies(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+        for run in bench.fringe_runs():
+            light = 1 + size * rng.standard_normal((run.frames, sources))
+            run.power = run.power * np.maximum(light, 0.1)
+        return {}
+
+    return applies
 
 
-@law("intensity_noise", "fibres", 3e-4, 0.03, "rms")
-def fibres(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """Coupling into each fibre varies independently."""
-    for run in bench.fringe_runs():
-        run.power = run.power * np.maximum(1 + size * rng.standard_normal((run.frames, 2)), 0.1)
-    return {}
+for _sources, _name in ((1, "laser"), (2, "fibres")):
+    law("intensity_noise", _name, 3e-4, 0.03, "rms")(_white(_sources))
 
 
 @law("intensity_noise", "flicker", 3e-4, 0.03, "rms")
@@ -73,16 +73,21 @@ def _ghost(bench: Bench, beam: Beam, size: float, rng: np.random.Generator) -> t
     return image, {"moved_mm": moved.tolist(), "period_px": float(period)}
 
 
-@law("ghost_fringes", "first_fibre", 8e-4, 0.02, "of the amplitude")
-def first_fibre(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """A reflection of the unmodulated fibre."""
-    return {one.name: _add_ghost(bench, n, 0, size, rng) for n, one in enumerate(bench.sets)}
+def _reflected(fibre: int) -> Apply:
+    """A reflection of one fibre: the unmodulated one (0) or the modulated one (1)."""
+
+    def applies(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+        drawn = {}
+        for one in bench.sets:
+            image, drawn[one.name] = _ghost(bench, one.beams[fibre], size, rng)
+            one.beams.append(image)
+        return drawn
+
+    return applies
 
 
-@law("ghost_fringes", "second_fibre", 8e-4, 0.02, "of the amplitude")
-def second_fibre(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """A reflection of the modulated fibre."""
-    return {one.name: _add_ghost(bench, n, 1, size, rng) for n, one in enumerate(bench.sets)}
+for _fibre, _name in enumerate(("first_fibre", "second_fibre")):
+    law("ghost_fringes", _name, 8e-4, 0.02, "of the amplitude")(_reflected(_fibre))
 
 
 @law("ghost_fringes", "both", 8e-4, 0.02, "of the amplitude")
@@ -119,15 +124,6 @@ def crossed(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
         one.beams.append(image)
         drawn[one.name] = facts | {"turned_rad": turn}
     return drawn
-
-
-def _add_ghost(
-    bench: Bench, number: int, fibre: int, size: float, rng: np.random.Generator
-) -> _Drawn:
-    one = bench.sets[number]
-    image, facts = _ghost(bench, one.beams[fibre], size, rng)
-    one.beams.append(image)
-    return facts
 
 
 def _stray(bench: Bench, shape: F64) -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from second_bench.sensors.model import F64, Drawn, Sensor, Series, kind, middle
+from second_bench.sensors.model import F64, Drawn, Sensor, Series, kind, middle, places
 
 
 @kind()
@@ -29,8 +29,7 @@ def fading_lamp(sensor: Sensor) -> Drawn:
 @kind()
 def vignetted(sensor: Sensor) -> Drawn:
     """Dark corners, dust, pixels with dark current of a long tail, exposure times with jitter."""
-    rng, (ny, nx) = sensor.rng, sensor.shape
-    y, x = np.mgrid[:ny, :nx] / np.array([ny, nx])[:, None, None] - 0.5
+    rng, (y, x) = sensor.rng, places(sensor.shape)
     shade = np.exp(-rng.uniform(0.5, 3) * (x**2 + y**2))
     for _ in range(6):
         at, size = rng.uniform(-0.5, 0.5, 2), rng.uniform(0.01, 0.04)
@@ -61,17 +60,10 @@ def without_bias(sensor: Sensor) -> Drawn:
     return {}
 
 
-def _places(sensor: Sensor) -> tuple[F64, F64]:
-    """Rows and columns over the shape, from -0.5 to 0.5."""
-    ny, nx = sensor.shape
-    y, x = np.mgrid[:ny, :nx] / np.array([ny, nx])[:, None, None] - 0.5
-    return y, x
-
-
 @kind("?")
 def twilight(sensor: Sensor) -> Drawn:
     """Flats of the sky: the light fades, and its gradient turns from frame to frame."""
-    rng, (y, x) = sensor.rng, _places(sensor)
+    rng, (y, x) = sensor.rng, places(sensor.shape)
     fade, slope = float(rng.uniform(0.02, 0.15)), float(rng.uniform(0.003, 0.03))
     turn = float(rng.uniform(0.05, 0.5))
 
@@ -98,7 +90,7 @@ def round_field(sensor: Sensor) -> Drawn:
 @kind()
 def strong_vignetting(sensor: Sensor) -> Drawn:
     """Corners get a tenth to a third of the light."""
-    y, x = _places(sensor)
+    y, x = places(sensor.shape)
     corner = float(sensor.rng.uniform(0.1, 0.33))
     sensor.response = sensor.response * corner ** (2 * (x**2 + y**2))
     return {"corner": corner}

@@ -113,13 +113,12 @@ def ordinary(
     converter: Converter | None = None,
 ) -> Sensor:
     """A sensor that bias, dark and flat maps describe completely."""
-    ny, nx = shape
     bits, gain, read = (converter or _converter)(rng)
     bias = float(rng.uniform(15, 40) if bits < 12 else rng.uniform(60, 400)) + 4 * read / gain
     range_e = gain * (2**bits - 1 - bias)
     well_e = range_e * float(rng.choice([0.7, 2.0]))
     top_e = 0.93 * min(well_e, range_e)
-    y, x = np.mgrid[:ny, :nx] / np.array([ny, nx])[:, None, None] - 0.5
+    y, x = places(shape)
     response = (1 - rng.uniform(0, 0.3) * (x**2 + y**2)) * (
         1 + rng.uniform(0.003, 0.02) * rng.standard_normal(shape)
     )
@@ -159,6 +158,12 @@ def _converter(rng: np.random.Generator) -> tuple[int, float, float]:
         gain, codes = np.exp(rng.uniform(np.log([0.05, 0.4]), np.log([40, 20])))
         if gain * codes > 0.7 and codes < 2**bits / 250 and 1e3 < gain * 2**bits < 1e6:
             return bits, float(gain), float(gain * codes)
+
+
+def places(shape: tuple[int, int]) -> F64:
+    """Rows and columns over the shape, from -0.5 to 0.5, (2, y, x)."""
+    ny, nx = shape
+    return np.asarray(np.mgrid[:ny, :nx] / np.array([ny, nx])[:, None, None] - 0.5)
 
 
 def middle(sensor: Sensor) -> Series:
