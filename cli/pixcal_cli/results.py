@@ -335,7 +335,7 @@ def show_advice(run: Path) -> None:
         show_table(summary.rows[0], summary.rows[1:])
 
 
-def show_run(run: Path, *, fitted: bool, diagnosed: bool) -> None:
+def show_run(run: Path, fitted: bool, diagnosed: bool) -> None:
     """Print which map to use, the results of all steps, and where the products are."""
     show_advice(run)
     if warnings := read_json(run / "ingest" / MANIFEST)["summary"]["warnings"]:

@@ -43,7 +43,7 @@ def run(acquisition: Path, run: Path, config: options.Run, runtime: "Runtime") -
     from pixcal.stages import chain  # here: for a fast `pixcal --help`
 
     done = chain.run(acquisition, run, config, runtime, results.announce, click.echo)
-    results.show_run(run, fitted=done.fitted, diagnosed=done.diagnosed)
+    results.show_run(run, *done)
 
 
 @command(

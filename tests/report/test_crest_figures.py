@@ -9,7 +9,7 @@ from matplotlib.colors import to_hex
 from PIL import Image
 
 from pixcal.report.colours import BLUE, INK, RED
-from pixcal.report.crest_figures import CrestView, Extract, crest_figure, outermost
+from pixcal.report.crest_figures import CrestView, crest_figure, outermost
 from pixcal.report.drawing import png
 
 
@@ -42,7 +42,7 @@ def a_view(angle: float = 0.0, paths: int = 9, points: int = 7, **changes: Any) 
         "sigma_px": np.full(len(k), 0.01),
         "residual_px": np.full(len(k), -0.02),
         "fibres": (np.array([-500.0, 40.0]), np.array([800.0, 40.0])),
-        "extracts": (Extract(np.ones((40, 30)), (0, 0)), Extract(np.ones((40, 30)), (90, 200))),
+        "extracts": ((np.ones((40, 30)), (0, 0)), (np.ones((40, 30)), (90, 200))),
         "best": (400.0, 6.0),
         "distance_sigma": 0.25,
         "distance_from_prior": False,

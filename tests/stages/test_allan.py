@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pixcal.engine.run import Runtime
 from pixcal.kernels.allan import allan_deviation, averaging_lengths
 from pixcal.model.errors import DamagedError, InputError, PlanError
+from pixcal.stages import allan
 from pixcal.stages.allan import Config
-from pixcal.stages.allan import stage as allan
 from pixcal.storage.artefact import build
 from pixcal.storage.cube import ArrayReader, create_array, create_group, write_array
 from pixcal.storage.manifest import read_json, write_json

@@ -29,7 +29,6 @@ from pixcal.stages.astrometry.detector import (
 )
 from pixcal.stages.astrometry.stars import (
     KINDS,
-    Observation,
     Telescope,
     exposures,
     observe,
@@ -243,7 +242,7 @@ def test_maps_of_noise_are_told_from_maps_that_help(tmp_path: Path) -> None:
     assert found["axes"]["x"]["floor"]["perfect"]["px"] is None
     assert found["axes"]["x"]["floor"]["gain"]["value"] is None
     assert any("below the errors of the maps" in w for w in found["warnings"])
-    assert "not significant" in table(found)[0].perfect
+    assert "not significant" in table(found)[0][2]
     worse = make_run(tmp_path / "worse", added(offsets(4, 1e-3), offsets(5, 2e-3)), 2e-3)
     truth = write_truth(tmp_path / "truth", offsets(4, 1e-3))
     astrometry.run(worse, Config(truth=truth, stars=60, positions=3), SYNC)
@@ -332,10 +331,9 @@ def test_the_map_of_errors_is_what_fits_give(case: Path) -> None:
 
 
 def test_first_order_predicts_every_star(case: Path) -> None:
-    plan = Observation(the_star(), 30, 4, 20.0)
-    errors = dict(
-        zip(KINDS, np.moveaxis(observe(the_detector(case / "run"), plan, SYNC), 2, 0), strict=True)
-    )
+    config = Config(stars=30, positions=4, dither_px=20.0)
+    found = observe(the_detector(case / "run"), the_star(), config, SYNC)
+    errors = dict(zip(KINDS, np.moveaxis(found, 2, 0), strict=True))
     good = np.isfinite(errors["perfect"])
     for kind, linear in (("perfect", "linear"), ("measured", "linear_measured")):
         assert np.all(np.isfinite(errors[kind]) == good)
@@ -512,11 +510,10 @@ def test_tasks_stay_within_their_plan(case: Path, truth: bool) -> None:
     modes = DegenerateModes(SHAPE, ()).n_smooth + 8 if truth else 0
     seen, config = the_star(), Config(positions=9, dither_px=60.0)
     planned, _ = stage.planned(SHAPE, modes, seen.side, config)
-    plan = Observation(seen, 4, 9, 60.0)
     core = stars.core_weights(seen, detector.axes)
     tasks: list[Callable[[], Any]] = [
         lambda: place_errors(detector, seen, (0, SHAPE[0]), (0, SHAPE[1])),
-        lambda: stars.observe_star(detector, plan, core, 1),
+        lambda: stars.observe_star(detector, seen, config, core, 1),
     ]
     for task in tasks:
         task()

@@ -129,7 +129,7 @@ def make(truth: tuple[F64, F64], tmp_path: Path) -> Any:
 def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drawing takes longer than all the rest: one test does it."""
     monkeypatch.setattr(stage, "png", lambda figure: b"")
-    monkeypatch.setattr(stage, "compare_figure", lambda view: None)
+    monkeypatch.setattr(stage, "compare_figure", lambda *_: None)
 
 
 def result(out: Path, *runs: Path, config: Config | None = None, runtime: Runtime = SYNC) -> Any:

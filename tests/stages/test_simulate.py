@@ -21,9 +21,9 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError, PlanError
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import recordings
+from pixcal.stages import simulate
+from pixcal.stages import simulate as simulated_truth
 from pixcal.stages.simulate import Config, run
-from pixcal.stages.simulate import stage as simulate
-from pixcal.stages.simulate import stage as simulated_truth
 from pixcal.storage.artefact import artefact_key
 from pixcal.storage.manifest import read_manifest
 

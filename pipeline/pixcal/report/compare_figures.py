@@ -44,29 +44,19 @@ class ComponentView:
     far: Sequence[tuple[int, int]]  # (y, x) of pixels that disagree
 
 
-@dataclass(frozen=True)
-class PairView:
-    """Two sides, and their components."""
-
-    numbers: tuple[int, int]
-    labels: tuple[str, str]
-    components: Sequence[ComponentView]
-
-
-def compare_figure(view: PairView) -> Figure:
-    """Two rows of panels for each component."""
-    figure = new_figure(WIDE, 5.6 * len(view.components) + 0.4)
-    first, second = view.labels
-    figure.suptitle(f"1: {first}      2: {second}", fontsize=12)
-    parts: Any = figure.subfigures(len(view.components), 1, squeeze=False)
-    for part, component in zip(parts.ravel(), view.components, strict=True):
+def compare_figure(labels: tuple[str, str], components: Sequence[ComponentView]) -> Figure:
+    """Two rows of panels for each component of two sides."""
+    figure = new_figure(WIDE, 5.6 * len(components) + 0.4)
+    figure.suptitle(f"1: {labels[0]}      2: {labels[1]}", fontsize=12)
+    parts: Any = figure.subfigures(len(components), 1, squeeze=False)
+    for part, component in zip(parts.ravel(), components, strict=True):
         top, below = part.subfigures(2, 1, height_ratios=[1.75, 1])
         left, middle, right = top.subplots(1, 3, width_ratios=[1, 1.35, 1.1])
         _against(left, component)
         _scales(middle, component)
         _places(top, right, component)
-        labels = {"columns": "column x (px)", "rows": "row y (px)"}
-        for axes, (name, label) in zip(below.subplots(1, 2), labels.items(), strict=True):
+        places = {"columns": "column x (px)", "rows": "row y (px)"}
+        for axes, (name, label) in zip(below.subplots(1, 2), places.items(), strict=True):
             _profile(axes, component.profiles[name], label, component)
     return figure
 

@@ -20,12 +20,8 @@ LONG_TITLE = 10  # points, so that long numbers stay within their panel
 CREST, VALLEY = RED, BLUE
 
 
-@dataclass(frozen=True)
-class Extract:
-    """A part of a frame: electrons (y, x), NaN where bad, and (y, x) of its first pixel."""
-
-    image: NDArray[Any]
-    start: tuple[int, int]
+# a part of a frame: electrons (y, x), NaN where bad, and (y, x) of its first pixel
+Extract = tuple[NDArray[Any], tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -140,8 +136,9 @@ def _whole(axes: Axes, view: CrestView, paths: I64) -> None:
 
 
 def _extract(axes: Axes, view: CrestView, extract: Extract, title: str) -> None:
-    (y0, x0), (ny, nx) = extract.start, extract.image.shape
-    draw_blocks(axes, extract.image / 1e3, 1, extract.start, cmap="gray")
+    image, (y0, x0) = extract
+    ny, nx = image.shape
+    draw_blocks(axes, image / 1e3, 1, (y0, x0), cmap="gray")
     x, y, every = (view.arrays[name] for name in ("x", "y", "k"))
     for k in np.unique(every):
         axes.plot(x[view.on(k)], y[view.on(k)], color=_colour(int(k)), lw=1.2)

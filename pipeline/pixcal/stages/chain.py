@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 
 from pixcal.engine.run import Runtime
@@ -17,14 +16,6 @@ Config = options.Run
 Step = Callable[[str, Path], AbstractContextManager[None]]
 
 
-@dataclass(frozen=True)
-class Done:
-    """Which steps were possible."""
-
-    fitted: bool
-    diagnosed: bool
-
-
 def run(
     acquisition: Path,
     out: Path,
@@ -32,8 +23,8 @@ def run(
     runtime: Runtime,
     step: Step = lambda _name, _folder: nullcontext(),
     note: Callable[[str], object] = lambda _text: None,
-) -> Done:
-    """Run all steps, each in the context that ``step`` gives.
+) -> tuple[bool, bool]:
+    """Run all steps, each in the context that ``step`` gives; whether it was fitted and diagnosed.
 
     ``note`` is told which diagnosis or correction was not possible; that is no error.
     """
@@ -49,7 +40,7 @@ def run(
             with step("fit", out / "fit"):
                 fit.run(out, of_fit, runtime)
             with step("allan", out / "allan"):
-                allan.run(out, allan.Config(), runtime)
+                allan.run(out, options.Allan(), runtime)
     diagnosed = config.diagnosed
     if diagnosed:
         try:
@@ -65,4 +56,4 @@ def run(
             note(f"no corrected maps (use the maps as fitted): {refused}")
     with step("report", out / "report"):
         report.run(out, options.Report(), runtime)
-    return Done(fringes, diagnosed)
+    return fringes, diagnosed

@@ -30,7 +30,6 @@ from pixcal.stages.astrometry.detector import (
 )
 from pixcal.stages.astrometry.stars import (
     ErrorMaps,
-    Observation,
     Telescope,
     core_weights,
     error_maps,
@@ -118,8 +117,7 @@ def _measure(
             f"{components[0].delta.path}: masked pixels leave no place for a star and its window "
             f"of {observed.side} px; try a smaller --window"
         )
-    plan = Observation(observed, config.stars, config.positions, config.dither_px)
-    errors = observe(detector, plan, runtime)
+    errors = observe(detector, observed, config, runtime)
     result = {
         "schema": SCHEMA,
         "pixcal": __version__,

@@ -15,6 +15,7 @@ from pixcal.kernels.psf import Psf, diffraction_psf
 from pixcal.model.acquisition import Detector as Declared
 from pixcal.model.arrays import C128, F64
 from pixcal.model.errors import InputError
+from pixcal.model.options import Astrometry as Config
 from pixcal.stages.astrometry.detector import PixelPositions
 from pixcal.storage.cube import ArrayWriter, create_group, create_map
 
@@ -84,24 +85,14 @@ def star(psf: Psf, half: int, electrons: float, background: float, detector: Dec
     return Star(psf, half, electrons, background, read_variance)
 
 
-@dataclass(frozen=True)
-class Observation:
-    """Plan of an observation."""
-
-    star: Star
-    stars: int
-    positions: int  # places of each star
-    dither: float  # largest distance (px) from the first place, along x and y
-
-
-def observe(detector: PixelPositions, plan: Observation, runtime: Runtime) -> F64:
+def observe(detector: PixelPositions, star: Star, config: Config, runtime: Runtime) -> F64:
     """Observe and fit stars all over the detector: errors (star, position, kind, component), px.
 
     NaN at unused places and for failed fits.
     """
-    batches = [range(n, min(n + BATCH, plan.stars)) for n in range(0, plan.stars, BATCH)]
-    core = core_weights(plan.star, detector.axes)
-    task = partial(_batch, detector, plan, core)
+    batches = [range(n, min(n + BATCH, config.stars)) for n in range(0, config.stars, BATCH)]
+    core = core_weights(star, detector.axes)
+    task = partial(_batch, detector, star, config, core)
     return np.concatenate(run_tasks(task, batches, runtime, label="stars"))
 
 
@@ -111,20 +102,23 @@ def core_weights(star: Star, axes: F64) -> F64:
     return np.asarray(np.einsum("ka,abyx,kb->kyx", axes, weights, axes))
 
 
-def _batch(detector: PixelPositions, plan: Observation, core: F64, stars: range) -> F64:
-    return np.stack([observe_star(detector, plan, core, n) for n in stars])
+def _batch(detector: PixelPositions, star: Star, config: Config, core: F64, stars: range) -> F64:
+    return np.stack([observe_star(detector, star, config, core, n) for n in stars])
 
 
-def observe_star(detector: PixelPositions, plan: Observation, core: F64, number: int) -> F64:
+def observe_star(
+    detector: PixelPositions, star: Star, config: Config, core: F64, number: int
+) -> F64:
     """Errors (position, kind, component) of one star, px; ``core`` is that of `core_weights`."""
-    star, half, axes = plan.star, plan.star.half, detector.axes
+    half, axes = star.half, detector.axes
     rng = np.random.default_rng([detector.seed, 2, number])
     # The whole window lies on the detector.
     first = np.full(2, half - 0.5)
     last = np.array(detector.shape[::-1]) - half - 0.5
     middle = rng.uniform(first, last)
-    low, high = np.maximum(first, middle - plan.dither), np.minimum(last, middle + plan.dither)
-    at = rng.uniform(low, high, (plan.positions, 2))
+    reach = config.dither_px
+    low, high = np.maximum(first, middle - reach), np.minimum(last, middle + reach)
+    at = rng.uniform(low, high, (config.positions, 2))
     at[0] = middle
     pixel = np.floor(at + 0.5).astype(int)
     corner, end = pixel.min(axis=0) - half, pixel.max(axis=0) + half + 1

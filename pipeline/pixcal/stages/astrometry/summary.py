@@ -13,10 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pixcal.model.arrays import F64
-from pixcal.stages.astrometry.stars import KINDS
+from pixcal.stages.astrometry.stars import GRIDS, KINDS
 
 TARGET_PX = 5e-5  # what a mission to Earth-like planets needs (paper, section 1)
-GRIDS = ("perfect", "measured")
 SEEN = 2.0  # least ratio of a significant mean square to its error
 
 
@@ -35,16 +34,6 @@ class GridComparison(NamedTuple):
     perfect: Value
     measured: Value
     gain: Value
-
-
-class Row(NamedTuple):
-    """A row of the table, as text."""
-
-    case: str
-    axis: str
-    perfect: str
-    measured: str
-    gain: str
 
 
 def compare(perfect: F64, measured: F64, noise: F64, rng: np.random.Generator) -> GridComparison:
@@ -150,8 +139,8 @@ def _facts(comparison: GridComparison, uas_per_px: float) -> dict[str, Any]:
     return {grid: number(getattr(comparison, grid), uas_per_px) for grid in GRIDS} | {"gain": gain}
 
 
-def table(result: Mapping[str, Any]) -> list[Row]:
-    """The main rows of ``astrometry.json``."""
+def table(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """The main rows of ``astrometry.json``: case, axis, perfect grid, measured maps, gain."""
     stars = result["stars"]
     cases = {
         "floor": "no photon noise",
@@ -164,10 +153,9 @@ def table(result: Mapping[str, Any]) -> list[Row]:
     rows = []
     for key, case in cases.items():
         for name, axis in result["axes"].items():
-            perfect, measured = (_length(axis[key][grid]) for grid in GRIDS)
             gain, error = axis[key]["gain"]["value"], axis[key]["gain"]["err"]
             times = "-" if gain is None else with_error(gain, error)
-            rows.append(Row(case, name, perfect, measured, times))
+            rows.append((case, name, *(_length(axis[key][grid]) for grid in GRIDS), times))
     return rows
 
 

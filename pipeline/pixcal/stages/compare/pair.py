@@ -152,10 +152,6 @@ class PairSums:
         """The maps at all scales."""
         return self.part(self.fine[0], self.whole)
 
-    def of_means(self, sums: F64) -> Part:
-        """The part of the maps in means of columns or rows."""
-        return self.part(Grouping.of(sums), self.whole)
-
     def differences(self, sums: F64) -> tuple[F64, F64]:
         """Mean difference, second minus first, of each block, and its error, px; NaN if empty."""
         *_, difference = self.projection.difference(sums[:-3])

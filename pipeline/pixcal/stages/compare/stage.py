@@ -18,9 +18,10 @@ from pixcal.model.arrays import F64
 from pixcal.model.config import result_options
 from pixcal.model.errors import InputError
 from pixcal.model.options import Compare as Config
-from pixcal.report.compare_figures import ComponentView, PairView, compare_figure
+from pixcal.report.compare_figures import ComponentView, compare_figure
 from pixcal.report.drawing import png
 from pixcal.stages.compare.agreement import (
+    Grouping,
     Part,
     VarianceEstimate,
     halve,
@@ -79,10 +80,10 @@ def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Ma
             result, views = _compare_all(sides, components, config, runtime)
             for picture in out.glob("compare*.png"):
                 picture.unlink()
-            for view in views:
-                first, second = view.numbers
-                name = "compare.png" if len(views) == 1 else f"compare-{first}-{second}.png"
-                write_whole(out / name, png(compare_figure(view)))
+            for (i, j), pictured in views.items():
+                name = "compare.png" if len(views) == 1 else f"compare-{i + 1}-{j + 1}.png"
+                labels = sides[i].label, sides[j].label
+                write_whole(out / name, png(compare_figure(labels, pictured)))
             write_json(out / RESULT, result)
             manifest = Manifest(STAGE.name, STAGE.format, key, plain, inputs)
             write_manifest(out, manifest)
@@ -128,8 +129,8 @@ def _angle(a: Vector, b: Vector) -> float:
 
 def _compare_all(
     sides: Sequence[Side], components: dict[str, Vector], config: Config, runtime: Runtime
-) -> tuple[dict[str, Any], list[PairView]]:
-    pairs, views = [], []
+) -> tuple[dict[str, Any], dict[tuple[int, int], list[ComponentView]]]:
+    pairs, views = [], {}
     for i, j in combinations(range(len(sides)), 2):
         results = {
             name: compare_pair(Pair(sides[i], sides[j], name, at), config.sigma_accuracy, runtime)
@@ -137,8 +138,7 @@ def _compare_all(
         }
         facts = {name: component for name, (component, _) in results.items()}
         pairs.append({"sides": [i, j], "components": facts})
-        labels = sides[i].label, sides[j].label
-        views.append(PairView((i + 1, j + 1), labels, [view for _, view in results.values()]))
+        views[i, j] = [view for _, view in results.values()]
     result = {
         "schema": SCHEMA,
         "pixcal": __version__,
@@ -227,7 +227,9 @@ def describe(
             if p.freedom >= 1
         ],
         **{
-            name: _profile(sums.of_means(sums.profiles[name]), *profile, accuracy)
+            name: _profile(
+                sums.part(Grouping.of(sums.profiles[name]), sums.whole), *profile, accuracy
+            )
             for name, profile in profiles.items()
         },
         "blocks": blocks,

@@ -140,7 +140,7 @@ def _corrected_maps(
         left[name] = parameter_errors(opened, runtime)
         target = made.scratch / "corrected" / name
         correct_sweep(opened, target, runtime, name)
-        fitted.append(fit_set(target, opened.source, facts[name], acquisition, name, model))
+        fitted.append(fit_set(target, opened.source, facts[name], acquisition, model))
     group = made.folder / "corrected.zarr"
     totals = write_maps(group, fitted, runtime)
     axes = {name: tuple(before["sets"][name]["axis"]) for name in sets}

@@ -74,8 +74,7 @@ class Swept:
     def carrier(self) -> Carrier:
         """Carrier of the phases."""
         facts = read_json(self.folder / "scout.json")
-        (kx, ky), (y, x) = facts["k"], facts["reference"]
-        return Carrier((float(kx), float(ky)), (float(y), float(x)))
+        return Carrier(tuple(facts["k"]), tuple(facts["reference"]))
 
     @cached_property
     def frames(self) -> FittedFrames:

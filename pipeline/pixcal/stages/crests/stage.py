@@ -218,4 +218,4 @@ def _extract_at(source: ReducedSet, frame: int, paths: CrestPaths, k: int) -> Ex
     places = zip((paths.y[near], paths.x[near]), source.shape, strict=True)
     y, x = (int(np.clip(round(at) - side // 2, 0, max(0, n - side))) for at, n in places)
     values, good = read_patch(source, frame, (y, y + side), (x, x + side))
-    return Extract(np.where(good, values, np.nan), (y, x))
+    return np.where(good, values, np.nan), (y, x)

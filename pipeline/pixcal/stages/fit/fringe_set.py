@@ -58,8 +58,6 @@ class FittedSet:
     shape: FringeShape  # with the fitted parameters
     model: str  # model, evidence: name of the shape, and why it was chosen
     evidence: str
-    # typical reduced chi-square: the variance of the samples over that of the noise model
-    noise: float
     # difference of maps of the two halves of the frames over its error, if that is too small
     excess: float = 1.0
 
@@ -77,7 +75,7 @@ class FittedSet:
     @property
     def sigma_scale(self) -> float:
         """Errors of the phases over those of the noise model."""
-        return self.excess * float(np.sqrt(self.noise))
+        return self.excess * float(np.sqrt(self.facts["chi2_reduced"]))
 
     @property
     def n_batches(self) -> int:
@@ -93,29 +91,18 @@ def fit_sets(
     model: str,
 ) -> list[FittedSet]:
     """Fit the shape of the fringes of every set, see `fit_set`."""
+    swept = sweep / "sweep.zarr"
     return [
-        fit_set(
-            sweep / "sweep.zarr" / name,
-            ReducedSet(reduced / name),
-            facts[name],
-            acquisition,
-            name,
-            model,
-        )
+        fit_set(swept / name, ReducedSet(reduced / name), facts[name], acquisition, model)
         for name in (listed.name for listed in acquisition.frames.fringes)
     ]
 
 
 def fit_set(
-    swept: Local,
-    source: ReducedSet,
-    facts: dict[str, Any],
-    acquisition: Acquisition,
-    name: str,
-    model: str,
+    swept: Local, source: ReducedSet, facts: dict[str, Any], acquisition: Acquisition, model: str
 ) -> FittedSet:
     """Fit the shape of a set's fringes, of this ``model`` or ``auto``, to its sweep."""
-    rows = ArrayReader(swept / "sums").read()
+    name, rows = source.folder.name, ArrayReader(swept / "sums").read()
     tiles = TileSums.of_rows(rows.reshape(-1, rows.shape[-1]))
     if not any(np.isfinite(p.sigma) for p in tiles.planes):
         raise InputError(
@@ -123,39 +110,13 @@ def fit_set(
             f"{source.n_frames} frames, or the mask leaves no pixel"
         )
     tiles = replace(tiles, planes=list(unwrap(tiles.planes, source.grid)))
-    start = _start(source, facts, tiles.planes, acquisition, name)
+    reference: tuple[float, float] = tuple(facts["reference"])
+    nominal = nominal_geometry(acquisition, name, reference)
+    start = Start(tuple(facts["k"]), reference, max(source.shape) / 2, tiles.planes, nominal)
     fitted, evidence = _choose(model, tiles, start)
     shape = fitted.basis.shape.moved(fitted.coefficients[: len(fitted.basis.shape.names), 0])
     chosen = next(n for n, cls in fringe_models().items() if isinstance(shape, cls))
-    return FittedSet(
-        name,
-        source,
-        swept,
-        facts,
-        tiles.planes,
-        fitted,
-        shape,
-        chosen,
-        evidence,
-        float(facts["chi2_reduced"]),
-    )
-
-
-def _start(
-    source: ReducedSet,
-    facts: dict[str, Any],
-    planes: list[TilePlane],
-    acquisition: Acquisition,
-    name: str,
-) -> Start:
-    reference = (float(facts["reference"][0]), float(facts["reference"][1]))
-    return Start(
-        k=(float(facts["k"][0]), float(facts["k"][1])),
-        reference=reference,
-        scale=max(source.shape) / 2,
-        planes=planes,
-        nominal=nominal_geometry(acquisition, name, reference),
-    )
+    return FittedSet(name, source, swept, facts, tiles.planes, fitted, shape, chosen, evidence)
 
 
 def _choose(model: str, tiles: TileSums, start: Start) -> tuple[SetFit, str]:
@@ -239,7 +200,7 @@ def describe(fitted: FittedSet, masked: int, sigma_px: float) -> dict[str, Any]:
         "visibility": float(1 / ratio),
         "sigma_median_px": sigma_px,
         "crb_median_px": None if facts["bound_rad"] is None else facts["bound_rad"] / k,
-        "chi2_reduced": fitted.noise,
+        "chi2_reduced": facts["chi2_reduced"],
         "sigma_scale": fitted.sigma_scale,
         "fringe_vector_moves": facts["moving"],
         "iterations": fit.steps,

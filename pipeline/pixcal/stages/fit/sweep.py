@@ -154,7 +154,7 @@ def sweep_set(
     kept = STRIP * (40 + 16 * n_batches)
     per_task = cy * cx * (held + 900 + 24 * n_batches + kept + source.more_bytes)
     runtime = within_memory(f"the fit of {name}", per_task, CACHE_BYTES, runtime)
-    carrier = Carrier((float(facts["k"][0]), float(facts["k"][1])), frames.reference)
+    carrier = Carrier(tuple(facts["k"]), frames.reference)
     usual = (facts["noise"], facts["excess_scatter"])
     number = _bound_pixels(source)
     common = SetSweep(source.coding, frames, carrier.k, batches, prime, number)
@@ -291,13 +291,6 @@ def scout_tiles(grid: tuple[int, int], number: int) -> list[tuple[int, int]]:
     return [(int(tiles[n][0]), int(tiles[n][1])) for n in chosen]
 
 
-def _write_frames(folder: Local, parts: Sequence[FrameParameters], time_s: F64) -> None:
-    g = np.concatenate([p.g for p in parts])
-    dk = np.concatenate([p.dk for p in parts])
-    for array, data in (("g", g), ("dk", dk), ("time", time_s)):
-        write_array(folder / array, data, dims=("time", "component")[: data.ndim])
-
-
 def scout_set(
     source: ReducedSet, nominal: tuple[float, float], folder: Local, runtime: Runtime, name: str
 ) -> None:
@@ -342,7 +335,9 @@ def scout_set(
             runtime,
             label=f"scout {name}",
         )
-    _write_frames(folder, parts, source.time_s())
+    arrays = {name: np.concatenate([getattr(p, name) for p in parts]) for name in ("g", "dk")}
+    for array, data in (arrays | {"time": source.time_s()}).items():
+        write_array(folder / array, data, dims=("time", "component")[: data.ndim])
     again = 0 if keep else len(places) * (source.n_blocks + len(first))
     facts: dict[str, Any] = {
         "k": [float(v) for v in scout.k],
@@ -383,7 +378,5 @@ def _first_look(source: ReducedSet, blocks: int) -> list[tuple[int, Indices]]:
 
 def read_frames(folder: Local) -> FrameParameters:
     """Frame parameters that the scout wrote to ``sweep.zarr/<set name>``."""
-    y, x = read_json(folder / "scout.json")["reference"]
-    return FrameParameters(
-        ArrayReader(folder / "g").read(), ArrayReader(folder / "dk").read(), (float(y), float(x))
-    )
+    g, dk = (ArrayReader(folder / name).read() for name in ("g", "dk"))
+    return FrameParameters(g, dk, tuple(read_json(folder / "scout.json")["reference"]))
