@@ -4,17 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from blind_examination.draw import (
-    LEFT_OUT,
-    NOTHING,
-    ONE,
-    SECOND_NOTHING,
-    SECOND_ONE,
-    SECOND_OTHER,
-    SECOND_PAIR,
-    SEVERAL,
-    Truth,
-)
+from blind_examination import draw
+from blind_examination.draw import Truth
 from blind_examination.offsets import AxisError
 from blind_examination.parameters import check_parameters
 from pixcal.effects import effects
@@ -65,14 +56,14 @@ class Grade:
 
 # questions of each part; the first one decides
 QUESTIONS = {
-    SECOND_ONE: ("named first", "nothing else named", "explained"),
-    SECOND_NOTHING: ("no gap", "no cause claimed"),
-    SECOND_PAIR: ("all found, none invented", "all found", "none invented"),
-    SECOND_OTHER: ("honest", "not called explained", "nobody blamed for most"),
-    ONE: ("named first",),
-    NOTHING: ("no cause claimed", "no gap"),
-    SEVERAL: ("all found, none invented", "all found", "none invented"),
-    LEFT_OUT: ("honest", "not called explained", "nobody blamed for most", "right domain"),
+    draw.SECOND_ONE: ("named first", "nothing else named", "explained"),
+    draw.SECOND_NOTHING: ("no gap", "no cause claimed"),
+    draw.SECOND_PAIR: ("all found, none invented", "all found", "none invented"),
+    draw.SECOND_OTHER: ("honest", "not called explained", "nobody blamed for most"),
+    draw.ONE: ("named first",),
+    draw.NOTHING: ("no cause claimed", "no gap"),
+    draw.SEVERAL: ("all found, none invented", "all found", "none invented"),
+    draw.LEFT_OUT: ("honest", "not called explained", "nobody blamed for most", "right domain"),
 }
 
 
@@ -106,21 +97,21 @@ def grade(case: str, truth: Truth, diagnosis: Diagnosis | None, error: str = "")
 
 def _answers(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> tuple[bool, ...]:
     verdict = diagnosis["verdict"]
-    if truth.part == ONE:
+    if truth.part == draw.ONE:
         return (named[:1] == truth.names,)
-    if truth.part == SECOND_ONE:
+    if truth.part == draw.SECOND_ONE:
         return named[:1] == truth.names, set(named) <= set(truth.names), verdict == "explained"
-    if truth.part == NOTHING:
+    if truth.part == draw.NOTHING:
         return not named, verdict == "no gap"
-    if truth.part == SECOND_NOTHING:
+    if truth.part == draw.SECOND_NOTHING:
         return verdict == "no gap", not named
-    if truth.part in (SEVERAL, SECOND_PAIR):
+    if truth.part in (draw.SEVERAL, draw.SECOND_PAIR):
         complete, invented = set(truth.names) <= set(named), set(named) - set(truth.names)
         return complete and not invented, complete, not invented
     honest = verdict in ("unexplained", "partly explained")
     blamed = any(cause["gap_closed"] > BLAMED for cause in diagnosis["causes"])
     answers = honest and not blamed, honest, not blamed
-    if truth.part == SECOND_OTHER:
+    if truth.part == draw.SECOND_OTHER:
         return answers
     # Whether the worst statistics include a domain in which the effect is visible.
     domains = {domain for name in truth.names for domain in effects()[name].domains}
@@ -149,13 +140,13 @@ def _parameters(truth: Truth, diagnosis: Diagnosis) -> list[dict[str, Any]]:
 def _why(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> str:
     """Reason of a wrong answer, from the diagnosis."""
     verdict, causes = f"verdict {diagnosis['verdict']!r}", diagnosis["causes"]
-    if truth.part in (NOTHING, SECOND_NOTHING):
+    if truth.part in (draw.NOTHING, draw.SECOND_NOTHING):
         reasons = [
             f"{c['effect']} claimed (p = {c['p_value']:.1e}, closes {c['gap_closed']:.2f})"
             for c in causes
         ]
         return "; ".join(reasons) or verdict
-    if truth.part in (LEFT_OUT, SECOND_OTHER):
+    if truth.part in (draw.LEFT_OUT, draw.SECOND_OTHER):
         blamed = [c for c in causes if c["gap_closed"] > BLAMED]
         reasons = [f"{c['effect']} credited with {c['gap_closed']:.2f} of the gap" for c in blamed]
         return "; ".join(reasons) or verdict

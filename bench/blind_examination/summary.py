@@ -7,16 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from blind_examination.draw import (
-    LEFT_OUT,
-    NOTHING,
-    ONE,
-    PARTS,
-    SECOND_NOTHING,
-    SECOND_ONE,
-    SECOND_OTHER,
-    SEVERAL,
-)
+from blind_examination import draw
 from blind_examination.grade import QUESTIONS, WITHIN, Grade
 from blind_examination.offsets import AXES, AxisError
 
@@ -27,15 +18,15 @@ PLACE = "right place, by the true effect"
 NEAR = 0.05  # by which the share closed may differ from the oracle's
 # shares that the diagnosis is to reach
 TARGETS = {
-    (SECOND_ONE, "named first"): 0.95,
-    (SECOND_ONE, "nothing else named"): 0.95,
-    (SECOND_ONE, "explained"): 0.85,
-    (SECOND_NOTHING, "no gap"): 0.95,
-    (SECOND_OTHER, "honest"): 0.9,
-    (ONE, FROM_TWICE): 0.95,
-    (NOTHING, "no cause claimed"): 0.95,
-    (SEVERAL, "pairs: both found"): 0.85,
-    (LEFT_OUT, "honest"): 0.9,
+    (draw.SECOND_ONE, "named first"): 0.95,
+    (draw.SECOND_ONE, "nothing else named"): 0.95,
+    (draw.SECOND_ONE, "explained"): 0.85,
+    (draw.SECOND_NOTHING, "no gap"): 0.95,
+    (draw.SECOND_OTHER, "honest"): 0.9,
+    (draw.ONE, FROM_TWICE): 0.95,
+    (draw.NOTHING, "no cause claimed"): 0.95,
+    (draw.SEVERAL, "pairs: both found"): 0.85,
+    (draw.LEFT_OUT, "honest"): 0.9,
 }
 # Cramér-Rao bounds that the median error of corrected maps is to be at most, where an effect biases
 # them
@@ -45,7 +36,7 @@ BOUNDS = 1.3
 def summary(grades: Sequence[Grade]) -> dict[str, Any]:
     """Counts of every part, with intervals and targets, and the confusion of causes."""
     parts = {}
-    for part, title in PARTS.items():
+    for part, title in draw.PARTS.items():
         own = [g for g in grades if g.part == part]
         if own:
             questions = {q: _count(g.marks[q] for g in own) for q in QUESTIONS[part]}
@@ -55,8 +46,8 @@ def summary(grades: Sequence[Grade]) -> dict[str, Any]:
                 if target is not None:
                     count |= {"target": target}
             parts[str(part)] = {"title": title, "cases": len(own), "questions": questions}
-    one = [g for g in grades if g.part == ONE]
-    second = [g for g in grades if g.part == SECOND_ONE]
+    one = [g for g in grades if g.part == draw.ONE]
+    second = [g for g in grades if g.part == draw.SECOND_ONE]
     return {
         "cases": [asdict(g) | {"right": g.right} for g in grades],
         "parts": parts,
@@ -72,7 +63,7 @@ def summary(grades: Sequence[Grade]) -> dict[str, Any]:
 
 
 def _more_questions(part: int, own: Sequence[Grade]) -> dict[str, dict[str, Any]]:
-    if part == ONE:
+    if part == draw.ONE:
         return {
             FROM_TWICE: _count(g.right for g in own if _clear(g)),
             **{
@@ -87,10 +78,10 @@ def _more_questions(part: int, own: Sequence[Grade]) -> dict[str, dict[str, Any]
                 if g.closed is not None and g.oracle is not None
             ),
         }
-    if part == SEVERAL:
+    if part == draw.SEVERAL:
         pairs = [g for g in own if len(g.truth) == 2]
         return {"pairs: both found": _count(g.marks["all found"] for g in pairs)}
-    if part == LEFT_OUT:
+    if part == draw.LEFT_OUT:
         return {PLACE: _count(g.marks[PLACE] for g in own if PLACE in g.marks)}
     return {}
 

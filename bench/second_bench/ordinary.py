@@ -4,14 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from second_bench.less_common import (
-    LESS_COMMON,
-    SHARE,
-    vary_camera,
-    vary_light,
-    vary_runs,
-    without_dropped,
-)
+from second_bench import less_common
 from second_bench.model import EXPTIME_S, F64, TOP_ADU, Beam, Bench, FringeSet, Run, new_run, stream
 
 VARIATIONS = (
@@ -32,7 +25,7 @@ VARIATIONS = (
     "stitches",
     "noisy_pixels",
     "lamp",
-    *LESS_COMMON,
+    *less_common.LESS_COMMON,
 )
 """What differs from bench to bench."""
 CHANCE = {
@@ -46,7 +39,7 @@ CHANCE = {
     "stitches": 0.3,
     "noisy_pixels": 0.3,
     "lamp": 0.5,
-    **SHARE,
+    **less_common.SHARE,
 }
 """With which probability, where that is not one."""
 PITCH_UM, WAVELENGTH_NM, DISTANCE_MM, PERIOD_S = 4.4, 632.8, 400.0, 0.14
@@ -107,12 +100,12 @@ def draw_bench(layout: Layout, seed: int, varied: set[str]) -> Bench:
     )
     bench.notes = {"gain_e_per_adu": gain, "read_noise_e": read, "peak_e": peak}
     _vary_detector(bench, varied)
-    vary_camera(bench, varied)
+    less_common.vary_camera(bench, varied)
     bench.sets = _draw_sets(bench, varied)[: layout.sets]
-    vary_light(bench, varied)
+    less_common.vary_light(bench, varied)
     bench.flat_response = bench.response * (_lamp(bench) if "lamp" in varied else 1.0)
     bench.runs = _draw_runs(bench, layout, varied)
-    vary_runs(bench, varied)
+    less_common.vary_runs(bench, varied)
     return bench
 
 
@@ -284,7 +277,9 @@ def _draw_runs(bench: Bench, layout: Layout, varied: set[str]) -> list[Run]:
         law = str(rng.choice(PHASE_LAWS)) if "phases" in varied else "random"
         lost = 3 if "dropped_frames" in varied else 0
         phases = draw_phases(law, run.frames + lost, rng)
-        run.phase = without_dropped(phases, lost, stream(bench.seed, "dropped", one.name))
+        run.phase = less_common.without_dropped(
+            phases, lost, stream(bench.seed, "dropped", one.name)
+        )
         bench.notes[one.name]["phases"] = law
         runs.append(run)
     return runs

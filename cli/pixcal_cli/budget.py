@@ -54,10 +54,8 @@ def _show(plan: Mapping[str, Any]) -> None:
     noise = sum(plan["variance_e2"].values()) ** 0.5
     click.echo(f"budget: {plan['bench']['file']}, {nx} × {ny} px, {noise:.3g} e- rms without light")
     _show_sets(plan)
-    if plan["precision_px"] is not None:
-        _show_wanted(plan)
-    if plan["frames"] is not None:
-        _show_given(plan)
+    _show_bound(plan, "precision_px", "\nfor {:g} px on each axis", "wanted", WANTED)
+    _show_bound(plan, "frames", "\nwith {} frames of each set", "given", GIVEN)
     _show_shares(plan)
     _show_calibration(plan)
     _show_levers(plan)
@@ -79,31 +77,28 @@ def _show_sets(plan: Mapping[str, Any]) -> None:
     show_records("set", plan["sets"], columns)
 
 
-def _alone_and_joined(plan: Mapping[str, Any], key: str) -> dict[str, Any]:
+WANTED: Columns = {
+    "frames": itemgetter("frames"),
+    "time": lambda w: _hours(w["hours"]),
+    "data": lambda w: _size(w["bytes"]),
+    "frames, worst px": itemgetter("frames_worst"),
+}
+GIVEN: Columns = {
+    "median px": lambda g: f"{g['median_px']:.3g}",
+    "worst px": lambda g: f"{g['worst_px']:.3g}",
+}
+
+
+def _show_bound(
+    plan: Mapping[str, Any], option: str, title: str, key: str, columns: Columns
+) -> None:
     """What each set gives alone and, for more than one, each axis with all of them."""
-    entries = {f"{name} alone": s[key] for name, s in plan["sets"].items()}
+    if plan[option] is None:
+        return
+    click.echo(title.format(plan[option]))
     joined = plan["joined"]["components"] if len(plan["sets"]) > 1 else {}
-    return entries | {f"{name}, all sets": c[key] for name, c in joined.items()}
-
-
-def _show_wanted(plan: Mapping[str, Any]) -> None:
-    click.echo(f"\nfor {plan['precision_px']:g} px on each axis")
-    columns: Columns = {
-        "frames": itemgetter("frames"),
-        "time": lambda w: _hours(w["hours"]),
-        "data": lambda w: _size(w["bytes"]),
-        "frames, worst px": itemgetter("frames_worst"),
-    }
-    show_records("", _alone_and_joined(plan, "wanted"), columns)
-
-
-def _show_given(plan: Mapping[str, Any]) -> None:
-    click.echo(f"\nwith {plan['frames']} frames of each set")
-    columns: Columns = {
-        "median px": lambda g: f"{g['median_px']:.3g}",
-        "worst px": lambda g: f"{g['worst_px']:.3g}",
-    }
-    show_records("", _alone_and_joined(plan, "given"), columns)
+    entries = {f"{name} alone": s[key] for name, s in plan["sets"].items()}
+    show_records("", entries | {f"{n}, all sets": c[key] for n, c in joined.items()}, columns)
 
 
 def _show_shares(plan: Mapping[str, Any]) -> None:

@@ -14,23 +14,12 @@ import click
 
 from pixcal import __version__
 from pixcal.model.errors import ClusterError, PixcalError
+from pixcal_cli import steps
 from pixcal_cli.blind import blind
 from pixcal_cli.budget import budget
 from pixcal_cli.centroids import centroids, wcs
 from pixcal_cli.click_options import examples
 from pixcal_cli.compare import compare
-from pixcal_cli.steps import (
-    allan,
-    astrometry,
-    crests,
-    diagnose,
-    fit,
-    ingest,
-    reduce,
-    report,
-    run,
-    simulate,
-)
 
 LONG_WORD = 600
 """Characters of a word, such as a value that makes no sense, that are not shown in full."""
@@ -47,19 +36,19 @@ class InOrder(click.Group):
 @click.group(
     cls=InOrder,
     commands=[
-        run,
-        ingest,
-        reduce,
-        fit,
-        allan,
-        crests,
-        diagnose,
-        astrometry,
+        steps.run,
+        steps.ingest,
+        steps.reduce,
+        steps.fit,
+        steps.allan,
+        steps.crests,
+        steps.diagnose,
+        steps.astrometry,
         centroids,
         wcs,
-        report,
+        steps.report,
         compare,
-        simulate,
+        steps.simulate,
         budget,
         blind,
     ],

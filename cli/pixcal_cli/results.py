@@ -11,10 +11,13 @@ from typing import Any
 
 import click
 
-from pixcal.report.text import chance, not_tested, share_by_law, times
+from pixcal.report.text import chance, not_tested, ratio, share_by_law, times
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.manifest import MANIFEST, read_json
 from pixcal_cli.printing import Columns, number, show_notes, show_records, show_table, with_error
+
+MAX_NAMED = 3  # most statistics in a line
+MAX_ROWS = 8  # most differences that are printed
 
 
 @contextmanager
@@ -75,7 +78,8 @@ def show_reduce(run: Path) -> None:
     shown = [
         (f["title"], f"{_figure(f['value'], f['error'])} {f['unit']}".rstrip(), f["note"])
         for key, f in facts.get("figures_of_merit", {}).items()
-        if not key.endswith(_PARTS)
+        # The JSON and the report have its parts as well.
+        if not key.endswith(("_row", "_column", "_pixel"))
     ]
     if shown:
         gain = "declared" if facts["gain_e_per_adu"]["measured"] is None else "measured"
@@ -83,10 +87,6 @@ def show_reduce(run: Path) -> None:
     counts = ", ".join(f"{count} {flag}" for flag, count in facts["flags"].items() if count)
     click.echo(f"  pixels: {counts}")
     show_notes(facts["warnings"])
-
-
-_PARTS = ("_row", "_column", "_pixel")
-"""Parts of a figure of merit, which the JSON and the report have."""
 
 
 def show_fit(run: Path) -> None:
@@ -98,7 +98,7 @@ def show_fit(run: Path) -> None:
         "fringe period px": lambda s: number(s["interfringe_px"], 5),
         "sigma px": lambda s: number(s["sigma_median_px"], 3),
         "bound px": lambda s: number(s["crb_median_px"], 3),
-        "sigma/bound": lambda s: number(_ratio(s["sigma_median_px"], s["crb_median_px"]), 3),
+        "sigma/bound": lambda s: number(ratio(s["sigma_median_px"], s["crb_median_px"]), 3),
         "chi2": lambda s: number(s["chi2_reduced"]),
     }
     show_records("set", sets, columns)
@@ -250,11 +250,6 @@ def _show_cause(cause: Mapping[str, Any]) -> None:
         click.echo(f"  recommended frames to distinguish {cause['effect']} from {others}: {frames}")
 
 
-MAX_NAMED = 3  # most statistics in a line
-MAX_ROWS = 8
-"""Largest number of differences that are printed."""
-
-
 def _closed(share: float, interval: Sequence[float]) -> str:
     low, high = (100 * end for end in interval)
     return f"{100 * share:.1f} % ({low:.1f} to {high:.1f} %)"
@@ -262,34 +257,31 @@ def _closed(share: float, interval: Sequence[float]) -> str:
 
 def show_crests(run: Path) -> None:
     """Print the points, the fibres and the difference from the fit for each set."""
+    parameters = ("centre_x", "centre_y", "distance", "baseline_x", "baseline_y", "baseline_z")
     for name, facts in read_json(run / "crests" / "crests.json")["sets"].items():
-        _show_crests_of(name, facts)
-        click.echo(f"  {run / 'products' / f'crests-{name}.png'}")
-
-
-def _show_crests_of(name: str, facts: Mapping[str, Any]) -> None:
-    click.echo(
-        f"  {name}: {facts['points_used']} of {facts['points']} points, error per point "
-        f"{facts['point_sigma_median_px']:.2g} px, chi2 {facts['chi2_reduced']:.3g}"
-    )
-    geometry, agreement = facts["geometry"], facts["agreement"]
-    for parameter in ("centre_x", "centre_y", "distance", "baseline_x", "baseline_y", "baseline_z"):
-        value, sigma = geometry[f"{parameter}_mm"], geometry[f"{parameter}_sigma_mm"]
-        line = f"    {parameter:10s} {value:.6g} ± {sigma:.2g} mm"
-        if agreement is not None:
-            other = agreement["parameters"][parameter]
-            origin = ", mostly from its prior" if other["from_prior"] else ""
-            line += f", {other['difference_sigma']:+.2f} sigma from the fit{origin}"
-        click.echo(line)
-    if agreement is None:
-        click.echo(f"    not compared: {facts['agreement_note']}")
-    else:
         click.echo(
-            f"    phase difference: {agreement['phase_rms_px']:.2g} px rms, "
-            f"{agreement['phase_sigma_px']:.2g} px expected"
+            f"  {name}: {facts['points_used']} of {facts['points']} points, error per point "
+            f"{facts['point_sigma_median_px']:.2g} px, chi2 {facts['chi2_reduced']:.3g}"
         )
-    for sentence in facts["warnings"]:
-        click.echo(f"    note: {sentence}")
+        geometry, agreement = facts["geometry"], facts["agreement"]
+        for parameter in parameters:
+            value, sigma = geometry[f"{parameter}_mm"], geometry[f"{parameter}_sigma_mm"]
+            line = f"    {parameter:10s} {value:.6g} ± {sigma:.2g} mm"
+            if agreement is not None:
+                other = agreement["parameters"][parameter]
+                origin = ", mostly from its prior" if other["from_prior"] else ""
+                line += f", {other['difference_sigma']:+.2f} sigma from the fit{origin}"
+            click.echo(line)
+        if agreement is None:
+            click.echo(f"    not compared: {facts['agreement_note']}")
+        else:
+            click.echo(
+                f"    phase difference: {agreement['phase_rms_px']:.2g} px rms, "
+                f"{agreement['phase_sigma_px']:.2g} px expected"
+            )
+        for sentence in facts["warnings"]:
+            click.echo(f"    note: {sentence}")
+        click.echo(f"  {run / 'products' / f'crests-{name}.png'}")
 
 
 def show_astrometry(run: Path) -> None:
@@ -349,10 +341,6 @@ def show_run(run: Path, fitted: bool, diagnosed: bool) -> None:
     click.echo("\nproducts")
     for file in sorted((run / "products").iterdir()):
         click.echo(f"  {file}")
-
-
-def _ratio(a: float | None, b: float | None) -> float | None:
-    return a / b if a is not None and b else None
 
 
 def _figure(value: float, error: float | None) -> str:

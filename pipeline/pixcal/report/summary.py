@@ -7,7 +7,7 @@ import numpy as np
 
 from pixcal.report.contents import Contents, DiagnosisContents, SetContents
 from pixcal.report.diagnosis_words import level, listed, residual_gap
-from pixcal.report.text import NAMES, NO_OFFSETS, duration, number, share, unit, with_error
+from pixcal.report.text import NAMES, NO_OFFSETS, duration, number, ratio, share, unit, with_error
 
 TARGET_PX = 5e-5  # target precision of a calibration (paper, section 4.2)
 
@@ -127,14 +127,12 @@ def _diagnosis_card(diagnosis: DiagnosisContents) -> Card:
 
 
 def _bound_card(sets: Sequence[SetContents]) -> Card:
-    ratios = {
-        s.name: _ratio(s.facts.get("sigma_median_px"), s.facts.get("crb_median_px")) for s in sets
-    }
+    ratios = [_over_bound(s.facts) for s in sets]
     return Card(
         "σ / Cramér–Rao bound",
-        ", ".join(number(ratio, 4) for ratio in ratios.values()),
-        f"{', '.join(ratios)}; 1 is the limit for any unbiased estimate",
-        max((_bound_level(ratio) for ratio in ratios.values()), key=SEVERITY.index),
+        ", ".join(number(value, 4) for value in ratios),
+        f"{', '.join(s.name for s in sets)}; 1 is the limit for any unbiased estimate",
+        max(map(_bound_level, ratios), key=SEVERITY.index),
     )
 
 
@@ -206,10 +204,10 @@ def _of_sets(sets: Sequence[SetContents]) -> Iterator[tuple[str, str]]:
 
 
 def _of_set(facts: dict[str, Any], allan: dict[str, Any] | None) -> Iterator[FindingTemplate]:
-    ratio = _ratio(facts.get("sigma_median_px"), facts.get("crb_median_px"))
-    if ratio is not None:
+    relative = _over_bound(facts)
+    if relative is not None:
         text = "errors relative to the Cramér–Rao bound: {}"
-        yield _bound_level(ratio), text, number(ratio, 4)
+        yield _bound_level(relative), text, number(relative, 4)
     scale = facts.get("sigma_scale")
     if scale is not None and abs(scale - 1) > 0.02:
         yield (
@@ -295,13 +293,13 @@ def _of_target(facts: dict[str, Any]) -> Iterator[FindingTemplate]:
     )
 
 
-def _ratio(above: float | None, below: float | None) -> float | None:
-    return above / below if above is not None and below else None
+def _over_bound(facts: Mapping[str, Any]) -> float | None:
+    return ratio(facts.get("sigma_median_px"), facts.get("crb_median_px"))
 
 
-def _bound_level(ratio: float | None) -> str:
+def _bound_level(value: float | None) -> str:
     """Severity of errors over their bound; below it the declared noise is too large."""
-    return CHECK if ratio is not None and ratio < 0.98 else _level(ratio, 1.1, 1.5)
+    return CHECK if value is not None and value < 0.98 else _level(value, 1.1, 1.5)
 
 
 def _level(value: float | None, good: float, tolerable: float) -> str:

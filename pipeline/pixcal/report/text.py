@@ -120,6 +120,11 @@ _NOTATION = {
 }
 
 
+def ratio(above: float | None, below: float | None) -> float | None:
+    """A quotient; None if a value is unknown, or the divisor zero."""
+    return above / below if above is not None and below else None
+
+
 def sigmas(value: float | None) -> str:
     """A significance; limited to a thousand sigma, beyond which numbers are meaningless."""
     if value is None:

@@ -97,7 +97,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             for name, found in facts.items()
         }
         for batches in sets.values():
-            for region in (config.region, *config.regions):
+            for region in filter(None, (config.region, *config.regions)):
                 _check_region(region, batches.window)
 
         def body(made: Build) -> None:
@@ -112,9 +112,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         return make(run_dir, STAGES["allan"], result_options(config), inputs, body)
 
 
-def _check_region(region: Region | None, window: tuple[int, int]) -> None:
-    if region is None:
-        return
+def _check_region(region: Region, window: tuple[int, int]) -> None:
     y0, y1, x0, x1 = region
     if not (0 <= y0 < y1 <= window[0] and 0 <= x0 < x1 <= window[1]):
         raise InputError(

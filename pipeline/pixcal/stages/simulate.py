@@ -85,7 +85,10 @@ def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
             f"--truth {apart.final}: one directory contains the other ({there.final}); choose "
             "another"
         )
-    effects = _checked_effects(plan, bench, config.own)
+    effects = parse_effects(plan.effects, str(bench), known_effects(config.own))
+    for effect in effects:
+        with naming(f"{bench}: effects.{effect.name}"):
+            effect.check(plan)
     own = {f"effect {file.name}": file_digest(file) for file in config.own}
     key = artefact_key(STAGE.name, STAGE.format, to_plain(plan), own)
     before = there.up_to_date(key)
@@ -114,15 +117,6 @@ def acquire(bench: Bench, effects: Effects, folder: Path, runtime: Runtime) -> N
     runtime = _fitting(bench, recorded, effects, runtime)
     _write_frames(bench, effects, recorded, folder, runtime)
     _write_description(bench, folder)
-
-
-def _checked_effects(bench: Bench, where: Path, own: tuple[Path, ...]) -> Effects:
-    """Effects of a bench file, which must be consistent with the bench."""
-    found = parse_effects(bench.effects, str(where), known_effects(own))
-    for effect in found:
-        with naming(f"{where}: effects.{effect.name}"):
-            effect.check(bench)
-    return found
 
 
 def _fitting(

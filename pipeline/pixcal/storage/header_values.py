@@ -5,7 +5,7 @@ needed to read the data (`integer`) are an error.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from typing import Any
@@ -87,33 +87,31 @@ def number(header: Header, key: str, default: float | None = None) -> float | No
     return result if math.isfinite(result) else None
 
 
+def _numbers(headers: tuple[Header, ...], *keys: str) -> Iterator[tuple[float, str]]:
+    """Finite numbers of some keys, and their comments in lower case."""
+    for key in keys:
+        for header in headers:
+            if (found := number(header, key)) is not None:
+                yield found, header.comment(key).lower()
+
+
 def exposure_s(headers: tuple[Header, ...]) -> float | None:
     """Exposure time (s) from EXPTIME, else EXPOSURE."""
-    for key in ("EXPTIME", "EXPOSURE"):
-        for header in headers:
-            time = number(header, key)
-            if time is not None and time >= 0:
-                return time
-    return None
+    return next((time for time, _ in _numbers(headers, "EXPTIME", "EXPOSURE") if time >= 0), None)
 
 
 def temperature_c(headers: tuple[Header, ...]) -> float | None:
     """Temperature in degrees Celsius, converted from kelvin if the comment says so."""
-    for key in ("CCD-TEMP", "DET-TEMP", "TEMPERAT", "CCDTEMP", "TEMP"):
-        for header in headers:
-            degrees = number(header, key)
-            if degrees is not None:
-                comment = header.comment(key).lower()
-                kelvin = "[k]" in comment or "kelvin" in comment
-                return degrees + -273.15 if kelvin else degrees
+    keys = ("CCD-TEMP", "DET-TEMP", "TEMPERAT", "CCDTEMP", "TEMP")
+    for degrees, comment in _numbers(headers, *keys):
+        return degrees + -273.15 if "[k]" in comment or "kelvin" in comment else degrees
     return None
 
 
 def time_stamp_mjd(headers: tuple[Header, ...]) -> float | None:
     """Time stamp from MJD-OBS if it is a date, else from DATE-OBS if it has the time of day."""
-    for header in headers:
-        mjd = number(header, "MJD-OBS")
-        if mjd is not None and FIRST_MJD <= mjd <= LAST_MJD:
+    for mjd, _ in _numbers(headers, "MJD-OBS"):
+        if FIRST_MJD <= mjd <= LAST_MJD:
             return mjd
     for header in headers:
         text, clock = value(header, "DATE-OBS"), value(header, "TIME-OBS")

@@ -183,19 +183,15 @@ def _matches(pattern: str, description: Path, place: str) -> set[str]:
             f"{place}: {pattern!r:.80} cannot be used ({reason!s:.80}); correct it"
         ) from error
     names = {path.relative_to(folder) for path in paths}
-    if not any(map(_hidden, parts)):
-        # Such as the '._…' that some systems leave.
-        names = {name for name in names if not any(map(_hidden, name.parts))}
+    if not any(part.startswith(".") for part in parts):
+        # Hidden ones, such as the '._…' that some systems leave.
+        names = {name for name in names if not any(part.startswith(".") for part in name.parts)}
     if not names:
         raise InputError(
             f"{place}: {pattern!r:.80} matches no file in {folder}; correct it, or remove it from "
             "the list"
         )
     return {name.as_posix() for name in names}
-
-
-def _hidden(part: str) -> bool:
-    return part.startswith(".")
 
 
 def _source(

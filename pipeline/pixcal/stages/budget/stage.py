@@ -19,25 +19,8 @@ from pixcal.model.errors import InputError, naming
 from pixcal.model.options import Budget as Config
 from pixcal.report.budget_figures import budget_figure
 from pixcal.report.drawing import png
-from pixcal.stages.budget.expected import (
-    JoinedBound,
-    SetBound,
-    Shares,
-    WeightErrors,
-    bias_frames_needed,
-    brightest_allowed,
-    flat_error,
-    flats_needed,
-    frame_rms,
-    frames_needed,
-    joined,
-    own_effects,
-    phase_information,
-    pixel_contrast,
-    planned_split,
-    sample_variance,
-    unweighted_variance,
-)
+from pixcal.stages.budget import expected
+from pixcal.stages.budget.expected import Shares
 from pixcal.storage.manifest import digest, write_json, write_whole
 
 SCHEMA = "pixcal/budget/1"
@@ -53,11 +36,11 @@ FINER_PX = (5.0, 4.0, 3.0)
 def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, Any]:
     """Compute the budget of a bench; write ``budget.json`` and ``budget.png`` to ``out``."""
     bench = load_bench(bench_file)
-    own_effects(bench, str(bench_file))
+    expected.own_effects(bench, str(bench_file))
     if not bench.frames.fringes:
         raise InputError(f"{bench_file}: frames.fringes: no fringe sets, nothing to budget")
     with naming(str(bench_file)):
-        bound = joined(bench)
+        bound = expected.joined(bench)
     for scan, s in zip(bench.frames.fringes, bound.sets, strict=True):
         if not np.isfinite(s.loss[0]):
             raise InputError(
@@ -83,9 +66,9 @@ def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, 
 
 
 def _budget(
-    bench: Bench, bound: JoinedBound, precision: float | None, frames: int | None
+    bench: Bench, bound: expected.JoinedBound, precision: float | None, frames: int | None
 ) -> dict[str, Any]:
-    d, f, split = bench.detector, bench.frames, planned_split(bench)
+    d, f, split = bench.detector, bench.frames, expected.planned_split(bench)
     counts = [s.count for s in f.fringes]
     given = None if frames is None else np.full(len(counts), frames)
 
@@ -93,7 +76,7 @@ def _budget(
         """Precision of one frame and of given frames, and the cost of the required precision."""
         (median, worst), wanted = reach(one), _cost(bench, reach(one)[0], precision)
         if wanted and precision is not None:
-            wanted["frames_worst"] = frames_needed(worst, precision)
+            wanted["frames_worst"] = expected.frames_needed(worst, precision)
         return {
             "frame_px": {"median": median**0.5, "worst": worst**0.5},
             "planned": _reached(reach, planned),
@@ -106,7 +89,7 @@ def _budget(
         shares = s.shares()
         limited_by = _limited_by(shares)
         if precision is not None:
-            shares["photons_frames"] = frames_needed(shares["photons"], precision)
+            shares["photons_frames"] = expected.frames_needed(shares["photons"], precision)
         sets[scan.name] = {
             "interfringe_px": s.interfringe,
             "mean_e": float(np.median(s.iota)),
@@ -145,7 +128,7 @@ def _budget(
 
 
 def _time(variance: float, period_s: float, precision: float | None) -> dict[str, Any]:
-    frames = None if precision is None else frames_needed(variance, precision)
+    frames = None if precision is None else expected.frames_needed(variance, precision)
     return {"frames": frames, "hours": None if frames is None else frames * period_s / 3600}
 
 
@@ -160,7 +143,7 @@ def _cost(bench: Bench, variance: float, precision: float | None) -> dict[str, A
     """Frames for a precision, their time and their bytes."""
     if precision is None:
         return None
-    n, (ny, nx) = frames_needed(variance, precision), bench.detector.shape
+    n, (ny, nx) = expected.frames_needed(variance, precision), bench.detector.shape
     hours = n * bench.frames.period_s / 3600
     return {"frames": n, "hours": hours, "bytes": n * ny * nx * 2}  # two bytes a sample
 
@@ -170,16 +153,16 @@ def _reached(reach: Reach, frames: Shares) -> dict[str, Any]:
     return {"frames": round(sum(frames)), "median_px": median**0.5, "worst_px": worst**0.5}
 
 
-def _calibration(bench: Bench, s: SetBound) -> dict[str, Any]:
+def _calibration(bench: Bench, s: expected.SetBound) -> dict[str, Any]:
     """Bias and flat frames needed, and the cost of those planned."""
     n, f = s.typical, bench.frames
-    errors = WeightErrors.of(float(s.iota[n]), float(s.alpha[n]), s.variance)
-    level, flat = float(np.median(s.iota)), flat_error(bench)
+    errors = expected.WeightErrors.of(float(s.iota[n]), float(s.alpha[n]), s.variance)
+    level, flat = float(np.median(s.iota)), expected.flat_error(bench)
     return {
-        "bias_frames_needed": bias_frames_needed(errors, s.variance),
+        "bias_frames_needed": expected.bias_frames_needed(errors, s.variance),
         "bias_frames": f.bias,
-        "bias_error_e": (sample_variance(bench) / f.bias) ** 0.5 if f.bias else None,
-        "flats_needed": flats_needed(errors, level, s.variance),
+        "bias_error_e": (expected.sample_variance(bench) / f.bias) ** 0.5 if f.bias else None,
+        "flats_needed": expected.flats_needed(errors, level, s.variance),
         "flats": sum(step.count for step in f.flats),
         "flat_error": flat,
         "flat_cost": errors.scale * (flat**2 if flat is not None else bench.detector.prnu_rms**2),
@@ -209,11 +192,11 @@ def _left_out(bench: Bench) -> list[str]:
     return sentences
 
 
-def _warnings(bench: Bench, bound: JoinedBound) -> list[str]:
-    sentences, limit = [], brightest_allowed(bench)
+def _warnings(bench: Bench, bound: expected.JoinedBound) -> list[str]:
+    sentences, limit = [], expected.brightest_allowed(bench)
     ny, nx = bench.detector.shape
     for number, (scan, s) in enumerate(zip(bench.frames.fringes, bound.sets, strict=True)):
-        noise = s.variance + scan.peak_e + (frame_rms(bench, number)[0] * scan.peak_e) ** 2
+        noise = s.variance + scan.peak_e + (expected.frame_rms(bench, number)[0] * scan.peak_e) ** 2
         top = scan.peak_e + MARGIN * noise**0.5
         if limit is not None and top > limit:
             sentences.append(
@@ -249,36 +232,36 @@ class Lever:
     note: str = ""  # its assumption, or ""
 
 
-def levers(bench: Bench, now: JoinedBound) -> list[Lever]:
+def levers(bench: Bench, now: expected.JoinedBound) -> list[Lever]:
     """Possible changes of the bench, the most helpful first, and the loss of equal weights."""
-    split, period = planned_split(bench), bench.frames.period_s
+    split, period = expected.planned_split(bench), bench.frames.period_s
     best = now.best_split()
     candidates = [Lever("as planned", _worse(now, split), period)]
     for name, changed, contrast, note in _changes(bench, now):
-        variance = _worse(joined(changed, contrast), split)
+        variance = _worse(expected.joined(changed, contrast), split)
         candidates.append(Lever(name, variance, changed.frames.period_s, note))
     if len(now.components) == 2 and np.abs(best - split).max() > 0.02:
         shares = " : ".join(f"{100 * s:.0f}" for s in best)
         candidates.append(Lever(f"frames shared {shares} %", _worse(now, best), period))
     plain = []
     for s in now.sets:
-        unweighted = unweighted_variance(s.iota, s.alpha, s.variance, s.frames)
-        information = phase_information(s.iota, s.alpha, s.variance, s.frames)
+        unweighted = expected.unweighted_variance(s.iota, s.alpha, s.variance, s.frames)
+        information = expected.phase_information(s.iota, s.alpha, s.variance, s.frames)
         ratio = float(np.median(unweighted * information))
         plain.append(replace(s, loss=(s.loss[0] * ratio, s.loss[1] * ratio)))
-    equal = _worse(JoinedBound(tuple(plain)), split)
+    equal = _worse(expected.JoinedBound(tuple(plain)), split)
     candidates.append(Lever("equal weights", equal, period, "needs more frames: not recommended"))
     return sorted(candidates, key=lambda lever: lever.variance * lever.period_s)
 
 
-def _worse(bound: JoinedBound, split: F64) -> float:
+def _worse(bound: expected.JoinedBound, split: F64) -> float:
     return float(bound.median(split).max())
 
 
 Change = tuple[str, Bench, list[float] | None, str]
 
 
-def _changes(bench: Bench, now: JoinedBound) -> list[Change]:
+def _changes(bench: Bench, now: expected.JoinedBound) -> list[Change]:
     """(name, bench, contrast of each set, note) of every applicable change."""
     d, f = bench.detector, bench.frames
     changes = _finer_fringes(bench, now)
@@ -290,7 +273,7 @@ def _changes(bench: Bench, now: JoinedBound) -> list[Change]:
         new = [replace(s, **{key: value(s) for key, value in of_set.items()}) for s in f.fringes]
         return replace(f, fringes=tuple(new))
 
-    limit = brightest_allowed(bench)
+    limit = expected.brightest_allowed(bench)
     if limit is not None and min(s.peak_e for s in f.fringes) < 0.95 * limit:
         fuller = with_sets(peak_e=lambda s: max(s.peak_e, limit))
         add(f"brightest fringe at {limit / 1e3:.3g} ke-", "no margin", frames=fuller)
@@ -312,7 +295,7 @@ def _changes(bench: Bench, now: JoinedBound) -> list[Change]:
     return changes
 
 
-def _finer_fringes(bench: Bench, now: JoinedBound) -> list[Change]:
+def _finer_fringes(bench: Bench, now: expected.JoinedBound) -> list[Change]:
     """Longer baselines, down to the next fringe period of `FINER_PX`."""
     widest = max(s.interfringe for s in now.sets)
     wanted = next((w for w in FINER_PX if w < 0.9 * widest), None)
@@ -324,7 +307,9 @@ def _finer_fringes(bench: Bench, now: JoinedBound) -> list[Change]:
         bx, by = scan.baseline_mm
         longer.append(replace(scan, baseline_mm=(bx * stretch, by * stretch)))
         kx, ky = np.array(s.axis) * float(s.k[s.typical])
-        contrast.append(pixel_contrast(kx * stretch, ky * stretch) / pixel_contrast(kx, ky))
+        contrast.append(
+            expected.pixel_contrast(kx * stretch, ky * stretch) / expected.pixel_contrast(kx, ky)
+        )
     length = max(float(np.hypot(*scan.baseline_mm)) for scan in longer)
     changed = replace(bench, frames=replace(bench.frames, fringes=tuple(longer)))
     loss = 100 * (1 - min(contrast))
