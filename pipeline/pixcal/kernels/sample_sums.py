@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.kernels import inner, kernel
+from pixcal.kernels import kernel
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
@@ -25,68 +25,26 @@ def calm_residuals(
     good; the mean variance (t,) of the good pixels; the number (2, n) of residuals of good pixels
     below and above each limit.
     """
-    # Not in compiled code, where large arrays come without huge pages: that takes as long again.
-    calm, kept = np.empty_like(samples), np.empty_like(samples)
+    calm, kept = np.zeros_like(samples), np.zeros_like(samples)
     variance, beyond = np.zeros(len(samples)), np.zeros((2, len(limits)))
-    _calm(samples, model, shot, read, good, most, limits, calm, kept, variance, beyond)
+    square = np.float32(most**2)
+    # Frame by frame, to stay in the cache.
+    for t, (own, signal) in enumerate(zip(samples, model, strict=True)):
+        noise = shot * np.maximum(signal, np.float32(0)) + read
+        rest = own - signal
+        inside = good & (rest * rest < square * noise)
+        np.copyto(kept[t], rest, where=inside)
+        np.divide(rest, np.sqrt(noise), out=calm[t], where=inside)
+        variance[t] = np.sum(noise, dtype=float, where=good)
+        beyond += count_beyond(rest, noise, good, limits)
     return calm, kept, variance / max(int(np.count_nonzero(good)), 1), beyond
 
 
-@kernel()
-def _calm(
-    samples: F32, model: F32, shot: F32, read: F32, good: Mask, most: float, limits: F64,
-    calm: F32, kept: F32, variance: F64, beyond: F64,
-) -> None:  # fmt: skip
-    square, least = np.float32(most**2), np.float32(limits[0] ** 2)
-    for t in range(samples.shape[0]):
-        for y in range(samples.shape[1]):
-            total, found = _calm_row(
-                samples[t, y], model[t, y], shot[y], read[y], good[y], square, least,
-                calm[t, y], kept[t, y],
-            )  # fmt: skip
-            variance[t] += total
-            if found > 0:
-                for x in range(samples.shape[2]):
-                    if good[y, x]:
-                        one = samples[t, y, x] - model[t, y, x]
-                        noise = shot[y, x] * max(model[t, y, x], np.float32(0)) + read[y, x]
-                        _count(one, noise, limits, beyond)
-
-
-@inner(fastmath=_FAST, error_model="numpy")
-def _calm_row(
-    samples: F32, model: F32, shot: F32, read: F32, good: Mask, square: float, least: float,
-    calm: F32, kept: F32,
-) -> tuple[np.float32, np.float32]:  # fmt: skip
-    """Sum of the variances of a row, and how many residuals are to be counted."""
-    zero, one = np.float32(0), np.float32(1)
-    total = found = zero
-    # Selections instead of joined conditions, as the compiler vectorises them.
-    for x in range(samples.size):
-        rest = samples[x] - model[x]
-        variance = shot[x] * max(model[x], zero) + read[x]
-        weight = one if good[x] else zero
-        # Both are false of NaN.
-        here = rest * rest < square * variance
-        far = one if rest * rest > least * variance else zero
-        size = rest / np.sqrt(variance) if here else zero
-        value = rest if here else zero
-        calm[x] = size if good[x] else zero
-        kept[x] = value if good[x] else zero
-        total += variance if good[x] else zero
-        found += far * weight
-    return total, found
-
-
-@inner()
-def _count(rest: float, variance: float, limits: F64, beyond: F64) -> None:
-    for n in range(len(limits)):
-        if rest * rest > limits[n] ** 2 * variance:
-            beyond[int(rest > 0), n] += 1
-
-
 def count_beyond(rest: F32, variance: F32, good: Mask, limits: F64) -> F64:
-    """How many residuals of good pixels are below and above (2, n) ascending limits, in sigmas."""
+    """How many residuals of good pixels are below and above (2, n) ascending limits, in sigmas.
+
+    ``rest, variance``: (..., y, x), NaN left out; ``good``: (y, x).
+    """
     far = good & (rest * rest > np.float32(limits[0] ** 2) * variance)
     some = rest[far]
     beyond = (some * some)[:, None] > limits**2 * variance[far][:, None]

@@ -9,13 +9,11 @@ all frames, are removed first: a nonlinear response cannot pass for noise.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from pixcal.estimators.diagnosis.distortions import Freedom, TwoWay
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, cached_on_evidence
-from pixcal.kernels import kernel
 from pixcal.kernels.boundaries import REACH, boundary_pushes, shared_noise
 from pixcal.kernels.line_means import without_line_means
 from pixcal.kernels.normal_matrix import inverse_normal
@@ -187,66 +185,21 @@ def pair_sums(
     step : rows (not negative) and columns to the second pixel
     margin : pixels along the edges that are not used
     """
-    sums = np.zeros((_TERMS, _TERMS + 1))
-    scratch = np.empty((2, noise.residual.shape[2]), np.float32)
-    _sum(
-        noise.residual, noise.variance, noise.charge, *shared, noise.covariance, noise.of_place,
-        *step, margin, *scratch, sums,
-    )  # fmt: skip
-    normal = np.triu(sums[:, :_TERMS])
-    return normal + np.triu(normal, 1).T, sums[:, _TERMS]
-
-
-# Loops vectorise only if sums may be reordered and row views have no negative indices.
-@kernel(fastmath={"reassoc", "contract"})
-def _sum(
-    residual: Any, variance: Any, charge: Any, shared1: Any, shared2: Any, covariance: Any,
-    of_place: Any, dy: int, dx: int, margin: int, taken: Any, share: Any, sums: Any,
-) -> None:  # fmt: skip
-    frames, ny, nx = residual.shape
+    (dy, dx), (ny, nx) = step, noise.residual.shape[1:]
     left, right = margin + max(0, -dx), nx - margin - max(0, dx)
-    zero = np.float32(0)
-    for t in range(frames):
-        for y in range(margin, ny - margin - dy):
-            one, other = residual[t, y, left:right], residual[t, y + dy, left + dx : right + dx]
-            var1, var2 = variance[t, y, left:right], variance[t, y + dy, left + dx : right + dx]
-            q1, q2 = charge[t, y, left:right], charge[t, y + dy, left + dx : right + dx]
-            first, second = shared1[t, y, left:right], shared2[t, y, left:right]
-            for x in range(right - left):
-                taken[x] = 0
-            for i in range(len(of_place)):
-                for x in range(right - left):
-                    share[x] = 0
-                for j in range(len(of_place)):
-                    factor = covariance[t, i, j]
-                    there = of_place[j, y + dy, left + dx : right + dx]
-                    for x in range(right - left):
-                        share[x] += factor * there[x]
-                here = of_place[i, y, left:right]
-                for x in range(right - left):
-                    taken[x] += share[x] * here[x]
-            n = n_q = n_a = n_b = qq = qa = qb = aa = ab = bb = r = rq = ra = rb = zero
-            for x in range(right - left):
-                product = one[x] * other[x]
-                w = np.float32(1) / (var1[x] * var2[x]) if product != 0 else zero
-                product = product + taken[x]
-                q, a, b = q1[x] + q2[x], first[x], second[x]
-                n += w
-                n_q += w * q
-                n_a += w * a
-                n_b += w * b
-                qq += w * q * q
-                qa += w * q * a
-                qb += w * q * b
-                aa += w * a * a
-                ab += w * a * b
-                bb += w * b * b
-                r += w * product
-                rq += w * product * q
-                ra += w * product * a
-                rb += w * product * b
-            row = ((n, n_q, n_a, n_b, r), (zero, qq, qa, qb, rq), (zero, zero, aa, ab, ra),
-                   (zero, zero, zero, bb, rb))  # fmt: skip
-            for i in range(_TERMS):
-                for j in range(_TERMS + 1):
-                    sums[i, j] += row[i][j]
+    here = np.s_[..., margin : ny - margin - dy, left:right]
+    there = np.s_[..., margin + dy : ny - margin, left + dx : right + dx]
+    functions = len(noise.of_place)
+    one, other = (noise.of_place[at].reshape(functions, -1) for at in (here, there))
+    sums = np.zeros((_TERMS, _TERMS + 1))
+    for residual, variance, charge, first, second, covariance in zip(
+        noise.residual, noise.variance, noise.charge, *shared, noise.covariance, strict=True
+    ):
+        product = (residual[here] * residual[there]).ravel()
+        both = (variance[here] * variance[there]).ravel()
+        weight = np.where(product != 0, 1 / both, np.float32(0))
+        product += np.einsum("ix,ix->x", one, covariance @ other)
+        own = (charge[here] + charge[there], first[here], second[here])
+        terms = np.stack([np.ones_like(product), *(term.ravel() for term in own)])
+        sums += (terms * weight) @ np.vstack([terms, product]).T
+    return sums[:, :_TERMS], sums[:, _TERMS]
