@@ -73,7 +73,7 @@ def test_the_sums_are_those_of_the_terms(step: int) -> None:
         product = e * shifted(e, *LINKS[step]) * weight
         expected += np.array([(product * term).sum(axis=0) for term in each])
     np.testing.assert_allclose(right[step], expected, rtol=1e-4, atol=1e-4)
-    for (i, j), place in NORMAL.items():
+    for (i, j), place in np.ndenumerate(NORMAL):
         own_sum = np.zeros((7, 21))
         for _, charge, one in terms:
             weight, each = formulae(charge, one)

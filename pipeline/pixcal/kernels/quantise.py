@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F32
@@ -136,22 +137,13 @@ def coefficients(
     return slope.astype(np.float32), start.astype(np.float32), dark.astype(np.float32)
 
 
-@inner()
-def _extremes_of_row(raw: Any, saturation: float, lowest: Any, highest: Any) -> None:
-    for i in range(raw.size):
-        sample = np.float32(raw[i])
-        good = sample < saturation
-        lowest[i] = sample if good & (sample < lowest[i]) else lowest[i]
-        highest[i] = sample if good & (sample > highest[i]) else highest[i]
-
-
-@kernel()
-def extremes(raw: Any, saturation: float, lowest: Any, highest: Any, x0: int = 0) -> None:
+def extremes(raw: NDArray[Any], saturation: float, lowest: F32, highest: F32, x0: int = 0) -> None:
     """Widen the range of each pixel's samples below saturation by those of more frames.
 
     ``raw``: as in `encode`. ``lowest``, ``highest``: (y, x) float32, initially +inf and -inf.
     """
-    for y in range(raw.shape[1]):
-        for t in range(raw.shape[0]):
-            row = raw[t, y, x0 : x0 + lowest.shape[1]]
-            _extremes_of_row(row, saturation, lowest[y], highest[y])
+    for frame in raw[:, :, x0 : x0 + lowest.shape[1]]:
+        samples = frame.astype(np.float32)
+        good = samples < saturation  # false for NaN
+        np.minimum(lowest, np.where(good, samples, np.inf), out=lowest)
+        np.maximum(highest, np.where(good, samples, -np.inf), out=highest)

@@ -34,10 +34,14 @@ Frames = tuple[F32, F32, F32]  # factor, charge over sigma, and one over sigma, 
 MIN_CHARGE, ABOVE_READ = 0.1, 4.0
 TINY = np.float32(1e-20)
 TERMS = 5  # D, D', 1, D D', D² + D'²
-# index of each normal sum; terms 2 and 3 share their sum with 0 and 1
-NORMAL = {(0, 0): 0, (0, 1): 1, (1, 1): 2, (0, 2): 3, (1, 2): 4, (2, 2): 5, (0, 3): 6,
-          (1, 3): 7, (3, 3): 8, (2, 3): 1, (0, 4): 9, (1, 4): 10, (2, 4): 11, (3, 4): 12,
-          (4, 4): 13}  # fmt: skip
+# index of the normal sum of each two terms; terms 2 and 3 share theirs with 0 and 1
+NORMAL = np.array([
+    [0, 1, 3, 6, 9],
+    [1, 2, 4, 7, 10],
+    [3, 4, 5, 1, 11],
+    [6, 7, 1, 8, 12],
+    [9, 10, 11, 12, 13],
+])  # fmt: skip
 NORMALS = 14
 
 

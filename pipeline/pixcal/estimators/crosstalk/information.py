@@ -118,19 +118,12 @@ def _backed(value: F64, normal: F64, right: F64) -> Mask:
 def _shares(right: F64, normal: F64, read: float) -> tuple[F64, F64]:
     """Sums of the shares alone (link, u, u), with the constant and brighter-fatter free."""
     links, _, count = right.shape
-    free = range(2, TERMS)
-
-    def block(i: int, j: int) -> F64:
-        return normal[:, NORMAL[min(i, j), max(i, j)]]
-
+    every = normal[:, NORMAL]
     own: F64 = np.zeros((links, count, 2, count, 2))
     at = np.arange(count)
-    for i in range(2):
-        for j in range(2):
-            own[:, at, i, at, j] = block(i, j)
-    cross = np.stack([np.stack([block(i, j) for j in free], -1) for i in range(2)], -2)
-    cross = cross.reshape(links, 2 * count, -1)
-    nuisance = np.stack([np.stack([block(i, j).sum(-1) for j in free], -1) for i in free], -2)
+    own[:, at, :, at] = np.moveaxis(every[:, :2, :2], -1, 0)
+    cross = np.moveaxis(every[:, :2, 2:], -1, 1).reshape(links, 2 * count, -1)
+    nuisance = every[:, 2:, 2:].sum(-1)
     nuisance += np.diag([read**-2] + [(BRIGHTER_FATTER * UNIT) ** -2] * 2)
     taken = cross @ np.linalg.inv(nuisance)
     shares = right[:, :2].swapaxes(1, 2).reshape(links, -1)
@@ -169,7 +162,7 @@ def to_first_order(
             offsets[4] = falls * (both / 2 + 2 * shared)
         for i in range(TERMS):
             for j, offset in offsets.items():
-                right[n, i] -= found.normal[n, NORMAL[min(i, j), max(i, j)]] * offset
+                right[n, i] -= found.normal[n, NORMAL[i, j]] * offset
     return replace(found, right=right)
 
 
@@ -192,10 +185,7 @@ def level_dependence(
         if not slope:
             continue
         sums = found.normal[n].sum(axis=(1, 2), dtype=float)
-        normal = np.array(
-            [[sums[NORMAL[min(i, j), max(i, j)]] for j in _ONE_LAW] for i in _ONE_LAW]
-        )
-        covariance = inverse_normal(normal)
+        covariance = inverse_normal(sums[NORMAL[np.ix_(_ONE_LAW, _ONE_LAW)]])
         value = float(covariance[-1] @ found.right[n, list(_ONE_LAW)].sum(axis=(1, 2), dtype=float))
         right += slope * value / float(covariance[-1, -1])
         weight += slope**2 / float(covariance[-1, -1])

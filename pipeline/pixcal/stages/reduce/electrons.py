@@ -73,7 +73,7 @@ def signal_range(fringes: FringeSet, strip: Strip) -> tuple[float, float]:
     highest = [-low for low in lowest]
     for _, samples in blocks(fringes.raw, strip):
         for n, (low, high) in enumerate(zip(lowest, highest, strict=True)):
-            extremes(samples, np.float32(fringes.saturation), low, high, n * CHUNK[2])
+            extremes(samples, fringes.saturation, low, high, n * CHUNK[2])
     found = [_range_e(fringes, *of) for of in zip(every, lowest, highest, strict=True)]
     return min(low for low, _ in found), max(high for _, high in found)
 

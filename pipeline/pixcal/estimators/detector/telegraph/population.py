@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq, minimize
-from scipy.special import expit, gammaln, xlogy
+from scipy.special import expit, gammaln, logsumexp, softmax, xlogy
 
 from pixcal.estimators.detector.telegraph.classes import (
     AMPLITUDES,
@@ -195,22 +195,18 @@ def _expected(
     pixels: Indices, parts: Sequence[Moments], unit: float, stays: Stays, lag: int
 ) -> tuple[F64, list[F64]]:
     """Result of `joined`, and the expected products of frames (n, class) of each series."""
-    totals = [np.zeros((len(m.pixel), len(AMPLITUDES))) for m in parts]
-    weight, largest = np.zeros((2, len(pixels), len(AMPLITUDES)))
-    largest -= np.inf
-    every = np.full(len(pixels), -np.inf)
+    ratios, quiets = [], []
+    products: list[list[F64]] = [[] for _ in parts]
     for noise, share in own_noises(parts):
         classes = [AmplitudeClasses.of(m, unit, stays, noise) for m in parts]
         ratio, quiet = of_own_noise(pixels, parts, classes)
-        ratio += quiet[:, None] + share
-        np.logaddexp(every, quiet + share, out=every)
-        before, largest = largest, np.maximum(largest, ratio)
-        kept, now = np.exp(before - largest), np.exp(ratio - largest)
-        weight = weight * kept + now
-        for m, one, total in zip(parts, classes, totals, strict=True):
-            at = np.searchsorted(pixels, m.pixel)
-            total *= kept[at]
-            total += now[at] * one.expected(lag)
+        quiets.append(quiet + share)
+        ratios.append(ratio + quiets[-1][:, None])
+        for own, one in zip(products, classes, strict=True):
+            own.append(one.expected(lag))
+    weight = softmax(ratios, axis=0)
     ats = (np.searchsorted(pixels, m.pixel) for m in parts)
-    expected = [total / weight[at] for total, at in zip(totals, ats, strict=True)]
-    return largest + np.log(weight) - every[:, None], expected
+    expected = [
+        np.einsum("snk,snk->nk", weight[:, at], own) for at, own in zip(ats, products, strict=True)
+    ]
+    return logsumexp(ratios, axis=0) - logsumexp(quiets, axis=0)[:, None], expected
