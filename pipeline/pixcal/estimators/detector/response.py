@@ -244,30 +244,18 @@ def _best_falloff(found: F64, otherwise_px: float, of_any: float) -> Boundaries:
     curved, slope, _ = bends[2]
     error = 1 / np.sqrt(-curved) if curved < 0 else np.inf
     if error > MAX_LOG_ERROR:
-        given = int(np.argmin(np.abs(_FINE_PX - otherwise_px)))
-        size, variance, gain, against, ratio, own = found[given].tolist()
-        return Boundaries(
-            otherwise_px, np.inf, size, variance**0.5, 0.0, against, of_any - gain, ratio, own, 0.0
-        )
-    top = float(-slope / (2 * curved))
-    # Limited to the range tried; the distance from the maximum adds to the error.
-    there = float(np.clip(top, *np.log(_FINE_PX[[0, -1]] / _FINE_PX[best])))
-    error = float(np.hypot(error, top - there))
-    size, variance, gain, against, ratio, own = (
-        value + float(np.polyval(bend, there))
-        for value, bend in zip(found[best].tolist(), bends, strict=True)
-    )
-    rises = [error * float(np.polyval(np.polyder(bend), there)) for bend in bends]
-    falloff = float(_FINE_PX[best] * np.exp(there))
-    return Boundaries(
-        falloff,
-        falloff * error,
-        size,
-        variance**0.5,
-        rises[0],
-        against,
-        of_any - gain,
-        ratio,
-        own,
-        rises[4],
-    )
+        falloff, falloff_error, rises = otherwise_px, np.inf, np.zeros(len(bends))
+        values = found[np.argmin(np.abs(_FINE_PX - otherwise_px))]
+    else:
+        top = float(-slope / (2 * curved))
+        # Limited to the range tried; the distance from the maximum adds to the error.
+        there = float(np.clip(top, *np.log(_FINE_PX[[0, -1]] / _FINE_PX[best])))
+        error = float(np.hypot(error, top - there))
+        falloff = float(_FINE_PX[best] * np.exp(there))
+        falloff_error = falloff * error
+        values = found[best] + [np.polyval(bend, there) for bend in bends]
+        rises = error * np.array([np.polyval(np.polyder(bend), there) for bend in bends])
+    size, variance, gain, against, ratio, own = values.tolist()
+    shift = size, variance**0.5, float(rises[0])
+    axes = ratio, own, float(rises[4])
+    return Boundaries(falloff, falloff_error, *shift, against, of_any - gain, *axes)

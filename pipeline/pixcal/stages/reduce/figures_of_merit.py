@@ -77,11 +77,8 @@ def characterise(
     scale = gain[0] / facts["gain_e_per_adu"]["used"]
     _dark_current(found, made, source, job, scale, middle)
     for name, figure in found.items():
-        if (
-            figure["unit"].startswith("e-")
-            and name != "conversion_gain"
-            and figure["error"] is not None
-        ):
+        by_gain = figure["unit"].startswith("e-") and name != "conversion_gain"
+        if by_gain and figure["error"] is not None:
             of_gain = figure["value"] * (gain[1] or 0.0) / gain[0]
             figure["error"] = math.hypot(figure["error"], of_gain)
     write_json(made.folder / "figures_of_merit.json", curves)

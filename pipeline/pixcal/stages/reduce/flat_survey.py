@@ -71,10 +71,8 @@ class FlatSurvey:
         step = code_step([flats]) if whole else 1
         levels: list[float] = []
         tops: list[_Top] = []
-        for number in range(flats.shape[0]):
-            if number % TOGETHER == 0:
-                several = middle_rows(flats, number, number + TOGETHER)
-            samples = several[number % TOGETHER]
+        blocks = range(0, flats.shape[0], TOGETHER)
+        for samples in (s for n in blocks for s in middle_rows(flats, n, n + TOGETHER)):
             levels.append(float(np.nanmean(samples)) - pedestal)
             if whole:
                 top = int(samples.max())
@@ -133,10 +131,10 @@ def rough_gain(arrays: Mapping[str, Reader], levels: F64, groups: Sequence[Seque
     """
     dark = next((arrays[name] for name in ("bias", "dark") if name in arrays), None)
     read = 0.0 if dark is None or dark.shape[0] < 2 else _noise_of_pair(dark, 0, 1)
-    pairs = [(group[0], group[1]) for group in groups if len(group) > 1]
     found = [
-        (_noise_of_pair(arrays["flat"], *pair) - read, float(levels[[*pair]].mean()))
-        for pair in pairs
+        (_noise_of_pair(arrays["flat"], *group[:2]) - read, float(levels[list(group[:2])].mean()))
+        for group in groups
+        if len(group) > 1
     ]
     photons, level = max(found, default=(0.0, 0.0))
     if not (photons > 0 and level > 0):

@@ -214,9 +214,7 @@ class Ingested:
 
         The declared level, else that at which flats pile up, else the largest value of the type.
         """
-        end = MOST_ADU
-        if self._is_integer(name):
-            end = float(np.iinfo(self.arrays[name].dtype).max)
+        end = self._ends(name)[1]
         return min(self.detector.saturation_adu or self.saturation_found or end, end)
 
     @property
@@ -238,9 +236,10 @@ class Ingested:
 
     def lowest(self, name: str) -> float:
         """Least sample (ADU) that an array can hold."""
-        if self._is_integer(name):
-            return float(np.iinfo(self.arrays[name].dtype).min)
-        return -math.inf
+        return self._ends(name)[0]
 
-    def _is_integer(self, name: str) -> bool:
-        return self.arrays[name].dtype.kind in "iu"
+    def _ends(self, name: str) -> tuple[float, float]:
+        dtype = self.arrays[name].dtype
+        if dtype.kind not in "iu":
+            return -math.inf, MOST_ADU
+        return float(np.iinfo(dtype).min), float(np.iinfo(dtype).max)
