@@ -215,7 +215,7 @@ def test_every_frame_is_read_once(
     monkeypatch.setattr(
         frame_decoding, "_read_exactly", counted(frame_decoding._read_exactly, read_bytes)
     )
-    monkeypatch.setattr(ingest, "unpack", counted(ingest.unpack, unpacked))
+    monkeypatch.setattr(frame_decoding, "unpack", counted(frame_decoding.unpack, unpacked))
     ingest.run(folder, tmp_path / "run", ingest.Config(), SYNC)
     assert sum(call[2].nbytes for call in read_bytes) == 70 * 300 * 20 * 2
     assert len(unpacked) == (70 if name.endswith("gz") else 0)

@@ -93,17 +93,13 @@ def fit_gain(
         amplifiers do
     without_dark : leave out the noise without light; by default where it is not on the curve
     """
+    given = sums, read_variance, level_error, uneven, straight
 
     def up_to(highest: float) -> GainFit | None:
-        def fit(without_dark: bool | None) -> GainFit | None:
-            return _fit_range(
-                sums, read_variance, highest, level_error, uneven, straight, without_dark
-            )
-
-        found = fit(without_dark)
+        found = _fit_range(*given, highest, without_dark)
         if found and found.without_dark and not found.chance > _OFF_CURVE:
             # Flats that are on no curve tell nothing of what is on it.
-            found = fit(bool(without_dark))
+            found = _fit_range(*given, highest, bool(without_dark))
         return found and replace(found, error=math.hypot(found.error, common * found.gain))
 
     whole = up_to(highest)
@@ -125,10 +121,10 @@ def fit_gain(
 def _fit_range(
     sums: F64,
     read_variance: tuple[float, float],
-    highest: float,
     level_error: float,
     uneven: float,
     straight: bool,
+    highest: float,
     without_dark: bool | None,
 ) -> GainFit | None:
     dof = sums[:, 0]

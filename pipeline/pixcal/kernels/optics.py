@@ -64,8 +64,7 @@ def phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> F64:
     # If x is a row and y a column, these terms are computed on the sides only.
     paths: F64 = np.sqrt((qx + 0.5 * bx) ** 2 + (qy + 0.5 * by) ** 2 + (0.5 * bz - d) ** 2)
     paths += np.sqrt((qx - 0.5 * bx) ** 2 + (qy - 0.5 * by) ** 2 + (-0.5 * bz - d) ** 2)
-    result: F64 = geometry.wavenumber * 2.0 * (bx * qx + by * qy - bz * d) / paths
-    return result
+    return np.asarray(geometry.wavenumber * 2.0 * (bx * qx + by * qy - bz * d) / paths)
 
 
 def paraxial_vector(geometry: Geometry) -> tuple[float, float]:
@@ -78,11 +77,8 @@ def paraxial_phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> F64:
     """Phase of straight fringes (paper, eq. 4), zero at the projection of the fibres' midpoint."""
     # As `phase`, but without the tilt of the baseline, as in the paper.
     kx, ky = paraxial_vector(geometry)
-    xs, ys = np.asarray(x, float), np.asarray(y, float)
-    result: F64 = kx * (xs - geometry.centre_x / geometry.pitch) + ky * (
-        ys - geometry.centre_y / geometry.pitch
-    )
-    return result
+    cx, cy = geometry.centre_x / geometry.pitch, geometry.centre_y / geometry.pitch
+    return np.asarray(kx * (np.asarray(x, float) - cx) + ky * (np.asarray(y, float) - cy))
 
 
 def interfringe(k: tuple[float, float]) -> float:
@@ -133,5 +129,4 @@ def gaussian_beam(x: ArrayLike, y: ArrayLike, centre: tuple[float, float], radiu
     # A product: if x is a row and y a column, exponentials are computed on the sides only.
     across = np.exp(-2 * ((np.asarray(x, float) - centre[0]) / radius) ** 2)
     along = np.exp(-2 * ((np.asarray(y, float) - centre[1]) / radius) ** 2)
-    result: F64 = along * across
-    return result
+    return np.asarray(along * across)

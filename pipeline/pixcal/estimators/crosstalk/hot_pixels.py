@@ -152,11 +152,27 @@ def hot_pixels(
         return None
     least = MIN_SIGMAS * noise / 10
     warm = np.where((rest > least) & highest, rest, 0.0)
-    got, shares = _given(warm, y, x, links, known, evidence.origin)
+    shape = (rest.shape[0], rest.shape[1])
+    kept = 1 - outflow(known, shape, evidence.origin)
+
+    def given(warm: F64) -> tuple[F64, F64]:
+        """Charge (y, x) received from all hot pixels, e-; the share (h, link, 2) of each in it."""
+        collected = warm / kept
+        got = couple(collected, known, evidence.origin) - collected * kept
+        shares = np.zeros((len(y), len(links), 2))
+        for c in known:
+            source = np.zeros(shape)
+            source[c.places(shape, evidence.origin)[0]] = c.share
+            step, side = ((c.dy, c.dx), 0) if (c.dy, c.dx) in links else ((-c.dy, -c.dx), 1)
+            level = 1 + c.per_ke * 1e-3 * collected[y, x]
+            shares[:, links.index(step), side] += source[y, x] * level / kept[y, x]
+        return got, shares
+
+    got, shares = given(warm)
     if known:
         # Pixels with much more signal than they receive are warm themselves.
         warm = np.where((warm > 0) | (rest - got > np.maximum(least, got)), rest, 0.0)
-        got, shares = _given(warm, y, x, links, known, evidence.origin)
+        got, shares = given(warm)
     rest = rest - got
     charge = rest[y, x]
     step = np.array(links)
@@ -170,31 +186,7 @@ def hot_pixels(
     value = around[at] / charge[:, None, None] + shares
     sigma = np.hypot(noise / charge[:, None, None], UNSURE * others)
     value, sigma = np.where(clean[at], value, 0.0), np.where(clean[at], sigma, np.inf)
-    shape = (rest.shape[0], rest.shape[1])
     return HotPixels(y, x, charge * 1e-3, value, sigma, shape)
-
-
-def _given(
-    warm: F64,
-    y: Indices,
-    x: Indices,
-    links: tuple[Place, ...],
-    known: Sequence[Coupling],
-    first: Place,
-) -> tuple[F64, F64]:
-    """Charge (y, x) received from all hot pixels, e-, and the share (h, link, 2) of each in it."""
-    shape = (warm.shape[0], warm.shape[1])
-    kept = 1 - outflow(known, shape, first)
-    collected = warm / kept
-    got = couple(collected, known, first) - collected * kept
-    shares = np.zeros((len(y), len(links), 2))
-    for c in known:
-        source = np.zeros(shape)
-        source[c.places(shape, first)[0]] = c.share
-        step, side = ((c.dy, c.dx), 0) if (c.dy, c.dx) in links else ((-c.dy, -c.dx), 1)
-        level = 1 + c.per_ke * 1e-3 * collected[y, x]
-        shares[:, links.index(step), side] += source[y, x] * level / kept[y, x]
-    return got, shares
 
 
 def _unsaturated(evidence: Evidence) -> Mask:

@@ -153,21 +153,15 @@ def _offsets(found: Sequence[_Pattern], gram: F64) -> tuple[F64, F64]:
     noise = np.array([one.noise for one in found])
     weight = np.linalg.inv(np.diag(noise**2) + own.mean() * axes @ axes.T)
     each = np.eye(len(gram))
-    slopes = [
-        np.vstack([one.slopes.imag / one.k, one.axis[0] * each, one.axis[1] * each])
-        for one in found
-    ]
-    normal = sum(
-        weight[a, b] * slopes[a] @ gram @ slopes[b].T
-        for a in range(len(found))
-        for b in range(len(found))
+    slopes = np.stack(
+        [
+            np.vstack([one.slopes.imag / one.k, one.axis[0] * each, one.axis[1] * each])
+            for one in found
+        ]
     )
-    right = sum(
-        weight[a, b] * slopes[a] @ found[b].delta
-        for a in range(len(found))
-        for b in range(len(found))
-    )
-    return np.asarray(normal), np.asarray(right)
+    weighted = np.tensordot(weight, slopes, 1)
+    normal = np.einsum("aik,kl,ajl->ij", weighted, gram, slopes, optimize=True)
+    return normal, np.einsum("aik,ak->i", weighted, np.stack([one.delta for one in found]))
 
 
 def good_in_all(evidence: Evidence) -> Mask:

@@ -153,9 +153,8 @@ def ladder(evidence: Evidence) -> Ladder | None:
     light = [light_of(evidence, s) for s in stacks]
     times = np.array([s.exptime_s for s in stacks])
     levels = np.array([one.mean() for one in light])
-    if len(times) < MIN_STEPS or len(set(times)) < len(times) or not levels.min() > 0:
-        return None
-    if not evidence.dithered:
+    once = len(set(times)) == len(times)
+    if len(times) < MIN_STEPS or not once or not levels.min() > 0 or not evidence.dithered:
         return None
     if len(times) < _WITH_OFFSET and (levels / times).max() > RATES * (levels / times).min():
         return None

@@ -12,12 +12,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.linalg import block_diag
 
-from pixcal.estimators.diagnosis.distortions import (
-    Agreement,
-    Distortion,
-    distortion_sums,
-    fit_distortions,
-)
+from pixcal.estimators.diagnosis import distortions
+from pixcal.estimators.diagnosis.distortions import Agreement, Distortion
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, cached_on_evidence
 from pixcal.kernels.boundaries import REACH, boundary_shifts, moved_charge
 from pixcal.kernels.normal_matrix import inverse_normal
@@ -48,7 +44,7 @@ def fit_response(
         value, information = np.zeros((2, 3))
         value[-1], information[-1] = known[0] / UNIT, UNIT**2 / known[1]
         prior = value, information
-    sizes, covariance, _ = fit_distortions(
+    sizes, covariance, _ = distortions.fit_distortions(
         tuple(evidence.fringes.values()),
         _signal_of(evidence, level_e, [UNIT * shifts]),
         3,
@@ -99,7 +95,7 @@ def fit_curve(
         return np.asarray(change / evidence.flat, np.float32)
 
     prior = np.zeros(len(unit)), np.ones(len(unit))
-    sizes, covariance, agreement = fit_distortions(
+    sizes, covariance, agreement = distortions.fit_distortions(
         tuple(evidence.fringes.values()), distortion, len(unit), prior=prior
     )
     straight = np.stack([np.ones(len(unit) + 1), knots_e[1:]], axis=1)
@@ -179,7 +175,7 @@ def _boundary_sums(evidence: Evidence) -> list[tuple[F64, F64]]:
         return sizes
 
     return [
-        distortion_sums(own, signal, POWERS + len(every), by_itself, margin=REACH)
+        distortions.distortion_sums(own, signal, POWERS + len(every), by_itself, margin=REACH)
         for own in across
         if own
     ]

@@ -8,17 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pixcal.estimators.fringe_fit import tile_sums
 from pixcal.estimators.fringe_fit.gauge import FRINGE_MODES
 from pixcal.estimators.fringe_fit.shapes import FringeShape
-from pixcal.estimators.fringe_fit.tile_sums import (
-    N_LOCAL,
-    POWERS,
-    SCALE_PX,
-    Carrier,
-    TilePlane,
-    TileSums,
-    expand,
-)
+from pixcal.estimators.fringe_fit.tile_sums import N_LOCAL, POWERS, Carrier, TilePlane, TileSums
 from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
 from pixcal.model.arrays import F64
 
@@ -42,16 +35,16 @@ class ModeBasis:
         centres = np.array([p.centre for p in planes])
         n_poly, n_own = len(POWERS), len(self.shape.names)
         modes = np.zeros((len(planes), len(self.names), N_LOCAL))
-        modes[:, :n_own, :n_poly] = expand(self.shape.modes, centres)
+        modes[:, :n_own, :n_poly] = tile_sums.expand(self.shape.modes, centres)
         modes[:, n_own:, n_poly:] = np.eye(len(FRINGE_MODES))
         phase = np.zeros((len(planes), N_LOCAL))
-        phase[:, :n_poly] = expand(
+        phase[:, :n_poly] = tile_sums.expand(
             lambda y, x: self.shape.phase(y, x) - self.carrier.phase(y, x), centres
         )
         at = {p: n for n, p in enumerate(POWERS)}
         phase[:, at[0, 0]] -= [p.phase for p in planes]
-        phase[:, at[1, 0]] -= [p.kx * SCALE_PX for p in planes]
-        phase[:, at[0, 1]] -= [p.ky * SCALE_PX for p in planes]
+        phase[:, at[1, 0]] -= [p.kx * tile_sums.SCALE_PX for p in planes]
+        phase[:, at[0, 1]] -= [p.ky * tile_sums.SCALE_PX for p in planes]
         return modes, phase
 
     def sums(self, tiles: TileSums) -> tuple[F64, F64, float]:

@@ -14,14 +14,9 @@ from typing import Any
 import numpy as np
 from scipy.linalg import eigh
 
+from pixcal.estimators.fringe_fit import fringes
 from pixcal.estimators.fringe_fit.fit_flags import excess_scatter, usual_chi2
-from pixcal.estimators.fringe_fit.fringes import (
-    MIN_FRINGES_FOR_MAPS,
-    FrameParameters,
-    find_fringe_vector,
-    grid,
-    smooth_phasor,
-)
+from pixcal.estimators.fringe_fit.fringes import MIN_FRINGES_FOR_MAPS, FrameParameters
 from pixcal.estimators.fringe_fit.gauge import gauge_matrix
 from pixcal.estimators.fringe_fit.tile_fit import Coding, Tile, fit_tile, residual_chi2
 from pixcal.kernels.bilinear import frame_sums
@@ -208,8 +203,8 @@ class Scout:
         mean = np.where(first.good & (np.abs(maps[0]) > 0), maps[0], 1.0)
         ratios = np.where(first.good, maps[1:] / mean, 0.0)
         # A third map that is only noise must not drown the fringes of the second.
-        self.k = find_fringe_vector(ratios, first.good, self.nominal)
-        y, x = grid(first.shape)
+        self.k = fringes.find_fringe_vector(ratios, first.good, self.nominal)
+        y, x = fringes.grid(first.shape)
         target = np.exp(1j * (self.k[0] * x + self.k[1] * y))[first.good]
         span = np.stack([m[first.good] for m in maps], axis=1)
         level = np.median(np.abs(span[:, 0]))
@@ -229,7 +224,7 @@ class Scout:
         tile, theta = self.tiles[0], self.theta[0]
         level = np.where(tile.good, theta[0], 1.0)
         phasor = np.where(tile.good, theta[2] + 1j * theta[1], 0.0) / level
-        smooth = smooth_phasor(np.asarray(phasor, complex), tile.good, self.k)
+        smooth = fringes.smooth_phasor(np.asarray(phasor, complex), tile.good, self.k)
         away = np.abs(np.angle(phasor * smooth.map.conj()))[tile.good]
         (kx, ky), (ny, nx) = smooth.k, tile.shape
         turned = np.hypot((kx - self.k[0]) * nx, (ky - self.k[1]) * ny)

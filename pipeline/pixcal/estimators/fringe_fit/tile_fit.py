@@ -1,7 +1,7 @@
 """Pixels of a tile by weighted least squares, for known frames."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -52,9 +52,8 @@ class Tile:
 class PixelSums:
     """Sums that grow block by block about a start model, of the run and of batches of its frames.
 
-    ``model``: (3, y, x) start. ``ranges``: first and end frame of each batch. ``variance``: (read,
-    shot) instead of the tile's own. ``turn, sigma``: (batch, y, x) phases relative to the start
-    model and their errors, rad; NaN in gaps.
+    ``model``: (3, y, x) start. ``ranges``: first and end frame of each batch. ``turn, sigma``:
+    (batch, y, x) phases relative to the start model and their errors, rad; NaN in gaps.
     """
 
     def __init__(
@@ -64,13 +63,11 @@ class PixelSums:
         frames: FrameParameters,
         model: F32,
         ranges: Sequence[tuple[int, int]] = (),
-        variance: tuple[F32, F32] | None = None,
     ) -> None:
         ny, nx = tile.shape
         self.model, self.position = model, 0
-        read, shot = variance or (tile.read, tile.shot)
         # The first pixel relative to the tile's centre, where the frames' parameters hold.
-        self._fixed = (-(ny - 1) / 2, -(nx - 1) / 2, model, read, shot)
+        self._fixed = (-(ny - 1) / 2, -(nx - 1) / 2, model, tile.read, tile.shot)
         self._coding = coding
         self._g, self._dk = (f.astype(np.float32) for f in (frames.at(*tile.centre), frames.dk))
         self._part, self._total = np.zeros((2, ny, N_SUMS, nx))
@@ -133,15 +130,10 @@ def residual_chi2(
 
 
 def accumulate(
-    tile: Tile,
-    blocks: Sequence[U16],
-    coding: Coding,
-    frames: FrameParameters,
-    theta: F32,
-    variance: tuple[F32, F32] | None = None,
+    tile: Tile, blocks: Sequence[U16], coding: Coding, frames: FrameParameters, theta: F32
 ) -> F64:
     """Sums (N_SUMS, y, x) of a tile over all blocks of codes (t, y, x), in the order of time."""
-    sums = PixelSums(tile, coding, frames, theta, variance=variance)
+    sums = PixelSums(tile, coding, frames, theta)
     for block in blocks:
         sums.add(block)
     return sums.sums
@@ -177,8 +169,8 @@ def _unweighted_pixels(
 ) -> F64:
     """Pixels (3, y, x) by unweighted least squares."""
     nothing = np.zeros((3, *tile.shape), np.float32)
-    even = (np.ones(tile.shape, np.float32), np.zeros(tile.shape, np.float32))
-    return solve_pixels(accumulate(tile, blocks, coding, frames, nothing, variance=even))[0]
+    even = replace(tile, read=nothing[0] + 1, shot=nothing[0])
+    return solve_pixels(accumulate(even, blocks, coding, frames, nothing))[0]
 
 
 def fit_tile(

@@ -14,15 +14,8 @@ from scipy.special import ndtri_exp
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid
-from pixcal.estimators.maps.map_fit import (
-    MapPart,
-    fit_maps,
-    fitted_values,
-    gauge_terms,
-    phase_map,
-    polynomial,
-    without,
-)
+from pixcal.estimators.maps import map_fit
+from pixcal.estimators.maps.map_fit import MapPart
 from pixcal.estimators.maps.structure import PERIODS
 from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.significance import sigmas_of_chi2
@@ -79,7 +72,7 @@ class _Map:
 
     def rest(self) -> tuple[F64, float]:
         """The map without its free terms, zero where masked, and its variance."""
-        left = without(self.data[self.good][:, None], self.free[:, self.good].T)[:, 0]
+        left = map_fit.without(self.data[self.good][:, None], self.free[:, self.good].T)[:, 0]
         scatter = robust_sigma(left - np.median(left))
         left = np.where(np.abs(left) > _CLIP * scatter, 0, left)
         out = np.zeros(self.good.shape)
@@ -129,14 +122,14 @@ def _maps(fringes: FringeEvidence, evidence: Evidence, in_flats: bool) -> list[_
     good = fringes.good & (alpha > 0) & (fringes.theta[0] > 0) & (evidence.flat > 0)
     iota = np.where(good, fringes.theta[0], 1.0)
     visibility = np.log(np.where(good, alpha, 1.0) / iota)
-    terms = np.concatenate([polynomial(good.shape, _SMOOTH), gauge_terms(fringes)])
+    terms = np.concatenate([map_fit.polynomial(good.shape, _SMOOTH), map_fit.gauge_terms(fringes)])
     light = evidence.flat if in_flats else iota
     light = np.log(np.where(good, light, 1.0))
-    free = polynomial(good.shape, _SMOOTH) if in_flats else terms
+    free = map_fit.polynomial(good.shape, _SMOOTH) if in_flats else terms
     return [
         _Map("the flats" if in_flats else LIGHT, light, free, good, (1, 0, 0)),
         _Map("the visibility", visibility, terms, good, (-1, 1, 1)),
-        _Map("the phase", np.nan_to_num(phase_map(fringes)), terms, good, (0, -1j, -1j)),
+        _Map("the phase", np.nan_to_num(map_fit.phase_map(fringes)), terms, good, (0, -1j, -1j)),
     ]
 
 
@@ -261,11 +254,11 @@ def _fitted(
             parts.append(
                 MapPart.of(signals if turn else signals[:size], m.data - model, m.free, m.good)
             )
-        step, _, _ = fitted_values(parts)
+        step, _, _ = map_fit.fitted_values(parts)
         six = six + step[:size]
         if turn:
             q = np.clip(q + step[size:], start - limit, start + limit)
-    errors = np.sqrt(np.diag(fit_maps(parts).covariance))
+    errors = np.sqrt(np.diag(map_fit.fit_maps(parts).covariance))
     waves = []
     for n, name in enumerate(names):
         own = slice(6 * n, 6 * n + 6)
@@ -281,7 +274,7 @@ def _plain_gain(m: _Map, q: F64) -> float:
     y, x = grid(m.good.shape)
     e = np.exp(1j * (q[0] * x + q[1] * y))
     signals = np.stack([e.real, e.imag])
-    return fit_maps([MapPart.of(signals, m.data, m.free, m.good)]).gain
+    return map_fit.fit_maps([MapPart.of(signals, m.data, m.free, m.good)]).gain
 
 
 def _best_of(gain: float, trials: float, dof: int) -> float:

@@ -31,19 +31,13 @@ from pixcal.stages.ingest.arrays import FRAMES_A_PIECE, Writers, find_kept, take
 from pixcal.stages.ingest.cut_frames import cut_from, cut_warning
 from pixcal.stages.ingest.repeated_frames import repeat_warning, repeats_of
 from pixcal.stages.steps import run_steps
+from pixcal.storage import frame_decoding
 from pixcal.storage.artefact import Build, discard
 from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.cube_place import base_of, chosen_base, cubes_of
 from pixcal.storage.folder import transit_bytes
 from pixcal.storage.formats import STAGES
-from pixcal.storage.frame_decoding import (
-    BAND,
-    by_fact,
-    read_rows,
-    rows_at_once,
-    unpack,
-    unpack_bytes,
-)
+from pixcal.storage.frame_decoding import BAND
 from pixcal.storage.frame_file import FrameFile
 from pixcal.storage.frame_reader import describe
 from pixcal.storage.frames import Frame, columns, inspect, tabulate
@@ -79,7 +73,9 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
     with lock(out):
         base = chosen_base(config.cubes, out, out / STAGE.name)
         earlier = _earlier(out)
-        same = _same_files(earlier, inputs)
+        names = {files: array for array, files in (earlier.inputs if earlier else {}).items()}
+        # Arrays made from the same files as an earlier array, with its name as value.
+        same = {array: names[files] for array, files in inputs.items() if files in names}
         if earlier is not None and not same and not config.overwrite:
             _refuse_other(out, earlier, plain, inputs)
 
@@ -130,14 +126,6 @@ def _earlier(out: Path) -> Manifest | None:
         return read_manifest(out / STAGE.name)
     except DamagedError:
         return None
-
-
-def _same_files(earlier: Manifest | None, inputs: Mapping[str, str]) -> dict[str, str]:
-    """Arrays made from the same files as an earlier array, with its name as value."""
-    if earlier is None:
-        return {}
-    names = {files: array for array, files in earlier.inputs.items()}
-    return {array: names[files] for array, files in inputs.items() if files in names}
 
 
 def _refuse_other(
@@ -255,12 +243,12 @@ def _task_bytes(array: str, frames: Sequence[Frame], rows: int, copied: bool) ->
     files = _files(frames)
     _, ny, nx = files[0].shape
     dtype = _common_dtype(array, files)
-    held = min(max(map(rows_at_once, files)), ny)
+    held = min(max(map(frame_decoding.rows_at_once, files)), ny)
     conversion = held * nx * (np.dtype("f8").itemsize + 3 * dtype.itemsize)
     if not copied:
         return conversion
     chunk = CHUNK[0] * CHUNK[1] * CHUNK[2] * dtype.itemsize
-    reading = max(conversion, *(unpack_bytes(f) for f in files), 4 * chunk)
+    reading = max(conversion, *(frame_decoding.unpack_bytes(f) for f in files), 4 * chunk)
     return min(CHUNK[0], len(frames)) * min(rows, ny) * nx * dtype.itemsize + reading
 
 
@@ -345,7 +333,7 @@ def _unpack_block(
     for name in unpacked.keys() - wanted.keys():
         unpacked[name].source.path.unlink()
     return {
-        name: unpacked.get(name) or unpack(file, scratch / str(number))
+        name: unpacked.get(name) or frame_decoding.unpack(file, scratch / str(number))
         for number, (name, file) in enumerate(wanted.items())
     }
 
@@ -360,7 +348,9 @@ def _read_block(
     for file, group in groupby(block, key=lambda frame: frame.file):
         planes = [frame.plane for frame in group]
         target = None if out is None else out[at : at + len(planes)]
-        found.append(read_rows(unpacked.get(file.source.name, file), planes, rows, target))
+        found.append(
+            frame_decoding.read_rows(unpacked.get(file.source.name, file), planes, rows, target)
+        )
         at += len(planes)
     return np.concatenate(found)
 
@@ -398,7 +388,7 @@ def _close(
     write_json(made.folder / "acquisition.json", to_plain(described))
     listed, places, warnings = {}, {}, []
     for array, frames in tables.items():
-        found = by_fact(ArrayReader(made.folder / "catalogue.zarr" / array).read())
+        found = frame_decoding.by_fact(ArrayReader(made.folder / "catalogue.zarr" / array).read())
         largest = np.fmax.reduce(found["largest"], axis=1)
         cut = cut_from(array, found, frames[0].file.shape[1])
         repeats = repeats_of(found)

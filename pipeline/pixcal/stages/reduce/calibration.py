@@ -17,18 +17,9 @@ from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.arrays import F32, F64, U8
 from pixcal.model.flags import PixelFlag
 from pixcal.model.options import Reduce
+from pixcal.stages import tiles
 from pixcal.stages.reduce.frame_statistics import STATISTICS, Measuring
-from pixcal.stages.tiles import (
-    STRIP,
-    Index,
-    Strip,
-    by_column,
-    extent,
-    indices,
-    map_chunk,
-    span,
-    strips,
-)
+from pixcal.stages.tiles import STRIP, Index, Strip
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group
 from pixcal.storage.place import Place
 
@@ -82,10 +73,10 @@ def on_grid(
     stride = int(np.ceil(np.sqrt(shape[0] * shape[1] / _SAMPLES)))
     wanted = [STATISTICS.index(name) for name in names]
     parts = []
-    for strip in strips(indices(shape), STRIP):
-        blocks = by_column(reader.read((0, len(STATISTICS)), *span(shape, strip)))
+    for strip in tiles.strips(tiles.indices(shape), STRIP):
+        blocks = tiles.by_column(reader.read((0, len(STATISTICS)), *tiles.span(shape, strip)))
         for index, block in zip(strip, blocks, strict=True):
-            (y0, _), (x0, _) = extent(shape, index)
+            (y0, _), (x0, _) = tiles.extent(shape, index)
             some = block[wanted, -y0 % stride :: stride, -x0 % stride :: stride]
             part = some.reshape(len(wanted), -1).astype(float)
             if light is not None:
@@ -132,7 +123,7 @@ def calibration_writers(folder: Place, shape: tuple[int, int]) -> dict[str, Arra
     create_group(folder, {"Conventions": "CF-1.11", "title": "calibration of the detector"})
     return {
         name: create_array(
-            folder / name, shape, dtype, dims=("y", "x"), chunks=map_chunk(shape), attrs=a
+            folder / name, shape, dtype, dims=("y", "x"), chunks=tiles.map_chunk(shape), attrs=a
         )
         for name, (dtype, a) in _MAPS.items()
     }
@@ -144,9 +135,9 @@ def finish(job: Finishing, strip: Strip) -> F64:
     Returns (column, 4) over the good pixels: least and largest flat, largest bias (ADU) and dark
     signal (e-/s); infinity of the opposite sign without good pixels.
     """
-    rows, columns = span(job.shape, strip)
+    rows, columns = tiles.span(job.shape, strip)
     block = ArrayReader(job.statistics / "maps").read((0, len(STATISTICS)), rows, columns)
-    parts = [_maps(job, *one) for one in zip(strip, by_column(block), strict=True)]
+    parts = [_maps(job, *one) for one in zip(strip, tiles.by_column(block), strict=True)]
     for name, writer in job.writers.items():
         data = np.concatenate([maps[name] for maps in parts], axis=1)
         writer.write((rows[0], columns[0]), data.astype(writer.dtype))

@@ -15,17 +15,9 @@ from pixcal.kernels.rounding import SHEPPARD, UNDETERMINED_BELOW
 from pixcal.model.acquisition import Detector
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
+from pixcal.stages.reduce import read_noise
 from pixcal.stages.reduce.calibration import Usual, usual
 from pixcal.stages.reduce.frame_statistics import Measuring
-from pixcal.stages.reduce.read_noise import (
-    bias_wander,
-    code_counts,
-    dark_rate,
-    is_cut_off,
-    lost_in_blocks,
-    of_variance,
-    read_noise,
-)
 from pixcal.stages.tiles import grid
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.place import Place
@@ -114,7 +106,7 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     # Full pixels saturate the flats even if the converter does not saturate.
     points = transfer_points(add_neighbours(sums[1], sums[0])[0])
     well = saturation(points)
-    rate = dark_rate(folder, job)
+    rate = read_noise.dark_rate(folder, job)
     times = np.array([group.exptime for group in job.flat])
     charged = levels + rate * times if job.flats_timed and job.flat else levels
     full = usable & (nearly | (charged > sum(well))) if well else np.zeros_like(usable)
@@ -137,15 +129,15 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     if job.flats_timed and job.flat and _one_lamp(times[usable], levels[usable]):
         straight = linearity(times, levels, usable)
     charge = 0.0 if job.read_series is None else rate * job.read_series.exptime
-    gain, wander, lost = None, bias_wander(job), lost_in_blocks(job)
+    gain, wander, lost = None, read_noise.bias_wander(job), read_noise.lost_in_blocks(job)
     # Shot noise of the dark signal is not read noise; its size depends on the gain.
     for _ in range(2 if charge else 1):
         shot = charge / (job.gain if gain is None else gain.gain)
         error = _GUESS_ERROR if gain is None else gain.error / gain.gain
-        noise, own = read_noise(sums[0], lost, (shot, error * shot), folder, job)
+        noise, own = read_noise.read_noise(sums[0], lost, (shot, error * shot), folder, job)
         gain = _gain(sums, own, lost[0], wander, top, job)
-    if gain is not None and (is_cut_off(job) or _tells_noise(gain)):
-        noise, own = of_variance(gain.read_variance, job.quantum)
+    if gain is not None and (read_noise.is_cut_off(job) or _tells_noise(gain)):
+        noise, own = read_noise.of_variance(gain.read_variance, job.quantum)
     elif gain is not None and gain.without_dark:
         noise, own = (n and (n[0], max(n[1], _OFF_CURVE * n[0])) for n in (noise, own))
     return Summary(
@@ -182,7 +174,7 @@ def pair_sums(folder: Place, job: Measuring) -> F64:
 
 
 def _gain(
-    sums: F64, read_noise: Measure | None, lost: float, wander: float, top: float, job: Measuring
+    sums: F64, known: Measure | None, lost: float, wander: float, top: float, job: Measuring
 ) -> GainFit | None:
     """Photon transfer below the level ``top`` (ADU above bias) of saturation, neighbours added.
 
@@ -191,7 +183,7 @@ def _gain(
     """
     if not (job.dark and job.flat):
         return None
-    noise, error = read_noise or (job.read_noise, _GUESS_ERROR * job.read_noise)
+    noise, error = known or (job.read_noise, _GUESS_ERROR * job.read_noise)
     # With light, noise is high enough for rounding to add exactly this.
     dark, lit = sums
     steps, uneven = _steps(job)
@@ -230,9 +222,9 @@ def _steps(job: Measuring) -> tuple[float, float]:
     if not job.quantum:
         return rounding, 0.0
     # Within one level, because codes between two levels need not occur.
-    if not any(len(missing_codes(code_counts([group], job))) for group in job.flat):
+    if not any(len(missing_codes(read_noise.code_counts([group], job))) for group in job.flat):
         return rounding, 0.0
-    variance, density = step_noise(code_counts(job.flat, job))
+    variance, density = step_noise(read_noise.code_counts(job.flat, job))
     return rounding + variance * job.quantum**2, density * job.quantum**3
 
 

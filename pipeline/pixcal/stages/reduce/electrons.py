@@ -10,27 +10,12 @@ from numpy.typing import NDArray
 from pixcal.kernels.quantise import FILL, Scale, coefficients, encode, extremes
 from pixcal.model.arrays import F32
 from pixcal.model.flags import PixelFlag
+from pixcal.stages import tiles
 from pixcal.stages.reduce.calibration import FLAG_ATTRS
 from pixcal.stages.reduce.columns import blocks
-from pixcal.stages.tiles import (
-    STRIP,
-    Index,
-    Strip,
-    by_column,
-    extent,
-    grid,
-    map_chunk,
-    span,
-    strips,
-)
-from pixcal.storage.cube import (
-    CHUNK,
-    ArrayReader,
-    ArrayWriter,
-    create_array,
-    create_group,
-    write_array,
-)
+from pixcal.stages.tiles import STRIP, Index, Strip
+from pixcal.storage import cube
+from pixcal.storage.cube import CHUNK, ArrayReader, ArrayWriter
 from pixcal.storage.frame_reader import Reader
 from pixcal.storage.place import Place
 
@@ -60,9 +45,11 @@ class FringeSet:
 
     def maps(self, strip: Strip) -> list[dict[str, NDArray[Any]]]:
         """Calibration maps of each column of chunks."""
-        ranges = span(self.raw.shape[1:], strip)
+        ranges = tiles.span(self.raw.shape[1:], strip)
         names = ("bias", "dark_rate", "flat", "read_noise", "mask")
-        found = [by_column(ArrayReader(self.calibration / name).read(*ranges)) for name in names]
+        found = [
+            tiles.by_column(ArrayReader(self.calibration / name).read(*ranges)) for name in names
+        ]
         return [dict(zip(names, of_column, strict=True)) for of_column in zip(*found, strict=True)]
 
 
@@ -115,10 +102,10 @@ def set_writers(
     }
     read = {"units": "electron2", "long_name": "variance of a sample without light"}
     shot = {"units": "1", "long_name": "shot variance over signal: one over the flat"}
-    create_group(folder.parent)
-    create_group(folder, {"Conventions": "CF-1.11", "title": f"fringe set {folder.name}"})
+    cube.create_group(folder.parent)
+    cube.create_group(folder, {"Conventions": "CF-1.11", "title": f"fringe set {folder.name}"})
     made = {
-        "signal": create_array(
+        "signal": cube.create_array(
             folder / "signal", (frames, *shape), np.uint16, fill_value=FILL, attrs=signal
         )
     }
@@ -127,15 +114,15 @@ def set_writers(
         ("shot_factor", np.float32, shot),
         ("mask", np.uint8, FLAG_ATTRS),
     ):
-        made[name] = create_array(
-            folder / name, shape, dtype, dims=("y", "x"), chunks=map_chunk(shape), attrs=attrs
+        made[name] = cube.create_array(
+            folder / name, shape, dtype, dims=("y", "x"), chunks=tiles.map_chunk(shape), attrs=attrs
         )
-    made["counts"] = create_array(
+    made["counts"] = cube.create_array(
         scratch,
-        (*grid(shape), 5),
+        (*tiles.grid(shape), 5),
         np.int64,
         dims=("i", "j", "count"),
-        chunks=(1, min(STRIP, grid(shape)[1]), 5),
+        chunks=(1, min(STRIP, tiles.grid(shape)[1]), 5),
     )
     return made
 
@@ -147,7 +134,7 @@ def write_coordinates(folder: Place, time_s: Any, shape: tuple[int, int]) -> Non
         ("y", np.arange(shape[0], dtype=np.int32), {"units": "1", "long_name": "row"}),
         ("x", np.arange(shape[1], dtype=np.int32), {"units": "1", "long_name": "column"}),
     ):
-        write_array(folder / name, values, dims=(name,), attrs=attrs)
+        cube.write_array(folder / name, values, dims=(name,), attrs=attrs)
 
 
 # largest share of saturated samples of a good pixel: occasional particle hits have no weight. Light
@@ -188,7 +175,7 @@ class _Column:
             begin,
         )
         if held == CHUNK[0] or last == fringes.frames:
-            (y0, _), (x0, _) = extent(fringes.raw.shape[1:], self.index)
+            (y0, _), (x0, _) = tiles.extent(fringes.raw.shape[1:], self.index)
             self.job.writers["signal"].write((last - held, y0, x0), self.codes[:held])
 
     def result(self) -> dict[str, NDArray[Any]]:
@@ -221,8 +208,8 @@ def convert(job: Converting, parts: Sequence[Strip]) -> None:
                 column.add(first, samples, n * CHUNK[2])
                 column.largest = max(column.largest, largest)
         found |= {column.index: column.result() for column in columns}
-    for strip in strips(list(found), STRIP):
-        (y0, _), (x0, _) = extent(job.fringes.raw.shape[1:], strip[0])
+    for strip in tiles.strips(list(found), STRIP):
+        (y0, _), (x0, _) = tiles.extent(job.fringes.raw.shape[1:], strip[0])
         for name in found[strip[0]]:
             writer = job.writers[name]
             data = np.concatenate([found[index][name] for index in strip], axis=1)

@@ -11,17 +11,8 @@ from typing import Any
 import numpy as np
 
 from pixcal.engine.run import Runtime
-from pixcal.estimators.detector.emva import (
-    Measure,
-    Nonuniformity,
-    alternation,
-    dark_slope,
-    dynamic_range,
-    nonuniformity,
-    spectrogram,
-    without_gaps,
-    without_trend,
-)
+from pixcal.estimators.detector import emva
+from pixcal.estimators.detector.emva import Measure, Nonuniformity
 from pixcal.estimators.detector.pair_noise import shared_by_lines
 from pixcal.model.arrays import F64, Mask
 from pixcal.report.text import with_error
@@ -72,7 +63,7 @@ def characterise(
         electrons = halves.dark * gain[0]
         facts["warnings"] += _spread(found, curves, "dsnu", "e-", electrons, halves.good)
     if halves.flat is not None:
-        percent = np.stack([100 * without_trend(half, halves.good) for half in halves.flat])
+        percent = np.stack([100 * emva.without_trend(half, halves.good) for half in halves.flat])
         facts["warnings"] += _spread(found, curves, "prnu", "%", percent, halves.good)
     scale = gain[0] / facts["gain_e_per_adu"]["used"]
     _dark_current(found, made, source, job, scale, middle)
@@ -177,7 +168,7 @@ def _full_well(
     found["snr_max"] = figure("largest signal-to-noise ratio", "", (peak, error))
     if noise is not None:
         electrons = noise[0] * gain[0], noise[1] * gain[0]
-        ratio, error, decibels = dynamic_range(well, electrons)
+        ratio, error, decibels = emva.dynamic_range(well, electrons)
         found["dynamic_range"] = figure("dynamic range", "", (ratio, error), f"{decibels:.1f} dB")
 
 
@@ -191,11 +182,11 @@ _ALTERNATING_SHARE = 0.04  # least share of its square in the variance of the ma
 
 def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: Mask) -> list[str]:
     """Add standard deviations, spectra and profiles of a pair of maps; return pattern warnings."""
-    pair = without_gaps(halves[0], good), without_gaps(halves[1], good)
-    spread: Nonuniformity = nonuniformity(*pair, int((~good).sum()))
+    pair = emva.without_gaps(halves[0], good), emva.without_gaps(halves[1], good)
+    spread: Nonuniformity = emva.nonuniformity(*pair, int((~good).sum()))
     patterns = []
     for axis, lines in ((0, "row"), (1, "column")):
-        size, error = alternation(*pair, axis=axis)
+        size, error = emva.alternation(*pair, axis=axis)
         if size > _ALTERNATES * error and size**2 > _ALTERNATING_SHARE * spread.total[0] ** 2:
             differ = f"alternate {lines}s differ by {with_error(size, error)} {unit}"
             patterns.append((differ, size / 2))
@@ -208,7 +199,7 @@ def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: 
     mean = np.where(good, halves.mean(axis=0), np.nan)
     curves[name] = {"unit": unit}
     for axis, along in ((1, "rows"), (0, "columns")):
-        *spectrum, noise = spectrogram(*pair, axis=axis)
+        *spectrum, noise = emva.spectrogram(*pair, axis=axis)
         curves[name][along] = _listed(spectrum, ("frequency", "amplitude")) | {"noise": noise}
         count = good.sum(axis=axis)
         filled = count > 0
@@ -248,7 +239,7 @@ def _dark_current(
     rates = scale * ArrayReader(folder / "dark_rate").read(*middle)
     gain = found["conversion_gain"]["value"]
     rows = _middle_rows(middle)
-    slope = dark_slope(*_dark_means(source, middle, good))
+    slope = emva.dark_slope(*_dark_means(source, middle, good))
     error = gain * slope[1] if slope is not None and slope[1] > _NO_ERROR else None
     if error is not None and slope is not None and source.cut_off:
         corrected = rates[rows][good[rows]].mean(dtype=float)

@@ -14,17 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pixcal.estimators.detector import calibration
 from pixcal.estimators.detector.bad_pixels import noisy, noisy_factor, nonlinear, variance_nearby
-from pixcal.estimators.detector.calibration import (
-    DarkLine,
-    ExposureLevel,
-    dark_line,
-    relative_response,
-    step_levels,
-    unsaturated,
-    usual_rate,
-    usual_variance,
-)
+from pixcal.estimators.detector.calibration import DarkLine, ExposureLevel
 from pixcal.estimators.detector.cut_off import without_cut_off
 from pixcal.estimators.detector.pair_noise import LineNoise, dark_pair_sums, flat_pair_sums
 from pixcal.kernels.photon_transfer import COLUMNS, N_BINS
@@ -33,20 +25,11 @@ from pixcal.kernels.rounding import SHEPPARD
 from pixcal.model.arrays import F32, F64
 from pixcal.model.flags import PixelFlag
 from pixcal.model.options import Reduce
+from pixcal.stages import tiles
 from pixcal.stages.reduce.black_cut_off import CutOff
 from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.ingested import MOST_ADU
-from pixcal.stages.tiles import (
-    STRIP,
-    Index,
-    Strip,
-    by_column,
-    extent,
-    grid,
-    map_chunk,
-    span,
-    strips,
-)
+from pixcal.stages.tiles import STRIP, Index, Strip
 from pixcal.storage.cube import CHUNK, ArrayWriter, create_array, create_group
 from pixcal.storage.frame_reader import Reader
 from pixcal.storage.place import Place
@@ -96,17 +79,17 @@ class Measuring:
 
 def statistics_writers(folder: Place, shape: tuple[int, int], flats: int) -> dict[str, ArrayWriter]:
     """Make the arrays that `measure` writes: one chunk of each for `STRIP` columns."""
-    tiles, n, steps = grid(shape), len(STATISTICS), max(flats, 1)
-    wide = min(STRIP, tiles[1])
+    whole, n, steps = tiles.grid(shape), len(STATISTICS), max(flats, 1)
+    wide = min(STRIP, whole[1])
     create_group(folder)
     made = {}
-    for name, whole, chunks, dtype in (
-        ("maps", (n, *shape), (n, *map_chunk(shape)), np.float32),
-        ("pairs", (*tiles, 2, N_BINS, COLUMNS), (1, wide, 2, N_BINS, COLUMNS), np.float64),
-        ("levels", (*tiles, steps, 4), (1, wide, steps, 4), np.float64),
+    for name, extents, chunks, dtype in (
+        ("maps", (n, *shape), (n, *tiles.map_chunk(shape)), np.float32),
+        ("pairs", (*whole, 2, N_BINS, COLUMNS), (1, wide, 2, N_BINS, COLUMNS), np.float64),
+        ("levels", (*whole, steps, 4), (1, wide, steps, 4), np.float64),
     ):
-        dims = [f"axis{axis}" for axis in range(len(whole))]
-        made[name] = create_array(folder / name, whole, dtype, chunks=chunks, dims=dims)
+        dims = [f"axis{axis}" for axis in range(len(extents))]
+        made[name] = create_array(folder / name, extents, dtype, chunks=chunks, dims=dims)
     return made
 
 
@@ -133,7 +116,7 @@ class _Column:
 
     @classmethod
     def begin(cls, job: Measuring, index: Index) -> "_Column":
-        (y0, y1), (x0, x1) = extent(job.shape, index)
+        (y0, y1), (x0, x1) = tiles.extent(job.shape, index)
         shape = y1 - y0, x1 - x0
         maps = {name: np.zeros(shape) for name in STATISTICS}
         levels = np.zeros(job.writers["levels"].shape[2:])
@@ -144,9 +127,9 @@ class _Column:
 def measure(job: Measuring, parts: Sequence[Strip]) -> None:
     """Combine the calibration frames of columns of chunks and write their statistics."""
     found = {column.index: column for strip in parts for column in _measured(job, strip)}
-    for strip in strips(list(found), STRIP):
+    for strip in tiles.strips(list(found), STRIP):
         columns = [found[index] for index in strip]
-        (i, j), ((y0, _), (x0, _)) = strip[0], span(job.shape, strip)
+        (i, j), ((y0, _), (x0, _)) = strip[0], tiles.span(job.shape, strip)
         maps = [np.stack([column.maps[name] for name in STATISTICS]) for column in columns]
         job.writers["maps"].write((0, y0, x0), np.concatenate(maps, axis=2).astype(np.float32))
         job.writers["pairs"].write((i, j, 0, 0, 0), np.stack([c.pairs for c in columns])[None])
@@ -186,12 +169,12 @@ def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined])
     """Measure bias and dark signal, and the typical variance of a sample in this column."""
     maps = column.maps
     times = [group.exptime for group in job.dark]
-    line = dark_line([c.mean for c in combined], [c.kept for c in combined], times)
+    line = calibration.dark_line([c.mean for c in combined], [c.kept for c in combined], times)
     maps["bias"], maps["dark_rate"] = line.bias, line.rate
     rate = np.nan_to_num(line.rate) + job.subtracted[0]
     charges = [np.maximum(rate * time, 0) for time in times]
     least = int(np.argmin(times))
-    read = usual_variance(
+    read = calibration.usual_variance(
         combined[least].variance - charges[least] / job.gain, len(job.dark[least].frames) - 1
     )
     read = max(read if read > 0 else job.read_noise**2, SHEPPARD * job.quantum**2)
@@ -214,7 +197,7 @@ def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined])
     missing = ~np.isfinite(line.bias) | ~np.isfinite(line.rate)
     maps["flags"][missing] += int(PixelFlag.NO_DATA)
     maps["flags"][line.bias >= job.full] += int(PixelFlag.HOT)
-    usual = usual_variance(pooled, int(np.median(dof)))
+    usual = calibration.usual_variance(pooled, int(np.median(dof)))
     usual = job.read_noise**2 if np.isnan(usual) else usual
     column.line, column.noise = line, np.maximum(pooled, usual)
     maps["dark_rate_error"] = np.sqrt(line.per_rate * column.noise)
@@ -230,7 +213,7 @@ def _measure_level(job: Measuring, column: _Column, number: int, found: Combined
     # Few frames give a poor estimate of one pixel's noise, and most pixels are alike.
     seen = lit(signal)
     level = finite_median(signal[seen])
-    usual = usual_variance(found.variance[seen], frames - 1)
+    usual = calibration.usual_variance(found.variance[seen], frames - 1)
     if usual < (_COARSE * job.quantum) ** 2:
         usual = float(np.nanmean(found.variance[seen]))
     usual = max(level, 0) / job.gain + job.read_noise**2 if np.isnan(usual) else usual
@@ -245,14 +228,14 @@ def _measure_level(job: Measuring, column: _Column, number: int, found: Combined
 
 def _measure_response(job: Measuring, column: _Column) -> None:
     """Measure the response, the levels of the tile, and pixels with deviating levels."""
-    maps, levels = column.maps, step_levels(column.steps)
+    maps, levels = column.maps, calibration.step_levels(column.steps)
     column.levels[:, 0] = levels
-    steps, levels = unsaturated(column.steps, levels, float(np.median(column.noise)))
+    steps, levels = calibration.unsaturated(column.steps, levels, float(np.median(column.noise)))
     column.levels[:, 3] = [
         np.isfinite(before.signal).sum() - np.isfinite(after.signal).sum()
         for before, after in zip(column.steps, steps, strict=True)
     ]
-    maps["response"], maps["response_error"] = relative_response(steps, levels)
+    maps["response"], maps["response_error"] = calibration.relative_response(steps, levels)
     maps["flags"][nonlinear(steps, levels, job.options.nonlinear_share)] += int(PixelFlag.NONLINEAR)
 
 
@@ -271,7 +254,7 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
         for n, line in enumerate(column.line for column in columns):
             if line is not None:
                 pedestals[n] = line.signal(exptime).astype(np.float32)
-                rate = usual_rate(line.rate, hot) + job.subtracted[0]
+                rate = calibration.usual_rate(line.rate, hot) + job.subtracted[0]
                 charges[n] = exptime * rate if exptime else 0.0
     for number, batch in enumerate(_batches(job, group, tuple(c.index for c in columns))):
         for column, combination, pedestal, charge, samples in zip(
@@ -307,7 +290,7 @@ def _loud(job: Measuring, frames: F32) -> NDArray[np.bool_]:
     variance = frames.var(axis=0, ddof=1, dtype=float)
     dof = np.full(variance.shape, len(frames) - 1.0)
     # A level at the boundary of two codes gives either one.
-    usual = max(usual_variance(variance, len(frames) - 1), job.quantum**2 / 4)
+    usual = max(calibration.usual_variance(variance, len(frames) - 1), job.quantum**2 / 4)
     unknown = np.full(variance.shape, np.nan)
     factor = noisy_factor(job.options.noisy_factor, variance, len(frames) - 1, job.quantum)
     nearby = variance_nearby(variance, dof, usual)
@@ -327,7 +310,7 @@ def _usable(job: Measuring, samples: NDArray[Any], lamp: bool) -> F32:
 def _batches(job: Measuring, group: Group, strip: Strip) -> Iterator[list[NDArray[Any]]]:
     """Frames (t, y, x) of a group in each column of a strip, `BATCH` at a time."""
     reader = job.frames[group.array]
-    rows, (x0, x1) = span(job.shape, strip)
+    rows, (x0, x1) = tiles.span(job.shape, strip)
     for first in range(0, len(group.frames), BATCH):
         numbers = group.frames[first : first + BATCH]
         batch = np.empty((len(numbers), rows[1] - rows[0], x1 - x0), reader.dtype)
@@ -336,4 +319,4 @@ def _batches(job: Measuring, group: Group, strip: Strip) -> Iterator[list[NDArra
             (n, frame), *more = run
             last = n + 1 + len(more)
             reader.read((frame, frame + last - n), rows, (x0, x1), out=batch[n:last])
-        yield by_column(batch)
+        yield tiles.by_column(batch)

@@ -8,16 +8,9 @@ from typing import Any
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels.quantise import Scale, choose_scale
 from pixcal.model.arrays import I64
+from pixcal.stages.reduce import electrons
 from pixcal.stages.reduce.columns import run_noted, strip_width
-from pixcal.stages.reduce.electrons import (
-    Converting,
-    FringeSet,
-    convert,
-    convert_bytes,
-    set_writers,
-    signal_range,
-    write_coordinates,
-)
+from pixcal.stages.reduce.electrons import Converting, FringeSet
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.tiles import indices, strips
 from pixcal.storage.artefact import Workspace
@@ -65,7 +58,9 @@ def write_set(
         gain=gain,
     )
     todo = indices(source.shape)
-    need = partial(convert_bytes, fringes.raw.dtype.itemsize, frames=fringes.raw.chunks[0])
+    need = partial(
+        electrons.convert_bytes, fringes.raw.dtype.itemsize, frames=fringes.raw.chunks[0]
+    )
     width = strip_width([fringes.raw], need, runtime)
     low, high = _possible_range(source, name, gain, bounds)
     origin = "saturation"
@@ -76,7 +71,10 @@ def write_set(
         # Read the range from the frames: they may not fill the converter's range.
         origin = "frames"
         ends = run_tasks(
-            partial(signal_range, fringes), strips(todo, width), runtime, label=f"{name} range"
+            partial(electrons.signal_range, fringes),
+            strips(todo, width),
+            runtime,
+            label=f"{name} range",
         )
         # Samples far below the bias are invalid and have no weight.
         low, high = max(low, min(e[0] for e in ends)), max(e[1] for e in ends)
@@ -85,12 +83,12 @@ def write_set(
     folder = made.cubes / "reduced.zarr" / fringes.name
     scratch = made.scratch / "counts" / fringes.name
     job = Converting(
-        fringes, scale, set_writers(folder, scratch, fringes.frames, source.shape, scale)
+        fringes, scale, electrons.set_writers(folder, scratch, fringes.frames, source.shape, scale)
     )
-    run_noted(made, partial(convert, job), todo, width, runtime, name)
+    run_noted(made, partial(electrons.convert, job), todo, width, runtime, name)
     for writer in job.writers.values():
         writer.finish()
-    write_coordinates(folder, source.tables[name]["time_s"], source.shape)
+    electrons.write_coordinates(folder, source.tables[name]["time_s"], source.shape)
     return {
         "frames": fringes.frames,
         **_describe_counts(ArrayReader(scratch).read(), scale),

@@ -11,14 +11,10 @@ import numpy as np
 
 from pixcal.model.acquisition import Detector
 from pixcal.model.errors import InputError
+from pixcal.stages.reduce import flat_survey
 from pixcal.stages.reduce.black_cut_off import Black, CutOff, cut_offs
 from pixcal.stages.reduce.exposures import Exposures, group_exposures
-from pixcal.stages.reduce.flat_survey import (
-    FlatSurvey,
-    code_step,
-    of_several_levels,
-    of_whole_numbers,
-)
+from pixcal.stages.reduce.flat_survey import FlatSurvey
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.frame_reader import ChosenFrames, FrameReader, Reader
@@ -105,7 +101,7 @@ class Ingested:
             dark is not None
             and "bias" in self._listed
             and all(t is None for t in dark["exptime_s"])
-            and of_several_levels(self.arrays["dark"])
+            and flat_survey.of_several_levels(self.arrays["dark"])
         )
 
     @cached_property
@@ -205,9 +201,9 @@ class Ingested:
         """Step of the calibration frames (ADU); 0 if any hold real numbers."""
         # 12-bit cameras that write 16 bits count in steps of 16.
         names = {group.array for group in (*self.exposures.dark, *self.exposures.flat)}
-        if not all(of_whole_numbers(self.arrays[name]) for name in names):
+        if not all(flat_survey.of_whole_numbers(self.arrays[name]) for name in names):
             return 0.0
-        return float(code_step([self.arrays[name] for name in sorted(names)]))
+        return float(flat_survey.code_step([self.arrays[name] for name in sorted(names)]))
 
     def saturation(self, name: str) -> float:
         """Level (ADU) from which samples of an array are saturated.

@@ -7,23 +7,11 @@ from typing import TypeVar
 import numpy as np
 from scipy.special import logit, logsumexp
 
+from pixcal.estimators.detector.telegraph import moments, population
 from pixcal.estimators.detector.telegraph.classes import Stays
 from pixcal.estimators.detector.telegraph.dwell import FEWEST_PIXELS, LitSeries, find_stays
-from pixcal.estimators.detector.telegraph.moments import (
-    NOISY,
-    Moments,
-    Series,
-    Signs,
-    moments_of,
-    signs,
-    thinned,
-)
-from pixcal.estimators.detector.telegraph.population import (
-    Population,
-    find_population,
-    find_switching,
-    off_later,
-)
+from pixcal.estimators.detector.telegraph.moments import NOISY, Moments, Series, Signs
+from pixcal.estimators.detector.telegraph.population import Population
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F32, F64, Indices
 
@@ -83,10 +71,10 @@ def find_telegraph(
 
     ``lit``: gives the fringe frames of given pixels, which constrain dwell times.
     """
-    parts = [m for s in series if (m := moments_of(s)) is not None]
+    parts = [m for s in series if (m := moments.moments_of(s)) is not None]
     if not parts:
         return None
-    jump_signs = signs(parts)
+    jump_signs = moments.signs(parts)
     longest, upper, known = max(parts, key=lambda m: m.frames), 0.5, None
     single: OwnLevels | None = None
     smallest_jump = 0.0
@@ -95,16 +83,16 @@ def find_telegraph(
         upper = _upper(lit, own, longest, jump_signs)
         if upper != 0.5:
             # Apparent hits are the rarer level.
-            parts = [m for s in series if (m := moments_of(s, hits=True)) is not None]
+            parts = [m for s in series if (m := moments.moments_of(s, hits=True)) is not None]
             longest = max(parts, key=lambda m: m.frames)
             upper = _upper(lit, own, longest, jump_signs)
         known = find_stays(lit(_chosen(longest)), longest, upper)
         clear = NOISY * float(np.sqrt(2 / longest.dof)) / (upper * (1 - upper))
         smallest_jump = longest.sigma * clear**0.5
         single = _single(lit, own, longest, noisy, smallest_jump)
-    parts = thinned(parts)
+    parts = moments.thinned(parts)
     if known is not None:
-        found = _Found(find_population(parts, known[0]), *known, 0.0)
+        found = _Found(population.find_population(parts, known[0]), *known, 0.0)
     else:
         found = _likeliest(parts, upper)
     stays = found.stays
@@ -122,8 +110,8 @@ def find_telegraph(
 
 def significance(series: Sequence[Series]) -> float | None:
     """Of the signs that noisy pixels jump; None without samples."""
-    parts = [m for s in series if (m := moments_of(s)) is not None]
-    return signs(parts).significance if parts else None
+    parts = [m for s in series if (m := moments.moments_of(s)) is not None]
+    return moments.signs(parts).significance if parts else None
 
 
 def _chosen(m: Moments) -> Indices:
@@ -196,18 +184,18 @@ def _of_stays(parts: Sequence[Moments], decades: float, upper: float) -> _Found:
     """The likeliest population with dwell times over a range of ``decades``."""
     # The population separates telegraph noise and chance in a pixel's variance; the dwell time
     # gives the part of it that few frames show.
-    found = find_population(parts, Stays(0.0, upper=upper))
-    switching, error = find_switching(parts, found, decades, upper)
+    found = population.find_population(parts, Stays(0.0, upper=upper))
+    switching, error = population.find_switching(parts, found, decades, upper)
     for _ in range(ROUNDS):
         before = switching
         if before == 0:
             break
-        found = find_population(parts, Stays(switching, decades, upper))
-        switching, error = find_switching(parts, found, decades, upper)
+        found = population.find_population(parts, Stays(switching, decades, upper))
+        switching, error = population.find_switching(parts, found, decades, upper)
         if abs(switching - before) < SETTLED * error:
             break
     stays = Stays(switching, decades, upper)
-    return _Found(found, stays, error, off_later(parts, found, stays))
+    return _Found(found, stays, error, population.off_later(parts, found, stays))
 
 
 # Levels, and the share of the time in the upper one
