@@ -59,8 +59,6 @@ def _ingest(acquisition: StrPath, out: StrPath, options: of.Ingest, runtime: Run
 
 
 def _step(stage: str) -> Callable[..., Run]:
-    """A step of a run."""
-
     def body(run: StrPath, options: Any, runtime: Runtime) -> Run:
         corrected = getattr(options, "with_diagnosis", False)
         _call("correct" if corrected else stage, Path(run), options, runtime)

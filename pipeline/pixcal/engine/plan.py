@@ -62,7 +62,6 @@ def within_memory(what: str, bytes_per_task: int, shared_bytes: int, runtime: Ru
 
 @cache
 def _tell(note: str) -> None:
-    """Print a note on stderr, once."""
     print(note, file=sys.stderr)
 
 

@@ -97,9 +97,8 @@ class Frames:
     fringes: tuple[FringeSet, ...] = quantity((), doc="the fringe sets")
 
     def __post_init__(self) -> None:
-        _check_globs("bias", self.bias)
-        _check_globs("dark", self.dark)
-        _check_globs("flat", self.flat)
+        for kind in ("bias", "dark", "flat"):
+            _check_globs(kind, getattr(self, kind))
 
 
 @dataclass(frozen=True, kw_only=True)

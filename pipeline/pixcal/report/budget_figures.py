@@ -47,8 +47,9 @@ def budget_figure(result: Mapping[str, Any]) -> Figure:
     """Of ``budget.json``: precision against frames, and time with each change of the bench."""
     figure = new_figure(WIDE, 4.9)
     left, right = figure.subplots(1, 2, width_ratios=[1.25, 1])
-    _precision(left, result)
-    _levers(right, result)
+    plan = next(lever for lever in result["levers"] if lever["name"] == "as planned")
+    _precision(left, result, plan["period_s"])
+    _levers(right, result, plan["variance"] * plan["period_s"])
     return figure
 
 
@@ -59,11 +60,6 @@ def _lines(entries: Mapping[str, Any]) -> list[PrecisionLine]:
         frame, planned = facts["frame_px"], facts["planned"]["frames"]
         lines.append(PrecisionLine(name + period, frame["median"], frame["worst"], planned))
     return lines
-
-
-def _as_planned(result: Mapping[str, Any]) -> Mapping[str, Any]:
-    lever: Mapping[str, Any] = next(v for v in result["levers"] if v["name"] == "as planned")
-    return lever
 
 
 def _span(
@@ -81,7 +77,7 @@ def _span(
     return np.logspace(low, high, 61)
 
 
-def _precision(axes: Axes, result: Mapping[str, Any]) -> None:
+def _precision(axes: Axes, result: Mapping[str, Any], period: float) -> None:
     sets = _lines(result["sets"])
     joined = _lines(result["joined"]["components"]) if len(sets) > 1 else []
     wanted, given = result["precision_px"], result["frames"]
@@ -113,7 +109,7 @@ def _precision(axes: Axes, result: Mapping[str, Any]) -> None:
     axes.set(xscale="log", yscale="log", xlim=(frames[0], frames[-1]))
     plain_ticks(axes.xaxis, *axes.get_xlim(), most=9)
     plain_ticks(axes.yaxis, *axes.get_ylim(), most=9)
-    _clock(axes, _as_planned(result)["period_s"])
+    _clock(axes, period)
     axes.plot([], [], "o", color=GREY, label="planned")
     if any(line.spread for line in sets):
         axes.fill_between([], [], [], color=GREY, alpha=0.25, label="median to worst pixel")
@@ -130,10 +126,9 @@ def _clock(axes: Axes, period: float) -> None:
     top.xaxis.set_minor_locator(NullLocator())
 
 
-def _levers(axes: Axes, result: Mapping[str, Any]) -> None:
-    """Time for the same precision, relative to the plan."""
-    plan, precision = _as_planned(result), result["precision_px"]
-    planned = plan["variance"] * plan["period_s"]
+def _levers(axes: Axes, result: Mapping[str, Any], planned: float) -> None:
+    """Time for the same precision, relative to that ``planned``, s px²."""
+    precision = result["precision_px"]
     shares = {
         lever["name"]: lever["variance"] * lever["period_s"] / planned
         for lever in result["levers"][::-1]

@@ -238,7 +238,6 @@ def _fit(fit: Mapping[str, Any]) -> Iterator[Table]:
 
 
 def _frames(arrays: Mapping[str, Mapping[str, Any]]) -> Table:
-    """What was ingested."""
     rows = []
     for name, a in arrays.items():
         times, source = _known(a, "time_s"), (a.get("time_source") or ["–"])[0]

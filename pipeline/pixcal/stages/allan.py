@@ -15,15 +15,8 @@ import numpy as np
 from pixcal import __version__
 from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.frame_series.stability import (
-    MAX_DRAWS,
-    NO_CURVE,
-    ONE_SIGMA,
-    AllanCurve,
-    fit_curve,
-    shared_noise,
-    white_population,
-)
+from pixcal.estimators.frame_series import stability
+from pixcal.estimators.frame_series.stability import AllanCurve
 from pixcal.kernels.allan import allan_deviation, averaging_lengths, disjoint_differences
 from pixcal.kernels.quantiles import quantiles_of_parts
 from pixcal.model.arrays import F32, F64, I64
@@ -32,15 +25,9 @@ from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Allan as Config
 from pixcal.model.options import Region
 from pixcal.stages.steps import run_steps
+from pixcal.storage import cube
 from pixcal.storage.artefact import Build
-from pixcal.storage.cube import (
-    ArrayReader,
-    ArrayWriter,
-    create_array,
-    create_group,
-    create_map,
-    write_array,
-)
+from pixcal.storage.cube import ArrayReader, ArrayWriter
 from pixcal.storage.formats import STAGES
 from pixcal.storage.manifest import Manifest, read_json, write_json
 from pixcal.storage.stage import make, working
@@ -101,7 +88,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
                 _check_region(region, batches.window)
 
         def body(made: Build) -> None:
-            create_group(made.folder / "allan.zarr")
+            cube.create_group(made.folder / "allan.zarr")
             result = {
                 name: _measure_set(made, name, batches, config, runtime)
                 for name, batches in sets.items()
@@ -131,7 +118,7 @@ def _measure_set(
     tile_bytes = 4 * cy * cx * (2 * batches.n + len(lengths) * (TILES_HIGH + 2))
     # Copies of rows of a map, and counts of its values.
     values = 16 * TILES_HIGH * cy * batches.window[1] + COUNT_BYTES
-    per_task, held = max(tile_bytes, values), values + 40 * MAX_DRAWS * len(lengths)
+    per_task, held = max(tile_bytes, values), values + 40 * stability.MAX_DRAWS * len(lengths)
     runtime = within_memory(f"the Allan deviation of {name}", per_task, held, runtime)
     if lengths:
         _write_maps(made, folder, name, batches, lengths, runtime)
@@ -160,10 +147,10 @@ def _write_maps(
     runtime: Runtime,
 ) -> None:
     """Write the deviation of every pixel, and that expected for one batch from fit errors."""
-    create_group(folder)
+    cube.create_group(folder)
     (cy, cx), shape = batches.chunks, batches.window
     chunks = (TILES_HIGH * cy, cx)
-    adev = create_array(
+    adev = cube.create_array(
         folder / "adev",
         (len(lengths), *shape),
         "<f4",
@@ -172,7 +159,7 @@ def _write_maps(
         fill_value=np.nan,
         attrs={"units": "pixel"},
     )
-    expected = create_map(folder / "expected", shape, chunks, units="pixel")
+    expected = cube.create_map(folder / "expected", shape, chunks, units="pixel")
     squares = batches.tiles((0, shape[0], 0, shape[1]), TILES_HIGH)
     steps = {f"{name}:{y[0]},{x[0]}": (y, x) for y, x in squares}
     task = partial(_maps_task, batches, lengths, adev, expected)
@@ -180,9 +167,9 @@ def _write_maps(
     adev.finish()
     expected.finish()
     frames = np.array(lengths) * batches.frames
-    write_array(folder / "length", frames, dims=("length",), attrs={"units": "frames"})
+    cube.write_array(folder / "length", frames, dims=("length",), attrs={"units": "frames"})
     seconds = np.array(lengths) * batches.step_s
-    write_array(folder / "seconds", seconds, dims=("length",), attrs={"units": "s"})
+    cube.write_array(folder / "seconds", seconds, dims=("length",), attrs={"units": "s"})
 
 
 def _maps_task(
@@ -230,13 +217,13 @@ def _measure_region(
     quantiles, pixels = quantiles_of_region(folder / "adev", region, usable, runtime)
     if filled < 3 or not quantiles:
         reason = f"{filled} of {batches.n} batches have data: too few for an Allan deviation"
-        return _as_json(batches, [], NO_CURVE, [], [reason]) | common | {"pixels": 0}
+        return _as_json(batches, [], stability.NO_CURVE, [], [reason]) | common | {"pixels": 0}
     chosen = [lengths[n] for n in quantiles]
     low, median, high = np.array(list(quantiles.values()), float).T
     noise = noise_levels(folder / "expected", region)
-    white = white_population(present, chosen, noise if pixels > 1 else None)
-    shared = shared_noise([grams[n] for n in quantiles], pixels)
-    curve = fit_curve(chosen, median, np.log(high / low) / 2, pixels, shared, white)
+    white = stability.white_population(present, chosen, noise if pixels > 1 else None)
+    shared = stability.shared_noise([grams[n] for n in quantiles], pixels)
+    curve = stability.fit_curve(chosen, median, np.log(high / low) / 2, pixels, shared, white)
     warnings = []
     if curve.knee is not None and curve.knee > batches.n / 2:
         at = f"{curve.knee * batches.frames:.0f} frames"
@@ -337,7 +324,7 @@ def quantiles_of_region(
 
 def _quantiles(path: Path, region: Region, n: int) -> tuple[F64, int]:
     parts = partial(_positive, path, (n, n + 1), region)
-    return quantiles_of_parts(parts, (ONE_SIGMA[0], 0.5, ONE_SIGMA[1]))
+    return quantiles_of_parts(parts, (stability.ONE_SIGMA[0], 0.5, stability.ONE_SIGMA[1]))
 
 
 def _positive(path: Path, lengths: Range | None, region: Region) -> Iterator[F32]:

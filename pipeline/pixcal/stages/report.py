@@ -70,7 +70,6 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
 
 def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime) -> Contents:
-    """Read everything that the page shows."""
     facts = _optional_json(run_dir / "reduce" / "reduce.json")
     fit = read_json(run_dir / "fit" / "fit.json") if "fit" in manifests else None
     allan = read_json(run_dir / "allan" / "allan.json") if "allan" in manifests else {}

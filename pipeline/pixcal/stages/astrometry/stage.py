@@ -20,6 +20,7 @@ from pixcal.model.errors import InputError
 from pixcal.model.options import Astrometry as Config
 from pixcal.report.astrometry_figures import AstrometryView, astrometry_figure
 from pixcal.report.drawing import png
+from pixcal.stages.astrometry import stars
 from pixcal.stages.astrometry.detector import (
     BAND,
     Component,
@@ -28,17 +29,7 @@ from pixcal.stages.astrometry.detector import (
     free_from_modes,
     open_components,
 )
-from pixcal.stages.astrometry.stars import (
-    ErrorMaps,
-    Telescope,
-    core_weights,
-    error_maps,
-    exposures,
-    observe,
-    place_errors,
-    star,
-    tile_side,
-)
+from pixcal.stages.astrometry.stars import ErrorMaps, Telescope
 from pixcal.stages.astrometry.summary import TARGET_PX, axis_facts, table
 from pixcal.stages.fitted_shape import fitted_shape
 from pixcal.storage.artefact import Build
@@ -111,13 +102,13 @@ def _measure(
     if modes is not None:
         components, removed = free_from_modes(components, modes, runtime)
     detector = PixelPositions(tuple(components), config.seed)
-    maps = error_maps(made.folder / "astrometry.zarr", detector, observed, runtime)
+    maps = stars.error_maps(made.folder / "astrometry.zarr", detector, observed, runtime)
     if not maps.places.any():
         raise InputError(
             f"{components[0].delta.path}: masked pixels leave no place for a star and its window "
             f"of {observed.side} px; try a smaller --window"
         )
-    errors = observe(detector, observed, config, runtime)
+    errors = stars.observe(detector, observed, config, runtime)
     result = {
         "schema": SCHEMA,
         "pixcal": __version__,
@@ -138,7 +129,7 @@ def _measure(
             "background_e": config.background_e,
             "window_px": observed.side,
             "seed": config.seed,
-            "exposures": exposures(observed.psf, config.electrons, acquisition.detector),
+            "exposures": stars.exposures(observed.psf, config.electrons, acquisition.detector),
             "read_noise_e": acquisition.detector.read_noise_e,
         },
         "axes": _axes(detector, observed, errors, maps, telescope),
@@ -156,7 +147,9 @@ def _photon_noise(observed: Star, share: float, acquisition: Acquisition) -> lis
 
     ``share``: background over the light of the star.
     """
-    others = (star(observed.psf, observed.half, n, share * n, acquisition.detector) for n in CURVE)
+    others = (
+        stars.star(observed.psf, observed.half, n, share * n, acquisition.detector) for n in CURVE
+    )
     return [float(np.sqrt(np.mean(other.bound() ** 2))) for other in others]
 
 
@@ -165,7 +158,7 @@ def _star(
 ) -> Star:
     """The star to observe, whose window must fit maps of a shape (y, x)."""
     psf, half = telescope.psf(config.window)
-    observed = star(psf, half, config.electrons, config.background_e, acquisition.detector)
+    observed = stars.star(psf, half, config.electrons, config.background_e, acquisition.detector)
     if observed.side > min(shape):
         by_itself = "" if config.window else " (the default for --wavelength and --diameter)"
         raise InputError(
@@ -180,7 +173,7 @@ def planned(shape: tuple[int, int], modes: int, side: int, config: Config) -> tu
     per_pixel = _BYTES_PER_PIXEL + _BYTES_PER_PIXEL_AND_MODE * modes
     reach = min(int(2 * config.dither_px) + 1, max(shape)) + side
     task = max(
-        (tile_side(shape)[0] + side) ** 2 * per_pixel,
+        (stars.tile_side(shape)[0] + side) ** 2 * per_pixel,
         reach**2 * per_pixel + config.positions * side**2 * _BYTES_PER_WINDOW_PIXEL,
         BAND * shape[1] * modes * _BYTES_PER_FITTED_MODE,
     )
@@ -240,7 +233,6 @@ def _warnings(result: Mapping[str, Any]) -> list[str]:
 def _view(
     result: dict[str, Any], detector: PixelPositions, observed: Star, maps: ErrorMaps, photons: F64
 ) -> AstrometryView:
-    """Contents of the figure."""
     ny, nx = detector.shape
     y, x = ((max(0, (n - DETAIL) // 2), min(n, (n + DETAIL) // 2)) for n in (ny, nx))
     return AstrometryView(
@@ -248,8 +240,8 @@ def _view(
         target_px=TARGET_PX,
         table=table(result),
         photons=photons,
-        weights=core_weights(observed, detector.axes)[0],
-        detail=place_errors(detector, observed, y, x)[:, 0],
+        weights=stars.core_weights(observed, detector.axes)[0],
+        detail=stars.place_errors(detector, observed, y, x)[:, 0],
         detail_at=(y[0], x[0]),
         rms=np.sqrt(np.mean(maps.rms**2, axis=1)),
         block=maps.block,

@@ -54,10 +54,6 @@ class FrameSpread:
         weight = np.outer(u, v).ravel()
         return cls(level, level * contrast, weight / weight.sum())
 
-    def mean(self, values: F64) -> F64:
-        """Mean over the frames of values (..., n)."""
-        return np.asarray(values @ self.weight)
-
 
 STEADY = FrameSpread(np.ones(1), np.ones(1), np.ones(1))
 
@@ -73,7 +69,7 @@ def phase_information(
     swing = np.asarray(alpha, float)[..., None] * spread.amplitude
     # At low contrast, a difference of two nearly equal numbers: written as a quotient.
     root = np.sqrt(np.maximum(total**2 - swing**2, 0.0))
-    return spread.mean(swing**2 / (total + root))
+    return np.asarray(swing**2 / (total + root) @ spread.weight)
 
 
 def unweighted_variance(
@@ -82,8 +78,8 @@ def unweighted_variance(
     """Variance (rad²) of one frame with equal weights: twice the bound at full contrast."""
     square = spread.amplitude**2
     noise = np.asarray(iota, float)[..., None] * spread.level + variance
-    power = np.asarray(alpha, float) ** 2 * spread.mean(square) ** 2
-    return np.asarray(2 * spread.mean(square * noise) / power)
+    power = np.asarray(alpha, float) ** 2 * (square @ spread.weight) ** 2
+    return np.asarray(2 * (square * noise @ spread.weight) / power)
 
 
 def sampling_loss(iota: float, alpha: float, variance: float, phases: F64) -> tuple[float, float]:
@@ -132,11 +128,16 @@ class WeightErrors:
         return cls(scatter(1 / noise), scatter(light / noise))
 
 
-def sample_variance(bench: Bench) -> float:
-    """Variance (e-²) of a sample without light: read noise, converter's step, dark current."""
+def sample_variances(bench: Bench) -> dict[str, float]:
+    """Parts of the variance (e-²) of a sample without light."""
     d = bench.detector
     dark = d.dark_e_s * bench.frames.exptime_s
-    return d.read_noise_e**2 + d.gain_e_per_adu**2 / 12 + dark
+    return {"read_noise": d.read_noise_e**2, "quantisation": d.gain_e_per_adu**2 / 12, "dark": dark}
+
+
+def sample_variance(bench: Bench) -> float:
+    """Their sum."""
+    return sum(sample_variances(bench).values())
 
 
 def own_effects(bench: Bench, where: str) -> tuple[Effect, ...]:

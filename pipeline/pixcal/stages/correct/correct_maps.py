@@ -37,14 +37,8 @@ from pixcal.stages.correct.sweep_to_correct import (
 from pixcal.stages.correct.uncertainty import parameter_variance, task_bytes
 from pixcal.stages.evidence import Part
 from pixcal.stages.fit.sweep import BATCH_MAPS
-from pixcal.storage.cube import (
-    ArrayReader,
-    ArrayWriter,
-    create_array,
-    create_group,
-    create_map,
-    write_array,
-)
+from pixcal.storage import cube
+from pixcal.storage.cube import ArrayReader, ArrayWriter
 from pixcal.storage.folder import link_files
 from pixcal.storage.manifest import read_json, write_json
 
@@ -60,7 +54,7 @@ SIGNS = ((0, 0), (0, 1), (1, 0), (1, 1))
 
 def correct_sweep(swept: Swept, target: Path, runtime: Runtime, name: str) -> None:
     """Write the corrected sweep of a set to a new folder."""
-    create_group(target)
+    cube.create_group(target)
     for array in SAME:
         link_files(swept.folder / array, target / array)
     write_json(target / "scout.json", read_json(swept.folder / "scout.json"))
@@ -68,8 +62,8 @@ def correct_sweep(swept: Swept, target: Path, runtime: Runtime, name: str) -> No
     middle, frames = len(counts) // 2, swept.source.n_frames
     of_halves = [int(counts[:middle].sum()), int(counts[middle:].sum())] * swept.has_halves
     variants = np.array([*of_halves, *[frames] * len(swept.effects)], np.int32)
-    write_array(target / "batch_count", variants, dims=("batch",))
-    write_array(target / "batch_time", np.zeros(len(variants)), dims=("batch",))
+    cube.write_array(target / "batch_count", variants, dims=("batch",))
+    cube.write_array(target / "batch_time", np.zeros(len(variants)), dims=("batch",))
     cy, cx = swept.source.signal.chunks[1:]
     tiles = swept.source.tiles()
     if swept.has_halves:
@@ -82,7 +76,7 @@ def correct_sweep(swept: Swept, target: Path, runtime: Runtime, name: str) -> No
     writers = _create(target, swept, ("iota", "alpha", "phase", "sigma"))
     writers |= _create(target, swept, ("batch_phase", "batch_sigma"), len(variants))
     width = TileSums.width(len(variants))
-    writers["sums"] = create_array(
+    writers["sums"] = cube.create_array(
         target / "sums",
         (*swept.source.grid, width),
         "<f8",
@@ -102,7 +96,7 @@ def _create(
     """Writers of maps (y, x), or of several at a time (number, y, x)."""
     source = swept.source
     chunks = source.signal.chunks[1:]
-    return {n: create_map(target / n, source.shape, chunks, number=number) for n in names}
+    return {n: cube.create_map(target / n, source.shape, chunks, number=number) for n in names}
 
 
 def _finish(writers: dict[str, ArrayWriter]) -> None:

@@ -22,15 +22,8 @@ from pixcal.model.errors import InputError, naming
 from pixcal.model.options import Crests as Config
 from pixcal.report.crest_figures import CrestView, Extract, crest_figure, outermost
 from pixcal.report.drawing import png
-from pixcal.stages.crests.crest_fit import (
-    CrestFit,
-    Prior,
-    agreement,
-    cost_map,
-    falls_then_rises,
-    fit_crests,
-    valley,
-)
+from pixcal.stages.crests import crest_fit
+from pixcal.stages.crests.crest_fit import CrestFit, Prior
 from pixcal.stages.crests.crests import SEED_PIXELS, CrestPaths, find_crests, seed_vector
 from pixcal.stages.crests.windows import N_SUMS, CrestCarrier, Vector, Windows, tile_sums
 from pixcal.stages.fit.sweep import load_run
@@ -76,12 +69,12 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
                 nominal = nominal_geometry(acquisition, name, centre)
                 with naming(f"{run_dir}: fringe set {name!r}"):
                     frames, paths = _trace(source, paraxial_vector(nominal), config, runtime)
-                    fit = fit_crests(paths, nominal, Prior.of_bench(nominal))
+                    fit = crest_fit.fit_crests(paths, nominal, Prior.of_bench(nominal))
                 maps = _write_arrays(made.folder / "crests.zarr" / name, paths, fit)
                 picture = crest_figure(_view(source, frames[0], paths, fit, maps))
                 (made.folder / f"crests-{name}.png").write_bytes(png(picture))
                 used = [n for n, phi in zip(frames, paths.phi, strict=True) if np.isfinite(phi)]
-                agrees, note = agreement(paths, fit, facts.get(name))
+                agrees, note = crest_fit.agreement(paths, fit, facts.get(name))
                 sets[name] = {"frames": used, **_facts(paths, fit, maps)}
                 sets[name] |= {"agreement": agrees, "agreement_note": note}
             whole = {"schema": SCHEMA, "pixcal": __version__, "sets": sets}
@@ -103,7 +96,7 @@ def _facts(paths: CrestPaths, fit: CrestFit, maps: Mapping[str, NDArray[Any]]) -
         "cost_rad2": fit.cost,
         "chi2_reduced": fit.chi2_reduced,
         "evaluations": fit.evaluations,
-        "unique_minimum": all(falls_then_rises(cost) for cost in costs),
+        "unique_minimum": all(crest_fit.falls_then_rises(cost) for cost in costs),
         "warnings": fit.warnings(),
     }
 
@@ -155,11 +148,11 @@ def _write_arrays(folder: Path, paths: CrestPaths, fit: CrestFit) -> dict[str, N
     steps, middle = np.linspace(-1, 1, MAP_SIDE), length / distance
     distances = distance * (1 + MAP_REACH * steps)
     lengths = length * (1 + MAP_REACH * steps)
-    best, cost = valley(paths, fit, distances)
+    best, cost = crest_fit.valley(paths, fit, distances)
     # Wide enough for the drift of the valley and for its walls.
     ratios = middle + max(2 * float(np.max(np.abs(best - middle))), 1e-5 * middle) * steps
-    held = cost_map(paths, fit, distances, lengths, ratio=False, refit=False)
-    refitted = cost_map(paths, fit, distances, ratios, ratio=True, refit=True)
+    held = crest_fit.cost_map(paths, fit, distances, lengths, ratio=False, refit=False)
+    refitted = crest_fit.cost_map(paths, fit, distances, ratios, ratio=True, refit=True)
     px, rad, mm, none = ({"units": unit} for unit in ("pixel", "rad", "mm", "1"))
     arrays: dict[str, tuple[str, dict[str, str], NDArray[Any]]] = {
         "x": ("point", px, paths.x),
@@ -189,7 +182,6 @@ def _write_arrays(folder: Path, paths: CrestPaths, fit: CrestFit) -> dict[str, N
 def _view(
     source: ReducedSet, frame: int, paths: CrestPaths, fit: CrestFit, arrays: Mapping[str, Any]
 ) -> CrestView:
-    """What the figure shows."""
     best = fit.geometry
     first, last = outermost(paths.k)
     foot = np.array([best.centre_x, best.centre_y])

@@ -19,15 +19,8 @@ from pixcal.model.arrays import F32, F64, U8
 from pixcal.stages.fit.fringe_set import FittedSet
 from pixcal.stages.fit.sweep import BATCH_MAPS, DIGITS, read_frames, rounded
 from pixcal.stages.tiles import STRIP, span
-from pixcal.storage.cube import (
-    ArrayReader,
-    ArrayWriter,
-    CachedReader,
-    create_array,
-    create_group,
-    create_map,
-    write_array,
-)
+from pixcal.storage import cube
+from pixcal.storage.cube import ArrayReader, ArrayWriter, CachedReader
 from pixcal.storage.folder import link_files
 from pixcal.storage.place import Local
 
@@ -54,7 +47,7 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
     ny, nx = source.shape
     both = axes_span_plane([f.shape.axis(ny / 2, nx / 2) for f in fitted])
     outputs = outputs_of(both)
-    create_group(group)
+    cube.create_group(group)
     writers = _create_joint(group, fitted[0], outputs)
     for f in fitted:
         writers |= _create_set(group / f.name, f)
@@ -105,7 +98,7 @@ def write_offsets(group: Local, fitted: list[FittedSet]) -> None:
 def _map_writer(place: Local, fitted: FittedSet, batches: int = 0) -> ArrayWriter:
     """A map (y, x) in pixels, or one for each batch."""
     source = fitted.source
-    return create_map(place, source.shape, source.map_chunks, units="pixel", number=batches)
+    return cube.create_map(place, source.shape, source.map_chunks, units="pixel", number=batches)
 
 
 @dataclass(frozen=True)
@@ -125,7 +118,6 @@ Swept = Mapping[str, ArrayReader]  # readers of the maps of a set's sweep
 def _write_strip(
     fitted: list[FittedSet], writers: Writers, both: bool, strip: Sequence[Job]
 ) -> list[_TileTotals]:
-    """Write the maps of neighbouring tiles."""
     (y0, y1), (x0, x1) = span(fitted[0].source.shape, [at for at, _ in strip])
     swept: list[Swept] = []
     for f in fitted:
@@ -245,7 +237,7 @@ def _maps_of_set(
 
 def _create_set(folder: Path, fitted: FittedSet) -> Writers:
     """Create the set's folder: link maps of the sweep, and return writers of the others."""
-    create_group(folder)
+    cube.create_group(folder)
     for name in SAME_AS_SWEPT:
         # Links left by a killed fit may point to a damaged sweep.
         shutil.rmtree(folder / name, ignore_errors=True)
@@ -264,7 +256,9 @@ def _create_joint(group: Path, fitted: FittedSet, outputs: tuple[str, ...]) -> W
     names = [array for name in outputs for array in (name, f"{name}_sigma")]
     writers = {("", name): _map_writer(group / name, fitted) for name in names}
     shape, chunks = fitted.source.shape, fitted.source.map_chunks
-    writers["", "mask"] = create_array(group / "mask", shape, "u1", dims=("y", "x"), chunks=chunks)
+    writers["", "mask"] = cube.create_array(
+        group / "mask", shape, "u1", dims=("y", "x"), chunks=chunks
+    )
     return writers
 
 
@@ -279,9 +273,9 @@ def _write_frames(folder: Path, maps: Local) -> None:
         ("dky", frames.dk[:, 1]),
         ("time", ArrayReader(maps / "time").read()),
     ):
-        write_array(folder / array, data, dims=("time",))
+        cube.write_array(folder / array, data, dims=("time",))
     for array in ("batch_time", "batch_count"):
-        write_array(folder / array, ArrayReader(maps / array).read(), dims=("batch",))
+        cube.write_array(folder / array, ArrayReader(maps / array).read(), dims=("batch",))
 
 
 def outputs_of(both: bool) -> tuple[str, ...]:

@@ -39,15 +39,9 @@ from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.steps import run_steps
 from pixcal.stages.tiles import STRIP
+from pixcal.storage import cube
 from pixcal.storage.artefact import Build, Workspace
-from pixcal.storage.cube import (
-    ArrayReader,
-    ArrayWriter,
-    create_array,
-    create_group,
-    create_map,
-    write_array,
-)
+from pixcal.storage.cube import ArrayReader, ArrayWriter
 from pixcal.storage.formats import STAGES
 from pixcal.storage.manifest import Manifest, file_digest, read_json, write_json
 from pixcal.storage.place import Local
@@ -101,7 +95,7 @@ def sweep_sets(
     made: Workspace, reduced: Local, acquisition: Acquisition, config: Config, runtime: Runtime
 ) -> dict[str, dict[str, Any]]:
     """Sweep every set of ``reduced.zarr`` into ``sweep.zarr``; their summaries by name."""
-    create_group(made.folder / "sweep.zarr")
+    cube.create_group(made.folder / "sweep.zarr")
     sets = {}
     for name in (listed.name for listed in acquisition.frames.fringes):
         nominal = nominal_vector(acquisition, name)
@@ -133,7 +127,7 @@ def sweep_set(
 ) -> dict[str, Any]:
     """Sweep one set into ``sweep.zarr/<set name>`` of a build; returns its summary."""
     folder = made.folder / "sweep.zarr" / name
-    create_group(folder)
+    cube.create_group(folder)
     scouted = folder / "scout.json"
     if not scouted.exists() or f"{name}:scout {file_digest(scouted)}" not in made.journal():
         scout_set(source, nominal, folder, runtime, name)
@@ -142,8 +136,8 @@ def sweep_set(
     frames = read_frames(folder)
     batches = plan_batches(source.time_s(), config.batch_frames)
     prime = frames_to_prime(frames, source.block)
-    write_array(folder / "batch_time", batches.time, dims=("batch",))
-    write_array(folder / "batch_count", batches.count, dims=("batch",))
+    cube.write_array(folder / "batch_time", batches.time, dims=("batch",))
+    cube.write_array(folder / "batch_count", batches.count, dims=("batch",))
 
     n_batches = len(batches.ranges)
     writers = _create_maps(folder, source, n_batches)
@@ -183,17 +177,17 @@ def _create_maps(folder: Local, source: ReducedSet, n_batches: int) -> dict[str,
     (ny, nx), (cy, cx) = source.shape, source.map_chunks
     units = {"iota": "electron", "alpha": "electron", "phase": "radian", "sigma": "radian"}
     writers = {
-        name: create_map(folder / name, (ny, nx), (cy, cx), units=units.get(name, "1"))
+        name: cube.create_map(folder / name, (ny, nx), (cy, cx), units=units.get(name, "1"))
         for name in MAPS
     }
-    writers["mask"] = create_array(
+    writers["mask"] = cube.create_array(
         folder / "mask", (ny, nx), "u1", dims=("y", "x"), chunks=(cy, cx)
     )
     for name in BATCH_MAPS if n_batches else ():
-        writers[name] = create_map(folder / name, (ny, nx), (cy, cx), number=n_batches)
+        writers[name] = cube.create_map(folder / name, (ny, nx), (cy, cx), number=n_batches)
     width = 1 + _bound_pixels(source) + _chi2_pixels(source)
     for name, numbers in zip(TABLES, (width, TileSums.width(n_batches)), strict=True):
-        writers[name] = create_array(
+        writers[name] = cube.create_array(
             folder / name,
             (*source.grid, numbers),
             "<f8",
@@ -214,7 +208,6 @@ def _chi2_pixels(source: ReducedSet) -> int:
 
 
 def _sweep_strip(job: _Job, strip: Sequence[tuple[int, int]]) -> None:
-    """Sweep neighbouring tiles and write their maps."""
     parts = [_sweep_tile(job, at) for at in strip]
     (y, _), (x, _) = job.source.ranges(strip[0])
     for name, writer in job.writers.items():
@@ -337,7 +330,7 @@ def scout_set(
         )
     arrays = {name: np.concatenate([getattr(p, name) for p in parts]) for name in ("g", "dk")}
     for array, data in (arrays | {"time": source.time_s()}).items():
-        write_array(folder / array, data, dims=("time", "component")[: data.ndim])
+        cube.write_array(folder / array, data, dims=("time", "component")[: data.ndim])
     again = 0 if keep else len(places) * (source.n_blocks + len(first))
     facts: dict[str, Any] = {
         "k": [float(v) for v in scout.k],
