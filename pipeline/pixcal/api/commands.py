@@ -67,17 +67,6 @@ def _step(stage: str) -> Callable[..., Run]:
     return body
 
 
-def _json_of(stage: str, file: str) -> Callable[..., Json]:
-    """A step whose result is a file of the run."""
-
-    def body(run: StrPath, options: Any, runtime: Runtime) -> Json:
-        _call(stage, Path(run), options, runtime)
-        contents: Json = read_json(Path(run) / stage / file)
-        return contents
-
-    return body
-
-
 def _compare(runs: Sequence[StrPath], out: StrPath, options: of.Compare, runtime: Runtime) -> Json:
     _call("compare", [Path(one) for one in runs], Path(out), options, runtime)
     contents: Json = read_json(Path(out) / "compare.json")
@@ -144,6 +133,18 @@ def function_of(
     return function
 
 
+def _with_json(kind: type, file: str, fails: str) -> Callable[..., Json]:
+    """The function of a command whose result is a file of the run."""
+    stage = kind.__name__.lower()
+
+    def body(run: StrPath, options: Any, runtime: Runtime) -> Json:
+        _call(stage, Path(run), options, runtime)
+        contents: Json = read_json(Path(run) / stage / file)
+        return contents
+
+    return function_of(kind, body, fails, f"dict\n    Contents of ``{file}``.")
+
+
 def accepted(hint: Any) -> Any:
     """Type that a caller may pass for a field: any path for a Path, a sequence for a tuple."""
     if hint is Path:
@@ -198,23 +199,16 @@ write_report = function_of(
     "Run\n    Its ``report`` is the page.",
     "write_report",
 )
-crests = function_of(
-    of.Crests,
-    _json_of("crests", "crests.json"),
-    "the run was not reduced, or a set has too few fringes",
-    "dict\n    Contents of ``crests.json``.",
+crests = _with_json(
+    of.Crests, "crests.json", "the run was not reduced, or a set has too few fringes"
 )
-diagnose = function_of(
-    of.Diagnose,
-    _json_of("diagnose", "diagnosis.json"),
-    "the run was not reduced, or an effect is not known",
-    "dict\n    Contents of ``diagnosis.json``.",
+diagnose = _with_json(
+    of.Diagnose, "diagnosis.json", "the run was not reduced, or an effect is not known"
 )
-astrometry = function_of(
+astrometry = _with_json(
     of.Astrometry,
-    _json_of("astrometry", "astrometry.json"),
+    "astrometry.json",
     "the run was not fitted, or the truth is not that of this detector",
-    "dict\n    Contents of ``astrometry.json``.",
 )
 compare = function_of(
     of.Compare,

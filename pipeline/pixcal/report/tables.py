@@ -243,31 +243,19 @@ def _frames(arrays: Mapping[str, Mapping[str, Any]]) -> Table:
         times, source = _known(a, "time_s"), (a.get("time_source") or ["–"])[0]
         exposures = sorted(set(_known(a, "exptime_s")))
         listed = ", ".join(exact(v) for v in exposures[:8]) + ", …" * (len(exposures) > 8)
-        rows.append(
-            [
-                name,
-                number(len(set(a["file"]))),
-                number(len(a["file"])),
-                f"{a['shape'][1]}\u00a0×\u00a0{a['shape'][0]}" if a.get("shape") else "–",
-                date_of_mjd(min(_known(a, "mjd"))) if _known(a, "mjd") else "–",
-                duration(max(times) - min(times)) if times and source != "number" else "–",
-                listed or "–",
-                _span(_known(a, "temperature_c")),
-                {"number": "frame numbers"}.get(source, source),
-            ]
-        )
-    header = [
-        "array",
-        "files",
-        "frames",
-        "x × y",
-        "first frame (UTC)",
-        "duration",
-        "exposures (s)",
-        "°C",
-        "times from",
-    ]
-    return Table("Frames", header, rows)
+        row = {
+            "array": name,
+            "files": number(len(set(a["file"]))),
+            "frames": number(len(a["file"])),
+            "x × y": f"{a['shape'][1]}\u00a0×\u00a0{a['shape'][0]}" if a.get("shape") else "–",
+            "first frame (UTC)": date_of_mjd(min(_known(a, "mjd"))) if _known(a, "mjd") else "–",
+            "duration": duration(max(times) - min(times)) if times and source != "number" else "–",
+            "exposures (s)": listed or "–",
+            "°C": _span(_known(a, "temperature_c")),
+            "times from": {"number": "frame numbers"}.get(source, source),
+        }
+        rows.append(row)
+    return Table("Frames", [*rows[0]], [[*row.values()] for row in rows])
 
 
 def _known(array: Mapping[str, Any], column: str) -> list[float]:

@@ -278,12 +278,9 @@ def sums_of_region(
     """Number of pixels of a region with each batch, and products for each length."""
     if not lengths:
         return ArrayReader(batches.folder / "batch_count").read().astype(np.int64), []
-    sums = run_tasks(
-        partial(_sums_task, batches, lengths, folder / "expected"),
-        batches.tiles(region, TILES_HIGH),
-        runtime,
-        label=f"region {region_name(region)}",
-    )
+    task = partial(_sums_task, batches, lengths, folder / "expected")
+    squares, label = batches.tiles(region, TILES_HIGH), f"region {region_name(region)}"
+    sums = run_tasks(task, squares, runtime, label=label)
     grams = [np.sum(parts, axis=0) for parts in zip(*(s[1] for s in sums), strict=True)]
     return np.sum([s[0] for s in sums], axis=0), grams
 

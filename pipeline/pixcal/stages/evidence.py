@@ -54,9 +54,10 @@ def evidence_of(
     y, x = part or ((0, ny), (0, nx))
     (y0, x0), window = within or ((0, 0), (ny, nx))
     origin = (y0 + y[0], x0 + x[0])
-    maps = {
-        name: ArrayReader(run_dir / "reduce" / "calibration.zarr" / name).read(y, x)
-        for name in ("bias", "dark_rate", "flat", "mask")
+    calibration = run_dir / "reduce" / "calibration.zarr"
+    maps: dict[str, Any] = {
+        name: ArrayReader(calibration / name).read(y, x).astype(float)
+        for name in ("bias", "dark_rate", "flat")
     }
     fringes = {}
     for listed in acquisition.frames.fringes:
@@ -72,10 +73,8 @@ def evidence_of(
         read_noise=float(used["read_noise_e"]["used"]),
         amplifier_noise=float(used["read_noise_e"]["before_rounding"]),
         read_noise_error=float(used["read_noise_e"].get("used_error") or np.nan),
-        bias=maps["bias"].astype(float),
-        dark_rate=maps["dark_rate"].astype(float),
-        flat=maps["flat"].astype(float),
-        good=maps["mask"] == 0,
+        **maps,
+        good=ArrayReader(calibration / "mask").read(y, x) == 0,
         lowest_adu=ingested.lowest_adu,
         saturation_adu=min(map(ingested.saturation, ingested.arrays)),
         pitch_um=acquisition.detector.pitch_um,

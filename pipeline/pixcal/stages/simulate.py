@@ -202,17 +202,11 @@ def _write_description(bench: Bench, folder: Path) -> None:
     def globs(name: str) -> tuple[str, ...]:
         return (f"{name}/*{COMPRESSED if name in f.compress else '.fits'}",)
 
+    known = {field.name: getattr(d, field.name) for field in fields(described.Detector)}
     sets = (described.FringeSet(s.name, globs(s.name), s.baseline_mm) for s in f.fringes)
     contents = described.Acquisition(
         schema=described.SCHEMA,
-        detector=described.Detector(
-            name=d.name,
-            pitch_um=d.pitch_um,
-            gain_e_per_adu=d.gain_e_per_adu,
-            read_noise_e=d.read_noise_e,
-            full_well_e=d.full_well_e,
-            saturation_adu=float(d.top_adu),
-        ),
+        detector=described.Detector(**known | {"saturation_adu": float(d.top_adu)}),
         optics=described.Optics(
             wavelength_nm=o.wavelength_nm,
             distance_mm=o.nominal_distance_mm or o.distance_mm,

@@ -10,20 +10,10 @@ T = TypeVar("T")
 
 
 def run_steps(
-    made: Workspace,
-    task: Callable[[T], Any],
-    steps: Mapping[str, T],
-    runtime: Runtime,
-    *,
-    label: str,
+    made: Workspace, task: Callable[[T], Any], steps: Mapping[str, T], runtime: Runtime, label: str
 ) -> None:
     """Run a task on each of the ``steps`` (by name), noting each in the journal once in place."""
     done = made.journal()
     names = [name for name in steps if name not in done]
-    run_tasks(
-        task,
-        [steps[name] for name in names],
-        runtime,
-        label=label,
-        done=lambda number, _: made.note(names[number]),
-    )
+    todo = [steps[name] for name in names]
+    run_tasks(task, todo, runtime, label=label, done=lambda n, _: made.note(names[n]))

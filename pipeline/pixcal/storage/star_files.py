@@ -20,11 +20,9 @@ from pixcal.storage.folder import written_aside
 
 def read_table(path: Path) -> Table:
     """Read a table."""
+    kinds = {".csv": "ascii.csv", ".ecsv": "ascii.ecsv", ".txt": "ascii", ".dat": "ascii"}
     try:
-        if path.suffix.lower() in (".csv", ".ecsv", ".txt", ".dat"):
-            kind = {".csv": "ascii.csv", ".ecsv": "ascii.ecsv"}.get(path.suffix.lower(), "ascii")
-            return Table.read(path, format=kind)
-        return Table.read(path)
+        return Table.read(path, format=kinds.get(path.suffix.lower()))
     except Exception as error:  # the readers raise a dozen kinds, all of which mean one thing
         reason = " ".join(str(error).split())[:200]
         if not path.exists():

@@ -14,55 +14,46 @@ from queue import SimpleQueue
 LARGE = 1 << 18  # least bytes of a file for a separate request
 
 
-class _Writeback:
+class _Writeback(threading.Thread):
     """A thread that flushes files one after the other."""
 
     def __init__(self) -> None:
-        self._files: SimpleQueue[Path | threading.Event] = SimpleQueue()
-        self._failed: OSError | None = None
-        threading.Thread(target=self._flush_all, daemon=True).start()
+        super().__init__(daemon=True)
+        self.files: SimpleQueue[Path | threading.Event] = SimpleQueue()
+        self.failed: OSError | None = None
+        self.start()
 
-    def begin(self, file: Path) -> None:
-        self._files.put(file)
-
-    def wait(self) -> None:
-        reached = threading.Event()
-        self._files.put(reached)
-        reached.wait()
-        failed, self._failed = self._failed, None
-        if failed is not None:
-            raise failed
-
-    def _flush_all(self) -> None:
+    def run(self) -> None:
+        """Flush what is in the queue; an event there tells that all before it are done."""
         while True:
-            item = self._files.get()
+            item = self.files.get()
             if isinstance(item, threading.Event):
                 item.set()
                 continue
             try:
                 flush_file(item)
             except OSError as error:
-                self._failed = self._failed or error
+                self.failed = self.failed or error
 
 
-@cache
-def _writeback() -> _Writeback:
-    """The writeback thread of this process."""
-    return _Writeback()
-
-
+_writeback = cache(_Writeback)  # the one of this process
 # A forked process does not inherit the thread.
 os.register_at_fork(after_in_child=_writeback.cache_clear)
 
 
 def begin(file: Path) -> None:
     """Start to flush a file to disk; returns at once."""
-    _writeback().begin(file)
+    _writeback().files.put(file)
 
 
 def wait() -> None:
     """Wait for all flushes; OSError if a file could not be written."""
-    _writeback().wait()
+    thread, reached = _writeback(), threading.Event()
+    thread.files.put(reached)
+    reached.wait()
+    failed, thread.failed = thread.failed, None
+    if failed is not None:
+        raise failed
 
 
 def flush_file(path: str | Path) -> None:

@@ -26,14 +26,10 @@ class Value(NamedTuple):
     error: float
 
 
-class GridComparison(NamedTuple):
-    """Root mean square errors of centroids, px, and the ratio of both."""
-
-    # perfect, measured: pixels assumed on a perfect grid, and at mapped positions. `perfect` is
-    # NaN if the scatter of the offsets is not significant above the maps' errors
-    perfect: Value
-    measured: Value
-    gain: Value
+# root mean square errors of centroids, px: `perfect` and `measured` with pixels assumed on a
+# perfect grid and at mapped positions, and `gain`, the ratio of both; `perfect` is NaN if the
+# scatter of the offsets is not significant above the maps' errors
+GridComparison = dict[str, Value]
 
 
 def compare(perfect: F64, measured: F64, noise: F64, rng: np.random.Generator) -> GridComparison:
@@ -54,7 +50,8 @@ def compare(perfect: F64, measured: F64, noise: F64, rng: np.random.Generator) -
         rms[0] = rms[2] = np.nan
     finite = [column[np.isfinite(column)] for column in again.T[:3]]
     errors = [float(np.std(values)) if len(values) > 1 else math.nan for values in finite]
-    return GridComparison(*(Value(float(rms[n]), errors[n]) for n in range(3)))
+    values = map(Value, rms[:3].tolist(), errors)
+    return dict(zip((*GRIDS, "gain"), values, strict=True))
 
 
 def _roots(sums: F64) -> F64:
@@ -99,7 +96,7 @@ def axis_facts(
     last = {kind: values[-1] for kind, values in means.items()}
     pairs = {kind: v[1::2] - v[: len(v) // 2 * 2 : 2] for kind, v in last.items()}
     photons = compared(kinds, "_photons")
-    times = {grid: getattr(photons, grid).value / TARGET_PX for grid in GRIDS}
+    times = {grid: photons[grid].value / TARGET_PX for grid in GRIDS}
     positions_needed = {g: math.ceil(t**2) if math.isfinite(t) else None for g, t in times.items()}
     second = kinds["perfect"] - kinds["linear"]
     second = second[np.isfinite(second)]
@@ -111,7 +108,7 @@ def axis_facts(
         "separation": _facts(compared(pairs, "_photons"), uas_per_px),
         "averaging": {"positions": lengths}
         | {
-            f"{grid}{suffix}_px": [_finite(getattr(c, grid)[n]) for c in averaged]
+            f"{grid}{suffix}_px": [_finite(c[grid][n]) for c in averaged]
             for grid in GRIDS
             for n, suffix in enumerate(("", "_err"))
         },
@@ -135,8 +132,9 @@ def number(value: Value, uas_per_px: float) -> dict[str, float | None]:
 
 
 def _facts(comparison: GridComparison, uas_per_px: float) -> dict[str, Any]:
-    gain = {"value": _finite(comparison.gain.value), "err": _finite(comparison.gain.error)}
-    return {grid: number(getattr(comparison, grid), uas_per_px) for grid in GRIDS} | {"gain": gain}
+    value, error = map(_finite, comparison["gain"])
+    grids = {grid: number(comparison[grid], uas_per_px) for grid in GRIDS}
+    return grids | {"gain": {"value": value, "err": error}}
 
 
 def table(result: Mapping[str, Any]) -> list[tuple[str, ...]]:

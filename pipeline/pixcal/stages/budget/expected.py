@@ -128,16 +128,11 @@ class WeightErrors:
         return cls(scatter(1 / noise), scatter(light / noise))
 
 
-def sample_variances(bench: Bench) -> dict[str, float]:
-    """Parts of the variance (e-²) of a sample without light."""
+def sample_variance(bench: Bench) -> float:
+    """Variance (e-²) of a sample without light: read noise, converter's step, dark current."""
     d = bench.detector
     dark = d.dark_e_s * bench.frames.exptime_s
-    return {"read_noise": d.read_noise_e**2, "quantisation": d.gain_e_per_adu**2 / 12, "dark": dark}
-
-
-def sample_variance(bench: Bench) -> float:
-    """Their sum."""
-    return sum(sample_variances(bench).values())
+    return d.read_noise_e**2 + d.gain_e_per_adu**2 / 12 + dark
 
 
 def own_effects(bench: Bench, where: str) -> tuple[Effect, ...]:

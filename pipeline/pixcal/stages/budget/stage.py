@@ -68,8 +68,8 @@ def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, 
 def _budget(
     bench: Bench, bound: expected.JoinedBound, precision: float | None, frames: int | None
 ) -> dict[str, Any]:
-    fringes, split = bench.frames.fringes, expected.planned_split(bench)
-    counts = [s.count for s in fringes]
+    d, f, split = bench.detector, bench.frames, expected.planned_split(bench)
+    counts = [s.count for s in f.fringes]
     given = None if frames is None else np.full(len(counts), frames)
 
     def facts(reach: Reach, one: Shares, planned: Shares, given: Shares | None) -> dict[str, Any]:
@@ -85,7 +85,7 @@ def _budget(
         }
 
     sets = {}
-    for n, (scan, s) in enumerate(zip(fringes, bound.sets, strict=True)):
+    for n, (scan, s) in enumerate(zip(f.fringes, bound.sets, strict=True)):
         shares = s.shares()
         limited_by = _limited_by(shares)
         if precision is not None:
@@ -105,8 +105,12 @@ def _budget(
     return {
         "precision_px": precision,
         "frames": frames,
-        "window": list(bench.detector.shape),
-        "variance_e2": expected.sample_variances(bench),
+        "window": list(d.shape),
+        "variance_e2": {
+            "read_noise": d.read_noise_e**2,
+            "quantisation": d.gain_e_per_adu**2 / 12,
+            "dark": d.dark_e_s * f.exptime_s,
+        },
         "sets": sets,
         "joined": {
             "components": components,

@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -62,23 +63,17 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
         at: (at, {name: local[n] for name, local in removed.items()})
         for n, at in enumerate(source.tiles())
     }
-    every = run_tasks(
-        partial(_write_strip, fitted, writers, both),
-        [[jobs[at] for at in strip] for strip in source.strips()],
-        runtime,
-        label="maps",
-    )
-    of_tiles = [of_tile for of_strip in every for of_tile in of_strip]
+    strips = [[jobs[at] for at in strip] for strip in source.strips()]
+    task = partial(_write_strip, fitted, writers, both)
+    every = run_tasks(task, strips, runtime, label="maps")
     for writer in writers.values():
         writer.finish()
+    good, sigma, square, freedom = zip(*chain.from_iterable(every), strict=True)
     sets = {}
     for n, f in enumerate(fitted):
-        good = sum(t.good[n] for t in of_tiles)
-        errors = np.concatenate([t.sigma[n] for t in of_tiles])
-        sets[f.name] = ny * nx - good, float(np.median(errors))
-    freedom = sum(t.freedom for t in of_tiles)
-    square = sum(t.square for t in of_tiles)
-    return Totals(sets, outputs, square / freedom if freedom else None)
+        errors = np.concatenate([of_tile[n] for of_tile in sigma])
+        sets[f.name] = ny * nx - sum(of_tile[n] for of_tile in good), float(np.median(errors))
+    return Totals(sets, outputs, sum(square) / sum(freedom) if any(freedom) else None)
 
 
 def write_offsets(group: Local, fitted: list[FittedSet]) -> None:
@@ -101,18 +96,11 @@ def _map_writer(place: Local, fitted: FittedSet, batches: int = 0) -> ArrayWrite
     return cube.create_map(place, source.shape, source.map_chunks, units="pixel", number=batches)
 
 
-@dataclass(frozen=True)
-class _TileTotals:
-    """Good pixels and sampled errors (px) of each set in a tile, and disagreement of the sets."""
-
-    good: list[int]
-    sigma: list[F32]
-    square: float
-    freedom: int
-
-
 Job = tuple[tuple[int, int], dict[str, F64]]  # a tile, and the modes removed from each set there
 Swept = Mapping[str, ArrayReader]  # readers of the maps of a set's sweep
+# of a tile: good pixels and sampled errors (px) of each set; square and freedom of the sets'
+# disagreement
+_TileTotals = tuple[list[int], list[F32], float, int]
 
 
 def _write_strip(
@@ -171,12 +159,8 @@ def _maps_of_tile(
     goods = [np.isfinite(s) for s in sigma]
     number = max(1, min(SAMPLED_ERRORS, MAX_SAMPLED_ERRORS // len(fitted[0].planes)))
     some = [_some(s[good].astype(np.float32), number) for s, good in zip(sigma, goods, strict=True)]
-    return _TileTotals(
-        [int(good.sum()) for good in goods],
-        some,
-        float(chi2[~missing].sum()),
-        int(freedom[~missing].sum()),
-    )
+    count = [int(good.sum()) for good in goods]
+    return count, some, float(chi2[~missing].sum()), int(freedom[~missing].sum())
 
 
 @dataclass(frozen=True)

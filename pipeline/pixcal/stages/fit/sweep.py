@@ -5,7 +5,7 @@ phases afterwards: a fit with another model does not read the cube again.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -259,19 +259,6 @@ def _sums(job: _Job, tile: Tile, maps: TileMaps, good: Mask) -> F64:
 # The scout's part: frame parameters of a set, from a few tiles
 
 
-@dataclass(frozen=True)
-class Lookout:
-    """Tiles that the scout reads, and whether their codes are kept for the sweep."""
-
-    source: ReducedSet
-    places: list[tuple[int, int]]
-    keep: bool
-
-    def codes(self, block: int) -> list[U16]:
-        """Codes (t, y, x) of a block of frames, for each place."""
-        return [self.source.codes(at, block, keep=self.keep) for at in self.places]
-
-
 def scout_tiles(grid: tuple[int, int], number: int) -> list[tuple[int, int]]:
     """Tiles spread over the window: the central one, then repeatedly the one farthest from all."""
     tiles = np.array(list(product(range(grid[0]), range(grid[1]))), dtype=float)
@@ -311,10 +298,10 @@ def scout_set(
     here = within_memory(what, per_task, 3 * PRIME_BYTES + kept, here)
     each = partial(run_tasks, runtime=here, label=f"first look at {name}")
     scout = Scout(tiles, source.coding, nominal, ((ny - 1) / 2, (nx - 1) / 2), each)
-    lookout = Lookout(source, places, keep)
+    codes = partial(_codes, source, places, keep)
 
     first = _first_look(source, PRIME_BYTES // (len(places) * chunk_bytes))
-    looks = run_tasks(partial(_look, lookout), first, here, label=f"first look at {name}")
+    looks = run_tasks(partial(_look, codes), first, here, label=f"first look at {name}")
     with one_blas_thread():
         parts = [scout.prime([np.concatenate(tile) for tile in zip(*looks, strict=True)])]
     del looks
@@ -322,12 +309,8 @@ def scout_set(
     if len(parts[0].g) < source.n_frames:
         # A chunk of each place and the memory of its solution.
         runtime = within_memory(what, 3 * len(places) * chunk_bytes, kept, runtime)
-        parts = run_tasks(
-            partial(_solve_block, lookout, scout),
-            range(source.n_blocks),
-            runtime,
-            label=f"scout {name}",
-        )
+        task = partial(_solve_block, codes, scout)
+        parts = run_tasks(task, range(source.n_blocks), runtime, label=f"scout {name}")
     arrays = {name: np.concatenate([getattr(p, name) for p in parts]) for name in ("g", "dk")}
     for array, data in (arrays | {"time": source.time_s()}).items():
         cube.write_array(folder / array, data, dims=("time", "component")[: data.ndim])
@@ -346,13 +329,18 @@ def scout_set(
     write_json(folder / "scout.json", facts)
 
 
-def _look(lookout: Lookout, wanted: tuple[int, Indices]) -> list[U16]:
+def _codes(source: ReducedSet, places: list[tuple[int, int]], keep: bool, block: int) -> list[U16]:
+    """Codes (t, y, x) of a block of frames for each place, perhaps kept for the sweep."""
+    return [source.codes(at, block, keep=keep) for at in places]
+
+
+def _look(codes: Callable[[int], list[U16]], wanted: tuple[int, Indices]) -> list[U16]:
     block, frames = wanted
-    return [codes[frames] for codes in lookout.codes(block)]
+    return [of_tile[frames] for of_tile in codes(block)]
 
 
-def _solve_block(lookout: Lookout, scout: Scout, block: int) -> FrameParameters:
-    return scout.solve(lookout.codes(block))
+def _solve_block(codes: Callable[[int], list[U16]], scout: Scout, block: int) -> FrameParameters:
+    return scout.solve(codes(block))
 
 
 def _first_look(source: ReducedSet, blocks: int) -> list[tuple[int, Indices]]:
