@@ -60,11 +60,8 @@ class HotPixels:
         self, classes: PixelClasses, links: tuple[Place, ...], doubt: float = 0.0
     ) -> "ClassShares":
         """Combined hot pixels of each class; ``doubt``: relative error of each."""
-        step = np.array(links)
-        y = np.stack([np.broadcast_to(self.y[:, None], (len(self.y), len(step)))] * 2, -1)
-        x = np.stack([np.broadcast_to(self.x[:, None], (len(self.x), len(step)))] * 2, -1)
-        y[:, :, 1] -= step[:, 0]
-        x[:, :, 1] -= step[:, 1]
+        step = np.array(links)[:, :, None] * [0, 1]
+        y, x = self.y[:, None, None] - step[:, 0], self.x[:, None, None] - step[:, 1]
         order = np.argsort(self.value, axis=0)
         every = (self.value, np.hypot(self.sigma, doubt * self.value), classes.of(y, x))
         value, sigma, number = (np.take_along_axis(a, order, 0) for a in every)
@@ -175,12 +172,8 @@ def hot_pixels(
         got, shares = given(warm)
     rest = rest - got
     charge = rest[y, x]
-    step = np.array(links)
-    at = (
-        slice(None),
-        REACH + np.stack([step[:, 0], -step[:, 0]], 1),
-        REACH + np.stack([step[:, 1], -step[:, 1]], 1),
-    )
+    step = np.array(links)[:, :, None] * [1, -1]
+    at = slice(None), REACH + step[:, 0], REACH + step[:, 1]
     around, clean = _patches(rest, warm, y, x, OVERLAP_KNOWN if known else OVERLAP)
     others = _surroundings(got, y, x, REACH)[at] / charge[:, None, None] - shares
     value = around[at] / charge[:, None, None] + shares

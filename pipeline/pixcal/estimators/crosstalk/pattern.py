@@ -65,7 +65,21 @@ def pattern_information(
     number = classes.of(*np.nonzero(good))
     members = without((number == np.arange(classes.count)[:, None]).astype(float), smooth)
     gram = members @ members.T
-    found = [_of_set(one, couplings, classes, good, smooth, members) for one in sets]
+
+    def of_set(found: FringeEvidence) -> _Pattern:
+        # Flagged pixels were fitted too, so their contribution to others is known.
+        read = filled(found.theta / found.shot_factor, found.k)
+        theta = uncouple_fringes(read, couplings, found.origin)
+        k = float(np.hypot(*found.k))
+        offsets = found.delta[good] + phase_change(read, theta)[good] / k
+        delta, scatter = _clipped(offsets, smooth)
+        visibility, spread = _clipped(log_visibility(theta, good), smooth)
+        noise = float(np.median(found.sigma[good])) / k
+        sums = members @ delta, members @ visibility
+        slopes = response_slopes(found.k, couplings, classes)
+        return _Pattern(np.array(found.k) / k, *sums, noise, scatter, spread, slopes, k)
+
+    found = [of_set(one) for one in sets]
     size = len(couplings)
     normal, right = np.zeros((size, size)), np.zeros(size)
     for one in found:
@@ -95,34 +109,6 @@ def visibility_pattern(evidence: Evidence) -> Callable[[PixelClasses], float]:
         return float(sum(np.sum(own**2 / count) for own in sums))
 
     return gain
-
-
-def _of_set(
-    found: FringeEvidence,
-    couplings: Sequence[Coupling],
-    classes: PixelClasses,
-    good: Mask,
-    smooth: F64,
-    members: F64,
-) -> _Pattern:
-    # Flagged pixels were fitted too, so their contribution to others is known.
-    read = filled(found.theta / found.shot_factor, found.k)
-    theta = uncouple_fringes(read, couplings, found.origin)
-    k = float(np.hypot(*found.k))
-    delta = found.delta[good] + phase_change(read, theta)[good] / k
-    delta, scatter = _clipped(delta, smooth)
-    visibility, spread = _clipped(log_visibility(theta, good), smooth)
-    noise = float(np.median(found.sigma[good])) / k
-    return _Pattern(
-        np.array(found.k) / k,
-        members @ delta,
-        members @ visibility,
-        noise,
-        scatter,
-        spread,
-        response_slopes(found.k, couplings, classes),
-        k,
-    )
 
 
 def _clipped(values: F64, modes: F64) -> tuple[F64, float]:

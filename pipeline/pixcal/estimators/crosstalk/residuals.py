@@ -17,7 +17,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.crosstalk import Coupling, filled, noise_shares, uncouple, uncouple_fringes
 from pixcal.kernels.line_means import without_line_means
-from pixcal.model.arrays import F32, F64, Indices
+from pixcal.model.arrays import F32, Indices
 
 UNIT = 1e4  # unit of charge, electrons; variances are in 10⁴ e-²
 CLIP = 6.0  # residuals beyond this many sigmas (particles, telegraph noise) are excluded
@@ -98,7 +98,8 @@ def _of_fringes(found: FringeEvidence, known: Sequence[Coupling], kept: F32) -> 
     flat = 1 / found.shot_factor
     theta = filled(np.where(found.good, found.theta, np.nan) * flat, found.k)
     collected = uncouple_fringes(theta, known, found.origin)
-    charge = np.maximum(_model(collected, found.g[at], found.dk[at]) / np.float32(UNIT), 0)
+    light = replace(found, theta=collected, g=found.g[at], dk=found.dk[at]).model
+    charge = np.maximum(light / np.float32(UNIT), 0)
     # Also changes along the window: a moving fringe vector, rows that are exposed later.
     y, x = grid((flat.shape[0], flat.shape[1]))
     places = np.concatenate([theta, x * theta, y * theta]).reshape(9, -1) / np.abs(theta).max()
@@ -127,18 +128,6 @@ def _without_response(rest: F32, charge: F32) -> F32:
         for noise, level in zip(rest, charge, strict=True):
             noise -= np.interp(level / step - 0.5, some, mean).astype(np.float32)
     return rest
-
-
-def _model(theta: F64, g: F64, dk: F64) -> F32:
-    """Frames (t, y, x) of maps, e-."""
-    theta = theta.astype(np.float32)
-    b, c, s = g.T.astype(np.float32)[:, :, None, None]
-    found = b * theta[0] + c * theta[1] + s * theta[2]
-    if np.any(dk):
-        y, x = (a.astype(np.float32) for a in grid((theta.shape[1], theta.shape[2])))
-        kx, ky = dk.T.astype(np.float32)[:, :, None, None]
-        found += (kx * x + ky * y) * (c * theta[2] - s * theta[1])
-    return np.asarray(found)
 
 
 def _noise(rest: F32, charge: F32, read: F32, kept: F32, of_time: F32, of_place: F32) -> Residuals:

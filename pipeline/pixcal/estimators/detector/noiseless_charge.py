@@ -46,7 +46,9 @@ def _last_of(
     for fringes in sets:
         flat = evidence.flat[fringes.good].astype(np.float32)
         variance = fringes.variance[:, fringes.good] * flat**2
-        left = np.maximum(1 - _taken_by_fit(fringes), _LEAST_LEFT)
+        # The fit of a pixel takes most of the variance of dark samples, which weigh most: an offset
+        # of the signal by 3 / t of its harmonic mean would change the variances alike.
+        left = np.maximum(1 - Freedom(fringes).taken_by_pixels(), _LEAST_LEFT)
         square = (fringes.residual[:, fringes.good] * flat) ** 2 / left
         kept = square < _CLIP * variance
         square, weight = np.where(kept, square, 0), np.where(kept, 0.5 / variance**2, 0)
@@ -55,16 +57,3 @@ def _last_of(
         right = right + np.array([np.vdot(weight * a, square) for a in own], float)
     covariance = inverse_normal(np.asarray(normal))
     return float(covariance[-1] @ right), float(np.sqrt(covariance[-1, -1]))
-
-
-def _taken_by_fit(fringes: FringeEvidence) -> F32:
-    """Share (t, n) of the variance of samples that the fit of their pixels takes up.
-
-    It is largest in dark samples, which weigh most: an offset of the signal by 3 / t of its
-    harmonic mean would change the variances alike.
-    """
-    freedom = Freedom(fringes)
-    i, j = np.indices((len(freedom.of_time),) * 2).reshape(2, -1)
-    pairs = (freedom.of_time[i] * freedom.of_time[j]).T.astype(np.float32)
-    taken = pairs @ freedom.pixel_inverse[:, i, j].T.astype(np.float32)
-    return np.asarray(freedom.weight * taken)

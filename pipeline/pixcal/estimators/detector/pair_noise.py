@@ -90,7 +90,8 @@ def dark_pair_sums(
     subtracted.
     """
     pairs = zip(frames[::2], frames[1::2], strict=False)
-    blocks = [_blocks(*pair, np.inf, read_noise, quantum, without) for pair in pairs]
+    guess = {"gain": np.inf, "read_noise": read_noise, "quantum": quantum}
+    blocks = [_blocks(a, b, without, **guess) for a, b in pairs]
     return bin_pairs(np.concatenate([_NO_BLOCKS, *blocks]))
 
 
@@ -124,25 +125,19 @@ def flat_pair_sums(
         # The noise of nearly full pixels is clipped, that of another colour beside them is not.
         # Full pixels beside those of an overscan would pass for half-full ones without noise.
         first[~lit(level) | (level + _NEARLY * noise > full)] = np.nan
-        blocks.append(_blocks(first, second, gain, read_noise, quantum, line_noise.lines or ()))
+        guess = {"gain": gain, "read_noise": read_noise, "quantum": quantum}
+        blocks.append(_blocks(first, second, line_noise.lines or (), **guess))
     every = np.concatenate(blocks)
     every[:, 1] += dark * (every[:, 0] > 0)
     return line_noise.put_back(bin_pairs(every))
 
 
-def _blocks(
-    first: F32,
-    second: F32,
-    gain: float,
-    read_noise: float,
-    quantum: float,
-    without: tuple[str, ...],
-) -> F64:
+def _blocks(first: F32, second: F32, without: tuple[str, ...], **guess: float) -> F64:
     if not np.isfinite(first + second).any():
         return _NO_BLOCKS
     for name in without:
         second = second + _common(first - second, name)
-    blocks = pair_statistics(first, second, gain=gain, read_noise=read_noise, quantum=quantum)
+    blocks = pair_statistics(first, second, **guess)
     for name in without:
         across = 0 if name == "row" else 1
         taken = _MEDIAN_TAKES / first.shape[1 - across] * blocks[:, 2]

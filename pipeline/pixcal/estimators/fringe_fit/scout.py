@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from scipy.linalg import eigh
 
-from pixcal.estimators.fringe_fit import fringes
+from pixcal.estimators.fringe_fit import fringes, tile_fit
 from pixcal.estimators.fringe_fit.fit_flags import excess_scatter, usual_chi2
 from pixcal.estimators.fringe_fit.fringes import MIN_FRINGES_FOR_MAPS, FrameParameters
 from pixcal.estimators.fringe_fit.gauge import gauge_matrix
-from pixcal.estimators.fringe_fit.tile_fit import Coding, Tile, fit_tile, residual_chi2
-from pixcal.kernels.bilinear import frame_sums
+from pixcal.estimators.fringe_fit.tile_fit import Coding, Tile
+from pixcal.kernels.bilinear import frame_sums, solve_pixels
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.model.arrays import C128, F32, F64, U16, Indices, Mask
 from pixcal.model.errors import InputError
@@ -263,7 +263,10 @@ class Scout:
         before: Sequence[F64 | None] = self.theta or [None] * len(self.tiles)
 
         def fit(n: int) -> tuple[F64, C128]:
-            return fit_tile(self.tiles[n], [codes[n]], self.coding, frames, self.k, before[n])
+            given = self.tiles[n], [codes[n]], self.coding, frames
+            model, smooth = tile_fit.start_model(*given, self.k, before[n])
+            step, _, _ = solve_pixels(tile_fit.accumulate(*given, model))
+            return model + step, smooth.map
 
         thetas, smooths = zip(*self.each(fit, range(len(self.tiles))), strict=True)
         goods = [
@@ -332,7 +335,8 @@ class Scout:
         """Reduced chi-square of the good pixels of all tiles."""
 
         def chi2(n: int) -> F64:
-            return residual_chi2(self.tiles[n], codes[n], self.coding, frames, self.theta[n])
+            tile, theta = self.tiles[n], self.theta[n]
+            return tile_fit.residual_chi2(tile, codes[n], self.coding, frames, theta)
 
         return np.concatenate(self.each(chi2, range(len(self.tiles))))
 

@@ -9,7 +9,7 @@ import numpy as np
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, SmoothPhasor, smooth_phasor
 from pixcal.kernels.bilinear import GAP, GOES_ON, N_SUMS, solve_pixels, sweep_batches
 from pixcal.kernels.robust import median
-from pixcal.model.arrays import C128, F32, F64, U16, Mask
+from pixcal.model.arrays import F32, F64, U16, Mask
 
 MOST_FRAMES = 64  # summed in float32
 
@@ -152,7 +152,11 @@ def start_model(
     Phase and visibility are smooth over the tile; the level is the pixel's own. ``k``: near fringe
     vector, rad/px. ``start``: (3, y, x) pixels if known; else from an unweighted fit.
     """
-    theta = _unweighted_pixels(tile, blocks, coding, frames) if start is None else start
+    theta = start
+    if theta is None:
+        nothing = np.zeros((3, *tile.shape), np.float32)
+        even = replace(tile, read=nothing[0] + 1, shot=nothing[0])
+        theta = solve_pixels(accumulate(even, blocks, coding, frames, nothing))[0]
     iota = theta[0]
     usable = np.isfinite(iota) & (iota > 0)
     good = tile.good & usable
@@ -162,27 +166,3 @@ def start_model(
     smooth = smooth_phasor(phasor, good, k)
     model = np.stack([iota, iota * smooth.map.imag, iota * smooth.map.real])
     return model.astype(np.float32), smooth
-
-
-def _unweighted_pixels(
-    tile: Tile, blocks: Sequence[U16], coding: Coding, frames: FrameParameters
-) -> F64:
-    """Pixels (3, y, x) by unweighted least squares."""
-    nothing = np.zeros((3, *tile.shape), np.float32)
-    even = replace(tile, read=nothing[0] + 1, shot=nothing[0])
-    return solve_pixels(accumulate(even, blocks, coding, frames, nothing))[0]
-
-
-def fit_tile(
-    tile: Tile,
-    blocks: Sequence[U16],
-    coding: Coding,
-    frames: FrameParameters,
-    k: tuple[float, float],
-    start: F64 | None = None,
-) -> tuple[F64, C128]:
-    """Weighted fit of every pixel of a tile: theta (3, y, x) and the smooth phasor (y, x)."""
-    model, smooth = start_model(tile, blocks, coding, frames, k, start)
-    sums = accumulate(tile, blocks, coding, frames, model)
-    step, _, _ = solve_pixels(sums)
-    return model + step, smooth.map

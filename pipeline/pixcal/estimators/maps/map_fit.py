@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
-from pixcal.estimators.fringe_fit.fringes import grid, polynomial_basis
+from pixcal.estimators.fringe_fit.fringes import plane_wave, polynomial_basis
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.estimators.maps.stitching import within
 from pixcal.estimators.maps.structure import CELLS
@@ -114,9 +114,8 @@ def fitted_values(parts: Sequence[MapPart]) -> tuple[F64, F64, F64]:
 
 def phase_map(fringes: FringeEvidence) -> F64:
     """Phase (y, x) of a set minus its fringe vector's plane and its mean, ±pi rad; NaN: masked."""
-    y, x = grid(fringes.good.shape)
-    kx, ky = fringes.k
-    phasor = (fringes.theta[2] + 1j * fringes.theta[1]) * np.exp(-1j * (kx * x + ky * y))
+    carrier = plane_wave(fringes.good.shape, fringes.k)
+    phasor = (fringes.theta[2] + 1j * fringes.theta[1]) * carrier.conj()
     phasor = np.where(fringes.good, phasor, 0)
     total = phasor.sum()
     rest = np.angle(phasor * np.conj(total if total else 1.0))

@@ -43,7 +43,6 @@ from pixcal.storage.frame_reader import describe
 from pixcal.storage.frames import Frame, columns, inspect, tabulate
 from pixcal.storage.lock import lock
 from pixcal.storage.manifest import Manifest, read_manifest, write_json, write_manifest
-from pixcal.storage.place import Place
 from pixcal.storage.sources import SourceFile, find_sources, fingerprint
 from pixcal.storage.stage import make
 
@@ -219,25 +218,6 @@ def _common_dtype(array: str, files: Sequence[FrameFile]) -> np.dtype[Any]:
 # Memory and tasks
 
 
-def _plan(
-    tables: Mapping[str, Sequence[Frame]],
-    copied: Mapping[str, bool],
-    cubes: Place,
-    runtime: Runtime,
-) -> tuple[int, Plan]:
-    """Rows to copy at once, and memory plan: reduces rows before workers."""
-    shared = _BYTES_A_FRAME * sum(map(len, tables.values()))
-    rows, need = 0, 0
-    for rows in _BAND_ROWS:
-        tasks = (
-            _task_bytes(array, frames, rows, copied[array]) for array, frames in tables.items()
-        )
-        need = max(tasks, default=0) + transit_bytes(cubes)
-        if Plan(need, shared, runtime.n_workers).total <= runtime.memory:
-            break
-    return rows, make_plan("ingest", need, shared, runtime)
-
-
 def _task_bytes(array: str, frames: Sequence[Frame], rows: int, copied: bool) -> int:
     """Peak memory of one task: its rows, samples in conversion, chunks in compression."""
     files = _files(frames)
@@ -284,7 +264,15 @@ def _fill(
     made: Build, tables: Mapping[str, Sequence[Frame]], copied: Mapping[str, bool], runtime: Runtime
 ) -> None:
     """Read and write all blocks that an earlier run has not written."""
-    rows, plan = _plan(tables, copied, made.cubes, runtime)
+    shared = _BYTES_A_FRAME * sum(map(len, tables.values()))
+    rows, need = 0, 0
+    # Fewer rows first, then fewer workers.
+    for rows in _BAND_ROWS:
+        tasks = (_task_bytes(array, some, rows, copied[array]) for array, some in tables.items())
+        need = max(tasks, default=0) + transit_bytes(made.cubes)
+        if Plan(need, shared, runtime.n_workers).total <= runtime.memory:
+            break
+    plan = make_plan("ingest", need, shared, runtime)
     scratch = made.scratch
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()

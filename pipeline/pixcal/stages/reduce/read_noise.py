@@ -27,14 +27,6 @@ _LEAST = 0.05  # smallest measurable noise, in steps
 _PAIRS, _SAMPLES = 16, 1 << 20  # pairs, and samples of each frame, that measure block noise
 
 
-def _read_variance(dark: F64, lost: Measure) -> Measure | None:
-    """Variance of a sample without light and its error (ADU²)."""
-    dof, _, square = dark[:, :3].sum(axis=0)
-    if not dof > 0:
-        return None
-    return square / dof + lost[0], math.hypot(square / dof * math.sqrt(2 / dof), lost[1])
-
-
 def lost_in_blocks(job: Measuring) -> Measure:
     """Variance (ADU²) that `pair_statistics` removes with the means of its blocks; its error."""
     series = job.read_series
@@ -74,10 +66,12 @@ def read_noise(
 
     ``lost``: see `lost_in_blocks`. ``shot``: the shot variance of the dark signal (ADU²).
     """
-    whole = _read_variance(dark, lost)
-    if whole is None:
+    dof, _, square = dark[:, :3].sum(axis=0)
+    if not dof > 0:
         return None, None
-    variance = max(whole[0] - shot[0], SHEPPARD * job.quantum**2), math.hypot(whole[1], shot[1])
+    whole = square / dof + lost[0]
+    error = math.hypot(square / dof * math.sqrt(2 / dof), lost[1], shot[1])
+    variance = max(whole - shot[0], SHEPPARD * job.quantum**2), error
     if is_cut_off(job):
         own = max(variance[0] - SHEPPARD * job.quantum**2, (_LEAST * job.quantum) ** 2)
         off = _CUT_OFF + _COARSE_CUT_OFF * (job.quantum / math.sqrt(own)) ** 3
