@@ -197,7 +197,7 @@ def hot(value, charge=None, sigma=2e-4):
     shares[:, 0, 0] = value
     sigmas = np.full((n, 1, 2), np.inf)
     sigmas[:, 0, 0] = sigma
-    return HotPixels(4 * np.arange(n), np.zeros(n, int), charge, shares, sigmas, (80, 10))
+    return HotPixels(4 * np.arange(n), np.zeros(n, int), charge, shares, sigmas)
 
 
 def shown(pixels):

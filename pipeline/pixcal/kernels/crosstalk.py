@@ -69,7 +69,7 @@ class Coupling:
         """The same with another share."""
         return replace(self, share=self.share * factor)
 
-    def places(self, shape: tuple[int, int], first: tuple[int, int]) -> tuple[Place, Place]:
+    def places(self, shape: tuple[int, ...], first: tuple[int, int]) -> tuple[Place, Place]:
         """Source and receiver pixels that both lie in a sub-window (y, x).
 
         ``first`` are its first row and column in the window.
@@ -98,7 +98,7 @@ class _Step:
 
 @lru_cache(maxsize=6)  # some megabytes each
 def _steps(
-    couplings: tuple[Coupling, ...], shape: tuple[int, int], first: tuple[int, int],
+    couplings: tuple[Coupling, ...], shape: tuple[int, ...], first: tuple[int, int],
     kind: np.dtype[Any],
 ) -> tuple[_Step, ...]:  # fmt: skip
     """Couplings in the order of their distances; one part per distance on small arrays."""
@@ -131,8 +131,7 @@ def couple(
     first row and column in the window.
     """
     out = signal.copy()
-    shape = signal.shape[-2], signal.shape[-1]
-    for step in _steps(tuple(couplings), shape, first, signal.dtype):
+    for step in _steps(tuple(couplings), signal.shape[-2:], first, signal.dtype):
         moved = []
         for here, _, share in step.parts:
             source = signal[(..., *here)]
@@ -161,8 +160,7 @@ def couple_fringes(
     alpha² / 2``, the fringe its slope, ``2 iota alpha``; the second harmonic is not in the maps.
     """
     out = theta.copy()
-    shape = theta.shape[1], theta.shape[2]
-    for step in _steps(tuple(couplings), shape, first, theta.dtype):
+    for step in _steps(tuple(couplings), theta.shape[1:], first, theta.dtype):
         moved = []
         for here, _, share in step.parts:
             source = theta[(slice(None), *here)]
@@ -202,7 +200,7 @@ def _inverse(data: F64, forward: Callable[[F64], F64]) -> F64:
 
 
 def outflow(
-    couplings: Sequence[Coupling], shape: tuple[int, int], first: tuple[int, int] = (0, 0)
+    couplings: Sequence[Coupling], shape: tuple[int, ...], first: tuple[int, int] = (0, 0)
 ) -> F64:
     """Share (y, x) of its signal that each pixel loses."""
     out = np.zeros(shape)
@@ -225,7 +223,7 @@ def largest_outflow(couplings: Sequence[Coupling]) -> float:
 
 
 def noise_shares(
-    couplings: Sequence[Coupling], shape: tuple[int, int], first: tuple[int, int] = (0, 0)
+    couplings: Sequence[Coupling], shape: tuple[int, ...], first: tuple[int, int] = (0, 0)
 ) -> tuple[F64, F64]:
     """Noise of a pixel read through the couplings, and after their correction, both (y, x).
 

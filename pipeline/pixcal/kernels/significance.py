@@ -59,8 +59,12 @@ def sigmas_of_best(*sigmas: float) -> float:
 
 def sigmas_of_largest(largest: float, count: int) -> float:
     """As `sigmas_of_best`, given the largest of ``count`` normals."""
-    chance = float(log_ndtr(-max(largest, -8.0)))
-    # One minus the probability that none is as large.
-    none = count * math.log1p(-math.exp(chance))
-    log_any = math.log(-math.expm1(none)) if none < -1e-12 else chance + math.log(count)
+    log_any = log_of_any(float(log_ndtr(-max(largest, -8.0))), count)
     return -float(ndtri_exp(min(log_any, -1e-300)))
+
+
+def log_of_any(log_chance: float, count: float) -> float:
+    """Log probability that any of independent events happens, each of the same probability."""
+    # One minus the probability that none does.
+    none = count * math.log1p(-math.exp(log_chance))
+    return math.log(-math.expm1(none)) if none < -1e-12 else log_chance + math.log(count)

@@ -59,21 +59,16 @@ class CouplingFrames:
     hot: HotPixels | None
     steps: tuple[Place, ...]
 
-    @property
-    def shape(self) -> Place:
-        """Rows and columns."""
-        return self.evidence.good.shape[0], self.evidence.good.shape[1]
-
     def measured(self, known: Sequence[Coupling], per_ke: float = 0.0) -> MeasuredLinks:
         """The same to first order in the shares; known shares give the second order."""
         large = [replace(c, per_ke=per_ke) for c in known if abs(c.share) > NEGLIGIBLE]
-        first = self.evidence.origin
+        shape, first = self.evidence.good.shape, self.evidence.origin
         noise, hot = self.noise, self.hot
         if noise is not None:
             noise = to_first_order(noise, large, self.steps, first)
         if hot is not None:
-            hot = hot.corrected(outflow(large, self.shape, first), per_ke)
-        return MeasuredLinks(noise, hot, self.steps, self.shape, first)
+            hot = hot.corrected(outflow(large, shape, first), per_ke)
+        return MeasuredLinks(noise, hot, self.steps, shape, first)
 
     def kernel(
         self, classes: PixelClasses, known: Sequence[Coupling], per_ke: float = 0.0
@@ -115,7 +110,7 @@ class CouplingFrames:
 
 def frames_of(
     parts: Iterable[Evidence],
-    steps_in: Callable[[Place], tuple[Place, ...]],
+    steps_in: Callable[[tuple[int, ...]], tuple[Place, ...]],
     known: Sequence[Coupling] = (),
 ) -> CouplingFrames | None:
     """What several parts of the frames measure together; None without light and dark signal.
@@ -127,7 +122,7 @@ def frames_of(
     first: Evidence | None = None
     for part in parts:
         if first is None:
-            steps = steps_in((part.good.shape[0], part.good.shape[1]))
+            steps = steps_in(part.good.shape)
             first, hot = part.without_frames(), hot_pixels(part, steps, known)
         noise.append(products(part, steps, known))
         del part  # the next one is read only then
@@ -151,7 +146,7 @@ def dense_kernel(parts: Iterable[Evidence], start: Sequence[Coupling]) -> Dense 
     return frames.kernel(PixelClasses(rows, columns, frames.evidence.origin), start)
 
 
-def within(shape: Place, far: Collection[Place] = ()) -> tuple[Place, ...]:
+def within(shape: tuple[int, ...], far: Collection[Place] = ()) -> tuple[Place, ...]:
     """Steps to partners within `WITHIN` pixels, and those in ``far``."""
     return tuple(s for s in links(shape) if max(map(abs, s)) <= WITHIN or s in far)
 

@@ -42,7 +42,6 @@ class HotPixels:
     # where spoilt)
     value: F64
     sigma: F64
-    shape: Place  # rows and columns of the maps
 
     def corrected(self, outflow: F64, per_ke: float) -> "HotPixels":
         """Shares of a hot pixel's original charge, at small signals, from those of what it kept.
@@ -149,8 +148,7 @@ def hot_pixels(
         return None
     least = MIN_SIGMAS * noise / 10
     warm = np.where((rest > least) & highest, rest, 0.0)
-    shape = (rest.shape[0], rest.shape[1])
-    kept = 1 - outflow(known, shape, evidence.origin)
+    kept = 1 - outflow(known, rest.shape, evidence.origin)
 
     def given(warm: F64) -> tuple[F64, F64]:
         """Charge (y, x) received from all hot pixels, e-; the share (h, link, 2) of each in it."""
@@ -158,8 +156,8 @@ def hot_pixels(
         got = couple(collected, known, evidence.origin) - collected * kept
         shares = np.zeros((len(y), len(links), 2))
         for c in known:
-            source = np.zeros(shape)
-            source[c.places(shape, evidence.origin)[0]] = c.share
+            source = np.zeros(rest.shape)
+            source[c.places(rest.shape, evidence.origin)[0]] = c.share
             step, side = ((c.dy, c.dx), 0) if (c.dy, c.dx) in links else ((-c.dy, -c.dx), 1)
             level = 1 + c.per_ke * 1e-3 * collected[y, x]
             shares[:, links.index(step), side] += source[y, x] * level / kept[y, x]
@@ -179,7 +177,7 @@ def hot_pixels(
     value = around[at] / charge[:, None, None] + shares
     sigma = np.hypot(noise / charge[:, None, None], UNSURE * others)
     value, sigma = np.where(clean[at], value, 0.0), np.where(clean[at], sigma, np.inf)
-    return HotPixels(y, x, charge * 1e-3, value, sigma, shape)
+    return HotPixels(y, x, charge * 1e-3, value, sigma)
 
 
 def _unsaturated(evidence: Evidence) -> Mask:

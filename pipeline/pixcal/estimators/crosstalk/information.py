@@ -48,8 +48,8 @@ class MeasuredLinks:
     products: Products | None
     hot: HotPixels | None
     links: tuple[Place, ...]
-    shape: Place  # shape, first: rows and columns of the arrays; their first in the window
-    first: Place
+    shape: tuple[int, ...]  # rows and columns of the arrays
+    first: Place  # their first in the window
 
     def of(self, numbers: Sequence[int]) -> "MeasuredLinks":
         """Some of the links."""
@@ -139,7 +139,7 @@ def to_first_order(
     A pixel keeps only a part of its charge; third pixels give to both partners; shares may change
     with the charge; and the unit of all is the shot noise of a pixel.
     """
-    shape = (found.right.shape[-2], found.right.shape[-1])
+    shape = found.right.shape[-2:]
     right = found.right / np.float32(found.shot)
     kept = 1 - outflow(couplings, shape, first)
     third = _third_pixels(couplings, shape, first)
@@ -205,7 +205,9 @@ def _per_unit(couplings: Sequence[Coupling]) -> float:
     return couplings[0].per_ke * UNIT * 1e-3 if couplings else 0.0
 
 
-def _third_pixels(couplings: Sequence[Coupling], shape: Place, first: Place) -> dict[Place, F64]:
+def _third_pixels(
+    couplings: Sequence[Coupling], shape: tuple[int, ...], first: Place
+) -> dict[Place, F64]:
     """By step, at a link's first pixel: product of the shares of both partners from a third."""
     period = lcm(*(c.every_rows for c in couplings)), lcm(*(c.every_columns for c in couplings))
     given: dict[Place, F64] = {}

@@ -52,7 +52,7 @@ def measure(evidence: Evidence) -> Kernel | None:
     none = Kernel((), np.zeros((0, 0)), found.significance, (), 0.0, np.inf)
     if not found.links:
         return none
-    near = within(_shape(evidence), {every[n] for n in found.links})
+    near = within(evidence.good.shape, {every[n] for n in found.links})
     known: tuple[Coupling, ...] = ()
     per_ke, error = 0.0, np.inf
     for _ in range(2):
@@ -79,15 +79,11 @@ def _standing_out(evidence: Evidence) -> tuple[Evidence, tuple[Place, ...], Choi
     """The pixels examined, all their links, and which of these are significant."""
     if not evidence.fringes:
         evidence = central_crop(evidence, MOST_PIXELS)
-    every = links(_shape(evidence))
+    every = links(evidence.good.shape)
     frames = frames_of([evidence], lambda _: every) if every else None
     if frames is None:
         return None
     return evidence, every, choose(frames.measured(()), visibility_pattern(evidence))
-
-
-def _shape(evidence: Evidence) -> Place:
-    return evidence.good.shape[0], evidence.good.shape[1]
 
 
 def _level(

@@ -15,7 +15,7 @@ MAX_CLASSES = 16  # most classes of pixels that a period in both directions may 
 MIN_REPEATS = 4  # periods that the window must hold at least
 
 
-def links(shape: Place, reach: int = REACH) -> tuple[Place, ...]:
+def links(shape: tuple[int, ...], reach: int = REACH) -> tuple[Place, ...]:
     """Steps (dy, dx) from a pixel to a partner; the opposite ones are the same pairs."""
     high, wide = min(reach, shape[0] // 2), min(reach, shape[1] // 2)
     return tuple(
@@ -60,7 +60,7 @@ class PixelClasses:
         return np.asarray(row % self.rows * self.columns + column % self.columns)
 
 
-def periods(shape: Place) -> list[Place]:
+def periods(shape: tuple[int, ...]) -> list[Place]:
     """Periods (rows, columns) that fit a window, the shortest first."""
     rows = range(1, max(1, min(MAX_PERIOD, shape[0] // MIN_REPEATS)) + 1)
     columns = range(1, max(1, min(MAX_PERIOD, shape[1] // MIN_REPEATS)) + 1)
@@ -71,7 +71,7 @@ def periods(shape: Place) -> list[Place]:
 def class_sums(values: F32 | F64, first: Place) -> Iterator[tuple[PixelClasses, F64]]:
     """Sums (..., class) of maps (..., y, x) over the pixels of each class, for every period."""
     # Rows first, then columns of those sums: row periods dominate the cost.
-    wanted = periods((values.shape[-2], values.shape[-1]))
+    wanted = periods(values.shape[-2:])
     by_rows: dict[int, F32 | F64] = {}
     for n in sorted({n for n, _ in wanted}, reverse=True):
         # Sums for a multiple of the period are fewer to add up.

@@ -170,11 +170,10 @@ def log_visibility(theta: F64, good: Mask) -> F64:
 
 def smooth_modes(sets: Sequence[FringeEvidence], good: Mask) -> F64:
     """Orthonormal (mode, pixel): smooth variation, and the fringes left by free light."""
-    shape = (good.shape[0], good.shape[1])
-    y, x = grid(shape)
-    modes = [polynomial_basis(shape, DEGREE)[good.ravel()].T]
+    y, x = grid(good.shape)
+    modes = [polynomial_basis(good.shape, DEGREE)[good.ravel()].T]
     for found in sets:
-        psi = np.broadcast_to(found.k[0] * x + found.k[1] * y, shape)[good]
+        psi = np.broadcast_to(found.k[0] * x + found.k[1] * y, good.shape)[good]
         phasor = (found.theta[2] + 1j * found.theta[1])[good] * np.exp(-1j * psi)
         modes += fringe_modes(psi + np.angle(phasor.sum()), np.ones(len(psi)))
     return np.asarray(np.linalg.qr(np.vstack(modes).T)[0].T)

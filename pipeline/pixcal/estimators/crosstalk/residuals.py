@@ -59,8 +59,7 @@ class Residuals:
 
 def all_residuals(evidence: Evidence, known: Sequence[Coupling]) -> Iterator[Residuals]:
     """Residuals of each sequence of frames; known couplings give the charge collected."""
-    shape = (evidence.good.shape[0], evidence.good.shape[1])
-    kept = noise_shares(known, shape, evidence.origin)[0].astype(np.float32)
+    kept = noise_shares(known, evidence.good.shape, evidence.origin)[0].astype(np.float32)
     for stack in evidence.stacks:
         if len(stack.adu) > 1:
             yield _of_stack(stack, evidence, known, kept)
@@ -101,7 +100,7 @@ def _of_fringes(found: FringeEvidence, known: Sequence[Coupling], kept: F32) -> 
     light = replace(found, theta=collected, g=found.g[at], dk=found.dk[at]).model
     charge = np.maximum(light / np.float32(UNIT), 0)
     # Also changes along the window: a moving fringe vector, rows that are exposed later.
-    y, x = grid((flat.shape[0], flat.shape[1]))
+    y, x = grid(flat.shape)
     places = np.concatenate([theta, x * theta, y * theta]).reshape(9, -1) / np.abs(theta).max()
     scale = np.where(found.good, flat / UNIT**0.5, np.nan).astype(np.float32)
     rest = _without_response(found.residual[at] * scale, charge)

@@ -15,6 +15,7 @@ from scipy.special import log_ndtr, ndtri, ndtri_exp
 from pixcal.estimators.crosstalk.information import MeasuredLinks, total
 from pixcal.estimators.crosstalk.links import PixelClasses, Place, periods
 from pixcal.kernels.crosstalk import Coupling
+from pixcal.kernels.significance import log_of_any
 from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
 
@@ -43,10 +44,7 @@ class FamilyOfTests:
     @property
     def log_any(self) -> float:
         """Logarithm of the probability that one of them is."""
-        # A small probability, times the number of tests.
-        none = self.log_none
-        few = self._log_one + np.log(INDEPENDENT * self.count)
-        return float(np.log(-np.expm1(none)) if none < -1e-9 else few)
+        return log_of_any(self._log_one, INDEPENDENT * self.count)
 
     @property
     def _log_one(self) -> float:

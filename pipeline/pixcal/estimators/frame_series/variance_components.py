@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtri_exp
 
 from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
-from pixcal.kernels.significance import root_with_error
+from pixcal.kernels.significance import log_of_any, root_with_error
 from pixcal.model.arrays import F64, Mask
 
 MAX_STEPS = 60
@@ -257,10 +257,7 @@ def joint_log_chance(full: Components, less: Components, sizes: F64) -> float:
 
 def log_chance_of_any(log_chances: Sequence[float]) -> float:
     """Log probability that the rarest of several independent findings is as rare by chance."""
-    rarest, number = min(*log_chances, 0.0), len(log_chances)
-    if rarest < -30:
-        return float(rarest + np.log(number))
-    return float(np.log(-np.expm1(number * np.log1p(-min(np.exp(rarest), 1 - 1e-12)))))
+    return log_of_any(float(min(*log_chances, -1e-12)), len(log_chances))
 
 
 def sigmas(log_chance: float) -> float:

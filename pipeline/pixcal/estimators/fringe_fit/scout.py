@@ -335,8 +335,9 @@ class Scout:
         """Reduced chi-square of the good pixels of all tiles."""
 
         def chi2(n: int) -> F64:
-            tile, theta = self.tiles[n], self.theta[n]
-            return tile_fit.residual_chi2(tile, codes[n], self.coding, frames, theta)
+            tile, theta = self.tiles[n], self.theta[n].astype(np.float32)
+            sums = tile_fit.accumulate(tile, [codes[n]], self.coding, frames, theta)
+            return np.asarray((solve_pixels(sums)[2] / np.maximum(sums[10] - 3, 1))[tile.good])
 
         return np.concatenate(self.each(chi2, range(len(self.tiles))))
 

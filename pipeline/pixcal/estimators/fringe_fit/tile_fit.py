@@ -119,16 +119,6 @@ def phase_sigma(theta: F64, covariance: F64) -> F64:
         return np.asarray(np.sqrt(variance))
 
 
-def residual_chi2(
-    tile: Tile, codes: U16, coding: Coding, frames: FrameParameters, theta: F64
-) -> F64:
-    """Reduced chi-square (n,) of a tile's good pixels."""
-    sums = accumulate(tile, [codes], coding, frames, theta.astype(np.float32))
-    _, _, chi2 = solve_pixels(sums)
-    reduced = chi2 / np.maximum(sums[10] - 3, 1)
-    return np.asarray(reduced[tile.good])
-
-
 def accumulate(
     tile: Tile, blocks: Sequence[U16], coding: Coding, frames: FrameParameters, theta: F32
 ) -> F64:
