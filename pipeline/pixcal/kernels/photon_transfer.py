@@ -93,19 +93,6 @@ def _add_blocks(
                 out[block, 3 + lag] = np.float32(0.5) * product / pairs + variance / n
 
 
-def _ratios(first: F32, second: F32, per_level: float, read_variance: float) -> F32:
-    """Differences over their expected noise (place in a block, block); NaN beyond the frame."""
-    level = np.maximum(np.float32(0.5) * (first + second), np.float32(0))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = (first - second) / np.sqrt(
-            level * np.float32(per_level) + np.float32(read_variance)
-        )
-    beyond = [(0, -n % BLOCK) for n in ratio.shape]
-    padded = np.pad(ratio, beyond, constant_values=np.nan)
-    blocks = padded.reshape(padded.shape[0] // BLOCK, BLOCK, -1, BLOCK).transpose(1, 3, 0, 2)
-    return np.ascontiguousarray(blocks.reshape(BLOCK * BLOCK, -1))
-
-
 def pair_statistics(
     first: F32, second: F32, *, gain: float, read_noise: float, quantum: float
 ) -> F64:
@@ -122,7 +109,15 @@ def pair_statistics(
     quantum : step of the samples, ADU
     """
     pair = np.ascontiguousarray(first, np.float32), np.ascontiguousarray(second, np.float32)
-    ratios = _ratios(*pair, 1 / gain, read_noise**2)
+    level = np.maximum(np.float32(0.5) * (pair[0] + pair[1]), np.float32(0))
+    sigma = np.sqrt(level * np.float32(1 / gain) + np.float32(read_noise**2))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = (pair[0] - pair[1]) / sigma
+    # Over the expected noise, (place in a block, block); NaN beyond the frame.
+    beyond = [(0, -n % BLOCK) for n in ratio.shape]
+    padded = np.pad(ratio, beyond, constant_values=np.nan)
+    blocks = padded.reshape(padded.shape[0] // BLOCK, BLOCK, -1, BLOCK).transpose(1, 3, 0, 2)
+    ratios = np.ascontiguousarray(blocks.reshape(BLOCK * BLOCK, -1))
     few = np.isfinite(ratios).sum(axis=0) < _MIN_PIXELS
     centre, spread = median_and_deviation(ratios)
     centre[few] = np.nan

@@ -62,7 +62,9 @@ def noise_before_rounding(
     if variance > SMOOTH**2 + SHEPPARD:
         sigma = float(np.sqrt(variance - SHEPPARD))
         return sigma, error / (2 * sigma)
-    spread = _clipped_variance(means) - variance / frames - SHEPPARD
+    off = means - np.median(means)
+    usual = off[np.abs(off) <= 3 * np.std(off)]
+    spread = float(np.var(usual)) - variance / frames - SHEPPARD
     everywhere = spread > _EVERYWHERE**2
     least = _MIN_SIGMA if everywhere else UNDETERMINED_BELOW
     places = np.zeros(_HARMONICS) if everywhere else _harmonics(means, variance / frames)
@@ -81,12 +83,6 @@ def noise_before_rounding(
     # The number of pixels near a change of code varies by chance.
     chance = np.var(rounded_moments(level, sigma)[1]) / len(means) if everywhere else 0.0
     return (sigma, float(np.hypot(error, np.sqrt(chance))) / slope) if slope > 0 else None
-
-
-def _clipped_variance(values: F64) -> float:
-    """Variance without values beyond three standard deviations."""
-    off = values - np.median(values)
-    return float(np.var(off[np.abs(off) <= 3 * np.std(off)]))
 
 
 def _harmonics(means: F64, noise: float) -> F64:

@@ -138,22 +138,17 @@ def boundaries_alone(
     sums = _boundary_sums(evidence)
     if len(sums) < 2 or not by_axis:
         sums = [(sum(n for n, _ in sums), sum(r for _, r in sums))]  # type: ignore[list-item]
-    fine = _of_fine_falloffs()
+    coarse, fine_shifts = (
+        np.stack([boundary_shifts(falloff).ravel() for falloff in falloffs], axis=1)
+        for falloffs in (FALLOFFS_PX, _FINE_PX.tolist())
+    )
+    # Powers, and shifts of `_FINE_PX` from those of `FALLOFFS_PX`.
+    fine = block_diag(np.eye(POWERS), np.linalg.lstsq(coarse, fine_shifts, rcond=None)[0].T)
     sums = [(fine @ normal @ fine.T, fine @ right) for normal, right in sums]
     found = np.array([_alone(sums, POWERS + n) for n in range(len(_FINE_PX))])
     shifts = [(normal[POWERS:, POWERS:], right[POWERS:]) for normal, right in sums]
     of_any_shape = sum(float(right @ inverse_normal(normal) @ right) for normal, right in shifts)
     return _best_falloff(found, otherwise_px, of_any_shape)
-
-
-def _of_fine_falloffs() -> F64:
-    """Matrix (to, from): powers and shifts of `_FINE_PX` from those of `FALLOFFS_PX`."""
-    coarse, fine = (
-        np.stack([boundary_shifts(falloff).ravel() for falloff in falloffs], axis=1)
-        for falloffs in (FALLOFFS_PX, _FINE_PX.tolist())
-    )
-    shares: F64 = block_diag(np.eye(POWERS), np.linalg.lstsq(coarse, fine, rcond=None)[0].T)
-    return shares
 
 
 @cached_on_evidence

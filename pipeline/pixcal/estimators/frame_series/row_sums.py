@@ -171,18 +171,12 @@ def _slope(sets: Sequence[tuple[F64, F64, F64]], terms: Sequence[F64]) -> tuple[
     return covariance @ right, covariance
 
 
-def _apart_in_time(g: F64, share: float, way: int) -> F64:
-    """Parameters (t, 3) of frames, less a share of those of the frame before or after (``way``)."""
-    found = g.copy()
-    order = range(len(g) - 2, -1, -1) if way > 0 else range(1, len(g))
-    for t in order:
-        found[t] = (g[t] - share * found[t + way]) / (1 - share)
-    return found
-
-
 def _rows(sums: RowSums, way: int, share: F64) -> tuple[F64, F64, F64]:
     """Rows of the window, normal matrix and right-hand side of a share in each row."""
-    g = _apart_in_time(sums.found.g, float(share.mean()), way)
+    # Parameters of the frames, less the mean share of those of the frame before or after.
+    g, mean = sums.found.g.copy(), float(share.mean())
+    for t in range(len(g) - 2, -1, -1) if way > 0 else range(1, len(g)):
+        g[t] = (g[t] - mean * g[t + way]) / (1 - mean)
     lost = 1 / (1 - (share - share.mean()))
     factors = np.stack([np.ones_like(lost), lost, lost], axis=1)
     return sums.rows, *sums.share(g[sums.inside + way] - g[sums.inside], factors)

@@ -58,9 +58,10 @@ def cut_warning(
         for frame, row, value in zip(frames, first, facts["last"][:, -1], strict=True)
         if row is not None
     ]
-    if not found:
-        return []
-    return [
-        f"{array}: incomplete frames are left out ({len(found)} of {len(frames)}): "
-        f"{first_few(found)}; frames.json lists them (cut_from_row)"
-    ]
+    return left_out(f"{array}: incomplete frames", found, len(frames), "cut_from_row")
+
+
+def left_out(what: str, found: Sequence[str], count: int, key: str) -> list[str]:
+    """Warning on frames that are not used, if there are any; ``key``: in ``frames.json``."""
+    several = f"({len(found)} of {count}): {first_few(found)}; frames.json lists them ({key})"
+    return [f"{what} are left out {several}"] if found else []

@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pixcal.model.arrays import F64
-from pixcal.storage.frames import Frame, first_few
+from pixcal.stages.ingest.cut_frames import left_out
+from pixcal.storage.frames import Frame
 
 _ONE_VALUE = 0.5  # share of a row with one value from which its noise is not seen
 
@@ -34,10 +35,4 @@ def repeat_warning(array: str, frames: Sequence[Frame], repeats: Sequence[int | 
         for n, first in enumerate(repeats)
         if first is not None
     ]
-    if not found:
-        return []
-    return [
-        f"{array}: frames identical to an earlier one are left out "
-        f"({len(found)} of {len(frames)}): {first_few(found)}; frames.json lists "
-        "them (repeat_of)"
-    ]
+    return left_out(f"{array}: frames identical to an earlier one", found, len(frames), "repeat_of")

@@ -41,14 +41,16 @@ def characterise(
     Each has ``title``, ``unit``, ``value``, ``error`` (null if unknown) and ``note``. ``facts``:
     present contents of ``reduce.json``.
     """
-    gain = _gain(facts)
+    entry = facts["gain_e_per_adu"]
+    measured = entry["measured"] is not None
+    gain = (entry["measured"], entry["error"]) if measured else (entry["used"], None)
     dark, _ = pair_sums(made.scratch / "statistics", job)
     clipped = (source.detector.saturation_adu or source.saturation_found) is not None
     top, reached = _top(summary, job, clipped)
     top = top if job.dark else None  # levels above an unknown bias are meaningless
     middle = middle_of(source.shape)
     halves = read_halves(made, source, summary, top, middle, runtime)
-    note = "" if facts["gain_e_per_adu"]["measured"] is not None else "declared, not measured"
+    note = "" if measured else "declared, not measured"
     found: Json = {"conversion_gain": _figure("conversion gain", "e-/ADU", gain, note)}
     noise = _read_noise(found, summary, gain[0], source.quantum)
     _line_noise(found, dark, gain[0], job.shape)
@@ -65,7 +67,7 @@ def characterise(
     if halves.flat is not None:
         percent = np.stack([100 * emva.without_trend(half, halves.good) for half in halves.flat])
         facts["warnings"] += _spread(found, curves, "prnu", "%", percent, halves.good)
-    scale = gain[0] / facts["gain_e_per_adu"]["used"]
+    scale = gain[0] / entry["used"]
     _dark_current(found, made, source, job, scale, middle)
     for name, figure in found.items():
         by_gain = figure["unit"].startswith("e-") and name != "conversion_gain"
@@ -81,13 +83,6 @@ def _figure(
 ) -> dict[str, Any]:
     value, error = measure
     return {"title": title, "unit": unit, "value": value, "error": error, "note": note}
-
-
-def _gain(facts: Json) -> tuple[float, float | None]:
-    entry = facts["gain_e_per_adu"]
-    if entry["measured"] is None:
-        return entry["used"], None
-    return entry["measured"], entry["error"]
 
 
 def _read_noise(found: Json, summary: Summary, gain: float, step: float) -> Measure | None:
