@@ -237,10 +237,7 @@ def noise_shares(
 
 
 def filled(theta: F64, k: tuple[float, float]) -> F64:
-    """Maps with pixels that have no data (NaN) taken from their neighbours, turned as fringes are.
-
-    Of theta (3, y, x), by the fringe vector k, rad/px.
-    """
+    """Maps (3, y, x) with NaN taken from neighbours, turned as fringes of vector k (rad/px) are."""
     good = np.isfinite(theta).all(axis=0)
     if good.all() or not good.any():
         return np.where(good, theta, 0.0)

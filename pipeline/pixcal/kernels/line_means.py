@@ -13,8 +13,7 @@ def without_line_means(noise: F32, used: Mask) -> F32:
 
     Subtraction of a plain mean of n pixels would correlate each pair by -1 / n. Here pixels within
     `REACH` of a pixel have half weight in its mean: white noise keeps its variance, and near pixels
-    stay uncorrelated, to second order in 1 / n. ``noise``: (t, y, x). ``used``: (y, x) pixels of
-    the means.
+    stay uncorrelated, to second order in 1 / n. ``used``: (y, x) pixels of the means.
     """
     weight = used.astype(np.float32)
     found = noise * weight

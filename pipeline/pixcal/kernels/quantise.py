@@ -97,9 +97,7 @@ def encode(
 ) -> int:
     """Convert raw frames of a tile to codes: ``raw * slope + start - dark * exptime``, truncated.
 
-    Fastest if the frames fit the cache.
-
-    Returns the sum of the codes that have weight.
+    Returns the sum of the codes that have weight. Fastest if the frames fit the cache.
 
     raw : (t, y, at least x0 + x) samples, ADU; the tile's columns begin at ``x0`` (a copy of them
         would double the time)

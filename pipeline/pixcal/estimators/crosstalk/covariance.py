@@ -114,8 +114,7 @@ def _gathered(parts: Iterable[Residuals]) -> Iterator[list[Residuals]]:
     """Short sequences together, as sums over few frames cost as much; long ones one by one."""
     some: list[Residuals] = []
     for part in parts:
-        joined = [*some, part]
-        if some and sum(len(p.e) for p in joined) > _LONG:
+        if some and sum(len(p.e) for p in [*some, part]) > _LONG:
             yield some
             some = []
         some.append(part)

@@ -14,6 +14,7 @@ from pixcal.estimators.crosstalk.covariance import NORMAL, TERMS, Products
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels
 from pixcal.estimators.crosstalk.links import PixelClasses, Place, class_sums, sums_of
 from pixcal.estimators.crosstalk.residuals import UNIT
+from pixcal.estimators.fringe_fit.combine import weighted_mean
 from pixcal.kernels.crosstalk import Coupling, outflow
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F32, F64, Mask
@@ -67,10 +68,8 @@ class MeasuredLinks:
             found.append(self.hot.level_dependence(couplings, self.links, self.first))
         if self.products is not None:
             found.append(level_dependence(self.products, couplings, self.links))
-        values, errors = np.array(found).T
-        weight = errors**-2
-        total = float(weight.sum())
-        return (float(weight @ values) / total, total**-0.5) if total else (0.0, np.inf)
+        value, error, _ = weighted_mean(*np.array(found).T)
+        return (float(value), float(error)) if np.isfinite(value) else (0.0, np.inf)
 
     @property
     def _sums(self) -> tuple[F32, F32]:

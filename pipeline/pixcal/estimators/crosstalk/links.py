@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -18,12 +19,8 @@ MIN_REPEATS = 4  # periods that the window must hold at least
 def links(shape: tuple[int, ...], reach: int = REACH) -> tuple[Place, ...]:
     """Steps (dy, dx) from a pixel to a partner; the opposite ones are the same pairs."""
     high, wide = min(reach, shape[0] // 2), min(reach, shape[1] // 2)
-    return tuple(
-        (dy, dx)
-        for dy in range(high + 1)
-        for dx in range(-wide, wide + 1)
-        if dy > 0 or (dy == 0 and dx > 0)
-    )
+    steps = product(range(high + 1), range(-wide, wide + 1))
+    return tuple(step for step in steps if step > (0, 0))
 
 
 @dataclass(frozen=True)
@@ -46,12 +43,11 @@ class PixelClasses:
 
     def divisors(self) -> list["PixelClasses"]:
         """Classes of all periods that divide this one, the shortest first."""
-        found = [
-            replace(self, rows=n, columns=m)
-            for n in range(1, self.rows + 1)
-            for m in range(1, self.columns + 1)
-            if self.rows % n == 0 and self.columns % m == 0
-        ]
+        rows, columns = (
+            [n for n in range(1, period + 1) if period % n == 0]
+            for period in (self.rows, self.columns)
+        )
+        found = [replace(self, rows=n, columns=m) for n, m in product(rows, columns)]
         return sorted(found, key=lambda classes: classes.count)
 
     def groups_of(self, finer: "PixelClasses") -> Indices:
@@ -88,11 +84,5 @@ def class_sums(values: F32 | F64, first: Place) -> Iterator[tuple[PixelClasses, 
 def sums_of(values: F32 | F64, classes: PixelClasses) -> F64:
     """Sums (..., class) of maps (..., y, x) over the pixels of each class."""
     (n, m), (y, x) = (classes.rows, classes.columns), classes.first
-    return np.stack(
-        [
-            values[..., (a - y) % n :: n, (b - x) % m :: m].sum((-2, -1), dtype=float)
-            for a in range(n)
-            for b in range(m)
-        ],
-        -1,
-    )
+    places = [np.s_[..., (a - y) % n :: n, (b - x) % m :: m] for a, b in np.ndindex(n, m)]
+    return np.stack([values[at].sum((-2, -1), dtype=float) for at in places], -1)

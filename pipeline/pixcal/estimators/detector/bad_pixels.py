@@ -222,7 +222,6 @@ def _curve(powers: F64, products: F64, values: F64, usable: Mask) -> F64:
     """Polynomial through values (n,) without outliers; all zero through too few.
 
     ``powers, products``: (n, power), (n, power * power) of the places, and products of each two.
-    ``values``: (n,). ``usable``: (n,).
     """
     terms = np.zeros(powers.shape[1])
     kept = usable

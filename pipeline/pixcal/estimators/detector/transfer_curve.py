@@ -46,9 +46,7 @@ class TransferCurve:
 
 @cached_on_evidence
 def transfer_curve(evidence: Evidence, *, whole: bool = False) -> TransferCurve | None:
-    """Photon transfer of each level of flats.
-
-    None with fewer than three levels, or without a known level of dark frames.
+    """Photon transfer of each level of flats; None with fewer than three, or no level of darks.
 
     Where the gain was measured from flats, only `STEPS` found to share noise count, unless
     ``whole``. This makes the slope more precise, but several insignificant covariances may

@@ -188,9 +188,7 @@ class TileSums:
     def of_rows(cls, rows: F64) -> "TileSums":
         """Sums of tiles from the rows (tile, number) that `row` wrote."""
         n = len(rows)
-        planes = [
-            TilePlane((r[0], r[1]), r[2], r[3], r[4], r[5], r[6]) for r in rows[:, :_PLANE].tolist()
-        ]
+        planes = [TilePlane((y, x), *facts) for y, x, *facts in rows[:, :_PLANE].tolist()]
         square, pixels = rows[:, _PLANE], rows[:, _PLANE + 1]
         rest = rows[:, _PLANE + 2 :]
         normal = rest[:, : N_LOCAL**2].reshape(n, N_LOCAL, N_LOCAL)

@@ -142,8 +142,7 @@ def share_at_mean(found: dict[str, Any], bounds: Bounds) -> float | None:
 def set_warnings(name: str, found: dict[str, Any], declared: bool, share: float) -> list[str]:
     """Warnings on a fringe set, given the result of `write_set`.
 
-    ``declared``: whether the saturation level is declared; ``share``: largest share of the
-    variance that rounding of stored samples may add.
+    ``declared``: whether the saturation level is declared; ``share``: as in `write_set`.
     """
     warnings = []
     cost = found["quantisation"]["share_of_variance_dark"]

@@ -207,10 +207,7 @@ class Mixture:
         return np.asarray(np.logaddexp(quiet, self.log_telegraph(weight)))
 
     def slope(self, weight: F64, stands_for: F64) -> F64:
-        """Slope (class,) of the sum of `log_likelihood` with the weights.
-
-        Each pixel counts as often as it ``stands_for``.
-        """
+        """Slope (class,) of the sum of `log_likelihood`, pixels counted ``stands_for`` times."""
         likely = self.log_likelihood(weight)
         own = stands_for * np.exp(self.largest - likely)
         quiet = float(np.sum(stands_for * np.exp(-likely)))

@@ -72,21 +72,12 @@ class Hyperbolic(FringeShape):
 
         def residual(c: F64) -> F64:
             geometry = self.geometry.with_vector(nominal + c[1:] * sigma)
-            here = self._relative(geometry, y, x)
-            kx, ky = fringe_vector(x, y, geometry)
-            return np.concatenate(
-                [
-                    (c[0] + here - values) / error,
-                    (kx - slopes[:, 0]) / (error / 20),
-                    (ky - slopes[:, 1]) / (error / 20),
-                    c[1:],
-                ]
-            )
+            off = (c[0] + self._relative(geometry, y, x) - values) / error
+            turned = (np.array(fringe_vector(x, y, geometry)) - slopes.T) / (error / 20)
+            return np.concatenate([off, *turned, c[1:]])
 
         middle = int(np.argmin((y - ry) ** 2 + (x - rx) ** 2))
-        offset = values[middle] - float(
-            self._relative(self.geometry, y[middle : middle + 1], x[middle : middle + 1])[0]
-        )
+        offset = values[middle] - float(self._relative(self.geometry, y[middle], x[middle]))
         found = least_squares(
             residual, np.concatenate([[offset], base]), x_scale="jac", xtol=1e-14, ftol=1e-14
         ).x
