@@ -42,7 +42,7 @@ def _show_cases(as_json: bool) -> None:
     facts = ("effect", "name", "weak", "strong", "unit", "known", "decidable", "needs")
     laws = [{name: getattr(law, name) for name in facts} for law in LAWS]
     if as_json:
-        print(json.dumps({"variations": VARIATIONS, "laws": laws}))
+        print(json.dumps({"variations": [*VARIATIONS], "laws": laws}))
         return
     print(*(f"ordinary/{name}" for name in VARIATIONS), sep="\n")
     for law in LAWS:

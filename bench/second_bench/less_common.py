@@ -17,7 +17,7 @@ LESS_COMMON = (
     "levels",
     "no_stamps",
 )
-SHARE = dict.fromkeys(LESS_COMMON, 0.15)
+CHANCE = 0.15
 """Probability of each."""
 
 

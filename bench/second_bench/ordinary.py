@@ -7,41 +7,27 @@ import numpy as np
 from second_bench import less_common
 from second_bench.model import EXPTIME_S, F64, TOP_ADU, Beam, Bench, FringeSet, Run, new_run, stream
 
-VARIATIONS = (
-    "aim",
-    "centred",
-    "radii",
-    "powers",
-    "read_noise",
-    "dust",
-    "phases",
-    "amplifiers",
-    "bad_pixels",
-    "gain",
-    "period",
-    "rotated",
-    "ambient",
-    "declared_gain",
-    "stitches",
-    "noisy_pixels",
-    "lamp",
-    *less_common.LESS_COMMON,
-)
-"""What differs from bench to bench."""
-CHANCE = {
+VARIATIONS = {
+    "aim": 1.0,
     "centred": 0.1,
+    "radii": 1.0,
+    "powers": 1.0,
+    "read_noise": 1.0,
     "dust": 0.5,
+    "phases": 1.0,
     "amplifiers": 0.3,
+    "bad_pixels": 1.0,
     "gain": 0.5,
+    "period": 1.0,
     "rotated": 0.25,
     "ambient": 0.3,
     "declared_gain": 0.3,
     "stitches": 0.3,
     "noisy_pixels": 0.3,
     "lamp": 0.5,
-    **less_common.SHARE,
+    **dict.fromkeys(less_common.LESS_COMMON, less_common.CHANCE),
 }
-"""With which probability, where that is not one."""
+"""What differs from bench to bench, and its probability."""
 PITCH_UM, WAVELENGTH_NM, DISTANCE_MM, PERIOD_S = 4.4, 632.8, 400.0, 0.14
 PAUSE_S = 60.0
 """Between two runs."""
@@ -62,7 +48,7 @@ class Layout:
 def draw_variations(seed: int) -> set[str]:
     """Variations of an ordinary bench."""
     rng = stream(seed, "variations")
-    return {name for name in VARIATIONS if rng.random() < CHANCE.get(name, 1.0)}
+    return {name for name, chance in VARIATIONS.items() if rng.random() < chance}
 
 
 def draw_bench(layout: Layout, seed: int, varied: set[str]) -> Bench:

@@ -115,8 +115,7 @@ def _against_electrons(axes: Axes, view: AstrometryView) -> None:
             axes.errorbar(stars, errors["px"], yerr=errors["err_px"], **style)
     axes.axhline(view.target_px, color=GREEN, lw=1, label=f"target, {view.target_px:g} px")
     lowest = min([view.target_px, *(f for f in _floors(view).values() if f > 0)])
-    axes.set_ylim(0.3 * lowest, 20 * float(photons[0]))
-    axes.set_xlim(electrons[0], electrons[-1])
+    axes.set(xlim=(electrons[0], electrons[-1]), ylim=(0.3 * lowest, 20 * float(photons[0])))
     axes.set(xlabel="photo-electrons of the star (e-)", ylabel="error, one position (px)")
     axes.legend(fontsize=7.5, loc="upper right", framealpha=0.95)
     _finish_with_sky(axes, view)
@@ -140,12 +139,12 @@ def _against_positions(axes: Axes, view: AstrometryView) -> None:
         values += px[known].tolist()
     axes.axhline(view.target_px, color=GREEN, lw=1)
     axes.set_xscale("log", base=2)
-    axes.set_yscale("log")
+    axes.set(yscale="log", ylim=(0.4 * min(values), 2 * max(values)))
     axes.set_xticks(positions, [f"{n:g}" for n in positions])
     axes.minorticks_off()
-    axes.set_ylim(0.4 * min(values), 2 * max(values))
-    axes.set_xlabel("positions averaged (dotted: independent)")
-    axes.set_ylabel("error with photon noise (px)")
+    axes.set(
+        xlabel="positions averaged (dotted: independent)", ylabel="error with photon noise (px)"
+    )
     _finish_with_sky(axes, view)
 
 

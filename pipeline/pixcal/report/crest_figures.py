@@ -179,8 +179,8 @@ def _map(figure: SubFigure, axes: Axes, view: CrestView, *, by_ratio: bool) -> N
         trace = 1e6 * (arrays["valley_ratio"] / middle - 1)
         axes.plot(arrays["distance"], trace, color="white", lw=1, ls="--")
     axes.plot(distance, at, "x", color=RED, ms=9, mew=2)
-    axes.set(xlabel="D (mm)", ylabel=label, ylim=(values[0], values[-1]))
-    axes.set_title("cost per point, others " + ("refitted" if by_ratio else "held"))
+    title = f"cost per point, others {'refitted' if by_ratio else 'held'}"
+    axes.set(xlabel="D (mm)", ylabel=label, ylim=(values[0], values[-1]), title=title)
     figure.colorbar(drawn, ax=axes, pad=0.02).minorticks_off()
 
 

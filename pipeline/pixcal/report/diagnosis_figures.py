@@ -78,10 +78,8 @@ def _bars(axes: Axes, bars: Sequence[Bar], *, with_after: bool) -> None:
             if bar.interval:
                 axes.plot([100 * low, 100 * high], [y + shift] * 2, color=INK, lw=1.6)
             _share(axes, max(bar.after, high), y + shift, bar.after)
-    axes.set_yticks(at, _domain_names(bars))
-    axes.set_xlim(0, 118 * max([1e-9, *(max(b.before, b.after) for b in bars)]))
-    axes.set_title("the gap by domain", **TITLE)
-    _share_axes(axes, len(bars))
+    end = 118 * max([1e-9, *(max(b.before, b.after) for b in bars)])
+    _share_axes(axes, _domain_names(bars), "the gap by domain", (0, end))
 
 
 def _share(axes: Axes, end: float, y: float, value: float) -> None:
@@ -89,23 +87,23 @@ def _share(axes: Axes, end: float, y: float, value: float) -> None:
     note(axes, percent(value), (100 * end, y), (5, 0), va="center", fontsize=9)
 
 
-def _share_axes(axes: Axes, rows: int) -> None:
-    finish(axes, xlabel="share of the gap (%)", ylim=(rows - 0.4, -0.6))
+def _share_axes(axes: Axes, names: Sequence[str], title: str, ends: tuple[float, float]) -> None:
+    axes.set_yticks(range(len(names)), names)
+    axes.set_title(title, **TITLE)
+    finish(axes, xlabel="share of the gap (%)", xlim=ends, ylim=(len(names) - 0.4, -0.6))
     axes.grid(visible=False, axis="y")
 
 
 def _causes(axes: Axes, causes: Mapping[str, Mapping[str, Any]]) -> None:
-    ends = np.array([c["gap_closed_interval"] for c in causes.values()])
-    sizes = np.array([(c["gap_closed"], c["gain_over_rest"]) for c in causes.values()])
-    low, high, alone, unique = shares = 100 * np.hstack([ends, sizes]).T
+    keys = ("gap_closed", "gain_over_rest")
+    facts = [(*c["gap_closed_interval"], *(c[key] for key in keys)) for c in causes.values()]
+    low, high, alone, unique = shares = 100 * np.array(facts).T
     rows = range(len(causes))
     axes.plot([low, high], [rows, rows], color=BLUE, lw=3, solid_capstyle="butt")
     axes.plot(alone, rows, "o", color=BLUE, ms=8, label="gap closed")
     axes.plot(unique, rows, "D", color=INK, ms=7, fillstyle="none", label="unique share")
-    axes.set_yticks(rows, _cause_names(causes))
-    axes.set_xlim(min(-3.0, shares.min()) - 2, max(103.0, shares.max()) + 2)
-    axes.set_title("gap closed by each cause", **TITLE)
-    _share_axes(axes, len(causes))
+    ends = (min(-3.0, shares.min()) - 2, max(103.0, shares.max()) + 2)
+    _share_axes(axes, _cause_names(causes), "gap closed by each cause", ends)
 
 
 def _domain_names(bars: Sequence[Bar]) -> list[str]:

@@ -49,6 +49,7 @@ class Batches:
 
     folder: Path
     n: int  # batches, gaps included
+    lengths: tuple[int, ...]  # of averaging, batches
     window: tuple[int, int]
     chunks: tuple[int, int]  # of the fit's maps, (rows, columns)
     frames: int  # frames of a batch
@@ -63,7 +64,8 @@ class Batches:
         cy, cx = delta.chunks
         step = round(float(time[1] - time[0]), 9) if len(time) > 1 else 0.0
         note = facts.get("batch_note", "")
-        return cls(folder, len(time), (ny, nx), (cy, cx), facts["batch_frames"], step, note)
+        frames, lengths = facts["batch_frames"], averaging_lengths(len(time))
+        return cls(folder, len(time), lengths, (ny, nx), (cy, cx), frames, step, note)
 
     def tiles(self, area: Region, times: int = 1) -> list[Tile]:
         """Tiles of ``times`` vertically stacked chunks, cut to an area."""
@@ -113,19 +115,18 @@ def _measure_set(
 ) -> dict[str, Any]:
     """Maps and curves of one fringe set; returns its part of ``allan.json``."""
     folder = made.folder / "allan.zarr" / name
-    lengths = averaging_lengths(batches.n)
-    cy, cx = batches.chunks
+    (cy, cx), lengths = batches.chunks, batches.lengths
     tile_bytes = 4 * cy * cx * (2 * batches.n + len(lengths) * (TILES_HIGH + 2))
     # Copies of rows of a map, and counts of its values.
     values = 16 * TILES_HIGH * cy * batches.window[1] + COUNT_BYTES
     per_task, held = max(tile_bytes, values), values + 40 * stability.MAX_DRAWS * len(lengths)
     runtime = within_memory(f"the Allan deviation of {name}", per_task, held, runtime)
     if lengths:
-        _write_maps(made, folder, name, batches, lengths, runtime)
+        _write_maps(made, folder, batches, runtime)
     whole = (0, batches.window[0], 0, batches.window[1])
-    main = _measure_region(folder, batches, lengths, config.region or whole, runtime)
+    main = _measure_region(folder, batches, config.region or whole, runtime)
     regions = {
-        region_name(region): _measure_region(folder, batches, lengths, region, runtime)
+        region_name(region): _measure_region(folder, batches, region, runtime)
         for region in config.regions
     }
     notes = [batches.note] if batches.note else []
@@ -138,16 +139,10 @@ def _measure_set(
     }
 
 
-def _write_maps(
-    made: Build,
-    folder: Path,
-    name: str,
-    batches: Batches,
-    lengths: tuple[int, ...],
-    runtime: Runtime,
-) -> None:
+def _write_maps(made: Build, folder: Path, batches: Batches, runtime: Runtime) -> None:
     """Write the deviation of every pixel, and that expected for one batch from fit errors."""
     cube.create_group(folder)
+    name, lengths = folder.name, batches.lengths
     (cy, cx), shape = batches.chunks, batches.window
     chunks = (TILES_HIGH * cy, cx)
     adev = cube.create_array(
@@ -162,7 +157,7 @@ def _write_maps(
     expected = cube.create_map(folder / "expected", shape, chunks, units="pixel")
     squares = batches.tiles((0, shape[0], 0, shape[1]), TILES_HIGH)
     steps = {f"{name}:{y[0]},{x[0]}": (y, x) for y, x in squares}
-    task = partial(_maps_task, batches, lengths, adev, expected)
+    task = partial(_maps_task, batches, adev, expected)
     run_steps(made, task, steps, runtime, label=f"Allan deviation {name}")
     adev.finish()
     expected.finish()
@@ -172,14 +167,8 @@ def _write_maps(
     cube.write_array(folder / "seconds", seconds, dims=("length",), attrs={"units": "s"})
 
 
-def _maps_task(
-    batches: Batches,
-    lengths: tuple[int, ...],
-    adev: ArrayWriter,
-    expected: ArrayWriter,
-    square: Tile,
-) -> None:
-    (y0, y1), (x0, x1) = square
+def _maps_task(batches: Batches, adev: ArrayWriter, expected: ArrayWriter, square: Tile) -> None:
+    ((y0, y1), (x0, x1)), lengths = square, batches.lengths
     deviations = np.empty((len(lengths), y1 - y0, x1 - x0), np.float32)
     white = np.empty((y1 - y0, x1 - x0), np.float32)
     for y, x in batches.tiles((y0, y1, x0, x1)):
@@ -203,10 +192,11 @@ def _root_mean_square(sigma: F32) -> F64:
 
 
 def _measure_region(
-    folder: Path, batches: Batches, lengths: tuple[int, ...], region: Region, runtime: Runtime
+    folder: Path, batches: Batches, region: Region, runtime: Runtime
 ) -> dict[str, Any]:
     """Curve of the median pixel of a region, in the format of ``allan.json``."""
-    counts, grams = sums_of_region(folder, batches, lengths, region, runtime)
+    lengths = batches.lengths
+    counts, grams = sums_of_region(folder, batches, region, runtime)
     # A batch is present if most pixels have it: a few may lack one individually.
     present = counts > counts.max(initial=0) / 2
     filled = int(present.sum())
@@ -273,30 +263,28 @@ def region_name(region: Region) -> str:
 
 
 def sums_of_region(
-    folder: Path, batches: Batches, lengths: tuple[int, ...], region: Region, runtime: Runtime
+    folder: Path, batches: Batches, region: Region, runtime: Runtime
 ) -> tuple[I64, list[F64]]:
     """Number of pixels of a region with each batch, and products for each length."""
-    if not lengths:
+    if not batches.lengths:
         return ArrayReader(batches.folder / "batch_count").read().astype(np.int64), []
-    task = partial(_sums_task, batches, lengths, folder / "expected")
+    task = partial(_sums_task, batches, folder / "expected")
     squares, label = batches.tiles(region, TILES_HIGH), f"region {region_name(region)}"
     sums = run_tasks(task, squares, runtime, label=label)
     grams = [np.sum(parts, axis=0) for parts in zip(*(s[1] for s in sums), strict=True)]
     return np.sum([s[0] for s in sums], axis=0), grams
 
 
-def _sums_task(
-    batches: Batches, lengths: tuple[int, ...], expected: Path, square: Tile
-) -> tuple[I64, list[F64]]:
+def _sums_task(batches: Batches, expected: Path, square: Tile) -> tuple[I64, list[F64]]:
     """Number of pixels with each batch, and products of differences that pixels may share."""
     counts = np.zeros(batches.n, np.int64)
-    grams: list[Any] = [0.0] * len(lengths)
+    grams: list[Any] = [0.0] * len(batches.lengths)
     for tile in batches.tiles((*square[0], *square[1])):
         series = batches.read("batch_delta", tile).reshape(batches.n, -1)
         noise = ArrayReader(expected).read(*tile).ravel()
         noise[noise <= 0] = np.nan
         counts += np.isfinite(series).sum(axis=1)
-        for number, m in enumerate(lengths):
+        for number, m in enumerate(batches.lengths):
             steps = disjoint_differences(series, m, 32)
             steps /= noise
             # Missing batches and pixels without errors are both NaN, and add zero.

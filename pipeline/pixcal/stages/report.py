@@ -158,11 +158,7 @@ def _offset(key: str, results: Mapping[str, Any]) -> MapContents:
 
 
 def _set(
-    group: Path,
-    name: str,
-    facts: dict[str, Any],
-    allan: Mapping[str, Any],
-    results: Mapping[str, Any],
+    group: Path, name: str, facts: dict[str, Any], allan: Mapping[str, Any], results: dict[str, Any]
 ) -> SetContents:
     maps = {of: results[f"set/{name}/{of}"] for of in ("iota", "visibility", "chi2")}
     columns = ("time", "B", "A", "phi", "dkx", "dky")

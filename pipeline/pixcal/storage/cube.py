@@ -31,6 +31,8 @@ from pixcal.storage.memory import MemoryArray, MemoryPath
 from pixcal.storage.place import Place, UrlPath
 from pixcal.storage.read_ahead import AHEAD, ReadAhead
 
+Ints = tuple[int, ...]
+
 CHUNK = (64, 128, 128)  # samples of a chunk along (time, y, x): 2 MiB of uint16
 
 # system errors that mean a damaged file; others may be temporary
@@ -88,12 +90,7 @@ def create_map(
 # Cached: many arrays are alike, and zarr-python takes a millisecond for each.
 @lru_cache(maxsize=512)
 def _array_metadata(
-    shape: tuple[int, ...],
-    chunks: tuple[int, ...],
-    dtype: str,
-    fill_value: Any,
-    dims: tuple[str, ...],
-    attrs: str,
+    shape: Ints, chunks: Ints, dtype: str, fill_value: Any, dims: tuple[str, ...], attrs: str
 ) -> bytes:
     """Metadata as zarr-python writes it for an array; attributes as JSON."""
     made: dict[str, Any] = {}
@@ -150,7 +147,7 @@ def write_array(path: Place, data: NDArray[Any], **options: Any) -> None:
     writer.finish()
 
 
-def _grid(shape: tuple[int, ...], chunks: tuple[int, ...]) -> tuple[int, ...]:
+def _grid(shape: Ints, chunks: Ints) -> Ints:
     return tuple(-(-n // c) for n, c in zip(shape, chunks, strict=True))
 
 
@@ -164,7 +161,7 @@ def _chunk_name(index: Sequence[int]) -> str:
     return "/".join(["c", *map(str, index)])
 
 
-def _names(grid: tuple[int, ...]) -> Iterator[list[str]]:
+def _names(grid: Ints) -> Iterator[list[str]]:
     """Names of all chunks, by steps along the first axis."""
     for first in range(grid[0]):
         yield [_chunk_name((first, *rest)) for rest in np.ndindex(grid[1:])]

@@ -188,7 +188,7 @@ def error_maps(folder: Path, detector: PixelPositions, star: Star, runtime: Runt
     names = [f"{grid}_{component.name}" for grid in GRIDS for component in detector.components]
     writers = [create_map(folder / name, (ny, nx), chunks, units="pixel") for name in names]
     corners = list(product(range(0, ny, side), range(0, nx, side)))
-    task = partial(_tile, detector, star, writers, side, block)
+    task = partial(_tile, detector, star, writers)
     parts = run_tasks(task, corners, runtime, label="error maps")
     for writer in writers:
         writer.finish()
@@ -199,14 +199,10 @@ def error_maps(folder: Path, detector: PixelPositions, star: Star, runtime: Runt
 
 
 def _tile(
-    detector: PixelPositions,
-    star: Star,
-    writers: list[ArrayWriter],
-    side: int,
-    block: int,
-    corner: tuple[int, int],
+    detector: PixelPositions, star: Star, writers: list[ArrayWriter], corner: tuple[int, int]
 ) -> F64:
     """Write a part of the maps; sums over its blocks (map + 1, y, x): squares, valid pixels."""
+    side, block = tile_side(detector.shape)
     y, x = ((a, min(a + side, n)) for a, n in zip(corner, detector.shape, strict=True))
     errors = place_errors(detector, star, y, x)
     maps = errors.reshape(-1, *errors.shape[2:])

@@ -36,7 +36,7 @@ from pixcal.stages.diagnose.windows import chosen_windows
 from pixcal.stages.evidence import Part, load_evidence
 from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
 from pixcal.stages.fit.maps import Totals, write_maps
-from pixcal.stages.fit.stage import header_of, publish_maps, published
+from pixcal.stages.fit.stage import Header, header_of, publish_maps, published
 from pixcal.stages.fit.sweep import load_run, sweep_set
 from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.stages.reduce.ingested import Ingested
@@ -47,7 +47,6 @@ from pixcal.storage.cube import create_group
 from pixcal.storage.formats import STAGES
 from pixcal.storage.lock import lock
 from pixcal.storage.manifest import Manifest, read_json, write_json
-from pixcal.storage.products import Card
 from pixcal.storage.stage import make, require
 
 Json = dict[str, Any]
@@ -96,7 +95,7 @@ def attempt(run_dir: Path, config: Config, runtime: Runtime) -> str | None:
     try:
         run(run_dir, config, runtime)
     except (InputError, ArithmeticError, LookupError, MemoryError, ValueError) as error:
-        publish_maps(run_dir, run_dir / "corrected" / "corrected.zarr", (), [], [], SUFFIX)
+        publish_maps(run_dir, run_dir / "corrected" / "corrected.zarr", (), ([], []), SUFFIX)
         (run_dir / "products" / "correction.json").unlink(missing_ok=True)
         return str(error) or type(error).__name__
     return None
@@ -188,7 +187,7 @@ def _swept_sets(
         if plan.on_samples:
             source = RestoredSet(reduced / name, plan.on_samples, calibration, exptime_s)
             nominal, config = nominal_vector(acquisition, name), Sweep(**of_fit.config)
-            facts[name] = sweep_set(again, source, name, nominal, config, runtime)
+            facts[name] = sweep_set(again, source, nominal, config, runtime)
             folder = made.scratch / "sweep.zarr" / name
         sets[name] = Swept(
             folder,
@@ -227,19 +226,18 @@ def _publish(run_dir: Path) -> None:
     """Write the products; only ``correction.json`` if there is nothing to correct."""
     folder = run_dir / "corrected"
     result = read_json(folder / "correction.json")
-    cards: list[Card] = []
-    history: list[str] = []
+    header: Header = [], []
     if result["outputs"]:
         fits = {name: facts["fit"] for name, facts in result["sets"].items()}
         key = read_json(folder / "manifest.json")["key"]
-        cards, history = header_of(run_dir, result | {"sets": fits}, key)
+        header = cards, history = header_of(run_dir, result | {"sets": fits}, key)
         freed = [e for e in result["effects"] if e["treatment"].startswith("corrected on")]
         cards.append(("NEFFECT", len(freed), "effects corrected"))
         for n, effect in enumerate(freed, start=1):
             cards.append((f"EFFECT{n}", effect["effect"], "effect corrected"))
             parameters = json.dumps(effect["parameters"])
             history.append(f"{effect['effect']}: {effect['treatment']}: {parameters}")
-    publish_maps(run_dir, folder / "corrected.zarr", result["outputs"], cards, history, SUFFIX)
+    publish_maps(run_dir, folder / "corrected.zarr", result["outputs"], header, SUFFIX)
     write_json(run_dir / "products" / "correction.json", result)
 
 

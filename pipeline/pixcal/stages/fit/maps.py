@@ -28,6 +28,7 @@ from pixcal.storage.place import Local
 SAME_AS_SWEPT = ("iota", "alpha", "chi2", "mask")  # maps identical to those of the sweep
 # by names of the set ("" for combined maps) and of the array
 Writers = dict[tuple[str, str], ArrayWriter]
+Made = dict[tuple[str, str], NDArray[Any]]  # maps of a tile, by the same keys
 # most errors that a tile contributes to the median, and about how many all tiles contribute
 SAMPLED_ERRORS, MAX_SAMPLED_ERRORS = 4000, 4_000_000
 
@@ -128,13 +129,9 @@ def _write_strip(
 
 
 def _maps_of_tile(
-    fitted: list[FittedSet],
-    readers: list[Swept],
-    both: bool,
-    job: Job,
-    made: dict[tuple[str, str], NDArray[Any]],
+    fitted: list[FittedSet], readers: list[Swept], both: bool, job: Job, made: Made
 ) -> _TileTotals:
-    """Fill the maps of a tile, by the keys of their writers; return its share of the totals."""
+    """Fill the maps of a tile; return its share of the totals."""
     at, removed = job
     y, x = fitted[0].source.ranges(at)
     found = [
@@ -193,11 +190,7 @@ def offsets(fitted: FittedSet, swept: Swept, at: tuple[int, int], removed: F64) 
 
 
 def _maps_of_set(
-    fitted: FittedSet,
-    swept: Swept,
-    at: tuple[int, int],
-    removed: F64,
-    made: dict[tuple[str, str], NDArray[Any]],
+    fitted: FittedSet, swept: Swept, at: tuple[int, int], removed: F64, made: Made
 ) -> SetOffsets:
     """Fill a set's own maps of a tile."""
     y, x = fitted.source.ranges(at)

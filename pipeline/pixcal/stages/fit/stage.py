@@ -80,13 +80,16 @@ def publish(run_dir: Path) -> None:
     """Write the products of a complete fit."""
     result = read_json(run_dir / "fit" / "fit.json")
     key = read_json(run_dir / "fit" / "manifest.json")["key"]
-    cards, history = header_of(run_dir, result, key)
-    publish_maps(run_dir, run_dir / "fit" / "fit.zarr", result["outputs"], cards, history)
+    header = header_of(run_dir, result, key)
+    publish_maps(run_dir, run_dir / "fit" / "fit.zarr", result["outputs"], header)
     write_json(run_dir / "products" / "fit.json", result)
 
 
-def header_of(run_dir: Path, result: dict[str, Any], key: str) -> tuple[list[Card], list[str]]:
-    """Cards and HISTORY lines of the maps of a fit, from its ``fit.json``."""
+Header = tuple[list[Card], list[str]]  # cards and HISTORY lines
+
+
+def header_of(run_dir: Path, result: dict[str, Any], key: str) -> Header:
+    """Header of the maps of a fit, from its ``fit.json``."""
     models = {facts["model"] for facts in result["sets"].values()}
     cards = [
         *_detector_cards(run_dir),
@@ -140,12 +143,7 @@ def _detector_cards(run_dir: Path) -> list[Card]:
 
 
 def publish_maps(
-    run_dir: Path,
-    group: Path,
-    outputs: Sequence[str],
-    cards: list[Card],
-    history: list[str],
-    suffix: str = "",
+    run_dir: Path, group: Path, outputs: Sequence[str], header: Header, suffix: str = ""
 ) -> None:
     """Write the maps of ``fit.zarr`` or the like as FITS, and remove maps of an earlier fit."""
     for name in outputs:
@@ -153,6 +151,6 @@ def publish_maps(
             ArrayReader(group / array) for array in (name, f"{name}_sigma", "mask")
         )
         product = run_dir / "products" / f"{name}{suffix}.fits"
-        write_map(product, delta, sigma, mask, cards, history)
+        write_map(product, delta, sigma, mask, *header)
     for other in {"delta_x", "delta_y", "delta_fringe"} - set(outputs):
         (run_dir / "products" / f"{other}{suffix}.fits").unlink(missing_ok=True)

@@ -100,7 +100,7 @@ def sweep_sets(
     for name in (listed.name for listed in acquisition.frames.fringes):
         nominal = nominal_vector(acquisition, name)
         with naming(f"fringe set {name!r}"):
-            sets[name] = sweep_set(made, ReducedSet(reduced / name), name, nominal, config, runtime)
+            sets[name] = sweep_set(made, ReducedSet(reduced / name), nominal, config, runtime)
     return sets
 
 
@@ -120,12 +120,12 @@ class _Job:
 def sweep_set(
     made: Workspace,
     source: ReducedSet,
-    name: str,
     nominal: tuple[float, float],
     config: Config,
     runtime: Runtime,
 ) -> dict[str, Any]:
     """Sweep one set into ``sweep.zarr/<set name>`` of a build; returns its summary."""
+    name = source.folder.name
     folder = made.folder / "sweep.zarr" / name
     cube.create_group(folder)
     scouted = folder / "scout.json"
