@@ -22,6 +22,8 @@ from pixcal.storage.stage import read_acquisition, require
 
 # rows and columns of the window: ((y0, y1), (x0, x1))
 Part = tuple[tuple[int, int], tuple[int, int]]
+# first row and column in, and shape of, a window
+Window = tuple[tuple[int, int], tuple[int, int]]
 
 DAY_S = 86400.0
 MAX_SAMPLES = 1 << 26  # samples of a set that are taken into memory (some ten bytes each)
@@ -41,13 +43,9 @@ def evidence_of(
     frames: slice = slice(None),
     *,
     black: Black | None = None,
-    within: tuple[tuple[int, int], tuple[int, int]] | None = None,
+    within: Window | None = None,
 ) -> Evidence:
-    """The same of a whole run.
-
-    ``black``: known of the camera from more frames. ``within``: first row and column in, and shape
-    of, a window.
-    """
+    """The same of a whole run; ``black``: known of the camera from more frames."""
     acquisition = read_acquisition(run_dir)
     ingested = Ingested(run_dir / "ingest", black)
     ny, nx = ingested.shape
@@ -61,7 +59,8 @@ def evidence_of(
     }
     fringes = {}
     for listed in acquisition.frames.fringes:
-        fringes[listed.name] = _fringes(run_dir, ingested, listed, (y, x), frames, origin, window)
+        place = origin, window
+        fringes[listed.name] = _fringes(run_dir, ingested, listed, (y, x), frames, place)
     used = read_json(run_dir / "reduce" / "reduce.json")
     without_dark = None if black is None else black.without_dark
     if without_dark is None:
@@ -96,29 +95,17 @@ def _photon_transfer(gain: dict[str, Any]) -> tuple[float, float, float]:
     return value, error, chi2
 
 
-def _span(frames: slice, count: int) -> tuple[int, int]:
-    """First of some consecutive frames, and the one after the last."""
-    first, last, step = frames.indices(count)
-    if step != 1:
-        raise ValueError("consecutive frames are needed")
-    return first, last
-
-
 def _fringes(
-    run_dir: Local,
-    ingested: Ingested,
-    listed: FringeSet,
-    part: Part,
-    frames: slice,
-    origin: tuple[int, int],
-    window: tuple[int, int],
+    run_dir: Local, ingested: Ingested, listed: FringeSet, part: Part, frames: slice, within: Window
 ) -> FringeEvidence:
-    name = listed.name
+    name, (origin, window) = listed.name, within
     source = ReducedSet(run_dir / "reduce" / "reduced.zarr" / name)
     swept = run_dir / "sweep" / "sweep.zarr" / name
     fitted = run_dir / "fit" / "fit.zarr" / name
     y, x = part
-    first, last = _span(frames, source.n_frames)
+    first, last, step = frames.indices(source.n_frames)
+    if step != 1:
+        raise ValueError("consecutive frames are needed")
     if (last - first) * (y[1] - y[0]) * (x[1] - x[0]) > MAX_SAMPLES:
         raise InputError(f"fringe set {name!r}: more than {MAX_SAMPLES} samples; take a part")
     codes = source.signal.read((first, last), y, x).astype(np.uint16, copy=False)

@@ -72,7 +72,8 @@ def correct_sweep(swept: Swept, target: Path, runtime: Runtime, name: str) -> No
         fitting = within_memory(f"halves of {name}", need, 0, runtime)
         task = partial(_halve, swept, halves, middle)
         run_tasks(task, tiles, fitting, label=f"halves {name}")
-        _finish(halves)
+        for writer in halves.values():
+            writer.finish()
     writers = _create(target, swept, ("iota", "alpha", "phase", "sigma"))
     writers |= _create(target, swept, ("batch_phase", "batch_sigma"), len(variants))
     width = TileSums.width(len(variants))
@@ -87,7 +88,8 @@ def correct_sweep(swept: Swept, target: Path, runtime: Runtime, name: str) -> No
     fitting = within_memory(f"correction of {name}", task_bytes(swept), 0, runtime)
     task = partial(_correct_tile, swept, target, writers)
     run_tasks(task, tiles, fitting, label=f"correct {name}")
-    _finish(writers)
+    for writer in writers.values():
+        writer.finish()
 
 
 def _create(
@@ -97,11 +99,6 @@ def _create(
     source = swept.source
     chunks = source.signal.chunks[1:]
     return {n: cube.create_map(target / n, source.shape, chunks, number=number) for n in names}
-
-
-def _finish(writers: dict[str, ArrayWriter]) -> None:
-    for writer in writers.values():
-        writer.finish()
 
 
 def _halve(swept: Swept, writers: dict[str, ArrayWriter], middle: int, at: tuple[int, int]) -> None:

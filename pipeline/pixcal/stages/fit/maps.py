@@ -50,7 +50,11 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
     both = axes_span_plane([f.shape.axis(ny / 2, nx / 2) for f in fitted])
     outputs = outputs_of(both)
     cube.create_group(group)
-    writers = _create_joint(group, fitted[0], outputs)
+    names = [array for name in outputs for array in (name, f"{name}_sigma")]
+    writers = {("", name): _map_writer(group / name, fitted[0]) for name in names}
+    writers["", "mask"] = cube.create_array(
+        group / "mask", source.shape, "u1", dims=("y", "x"), chunks=source.map_chunks
+    )
     for f in fitted:
         writers |= _create_set(group / f.name, f)
     pixels = int(np.prod(source.signal.chunks[1:]))
@@ -227,16 +231,6 @@ def _create_set(folder: Path, fitted: FittedSet) -> Writers:
     for name in ("batch_delta", "batch_sigma") if n else ():
         writers[name] = _map_writer(folder / name, fitted, n)
     return {(fitted.name, name): writer for name, writer in writers.items()}
-
-
-def _create_joint(group: Path, fitted: FittedSet, outputs: tuple[str, ...]) -> Writers:
-    names = [array for name in outputs for array in (name, f"{name}_sigma")]
-    writers = {("", name): _map_writer(group / name, fitted) for name in names}
-    shape, chunks = fitted.source.shape, fitted.source.map_chunks
-    writers["", "mask"] = cube.create_array(
-        group / "mask", shape, "u1", dims=("y", "x"), chunks=chunks
-    )
-    return writers
 
 
 def _write_frames(folder: Path, maps: Local) -> None:
