@@ -26,7 +26,9 @@ def write_acquisition(
     for run, frames in recorded:
         (out / run.name).mkdir()
         for first in range(0, len(frames), PER_FILE):
-            seconds = run.start_s + (first + WARM_UP) * (bench.period_s + _longer(run))
+            # Frames of darks and flats take longer by their exposure.
+            longer = run.exptime_s if run.kind in ("dark", "flat") else 0.0
+            seconds = run.start_s + (first + WARM_UP) * (bench.period_s + longer)
             header = fits.Header()
             if bench.stamped:
                 header["DATE-OBS"] = (NIGHT + TimeDelta(seconds, format="sec")).isot
@@ -36,11 +38,6 @@ def write_acquisition(
             file = out / run.name / f"{run.name}_{first:05d}.fits"
             fits.PrimaryHDU(cube, header).writeto(file)
     (out / "acquisition.yaml").write_text(yaml.safe_dump(_described(bench), sort_keys=False))
-
-
-def _longer(run: Run) -> float:
-    """Additional frame period of a run over that of fringes, s."""
-    return run.exptime_s if run.kind in ("dark", "flat") else 0.0
 
 
 def _described(bench: Bench) -> dict[str, Any]:

@@ -207,7 +207,7 @@ def _measure_region(
     quantiles, pixels = quantiles_of_region(folder / "adev", region, usable, runtime)
     if filled < 3 or not quantiles:
         reason = f"{filled} of {batches.n} batches have data: too few for an Allan deviation"
-        return _as_json(batches, [], stability.NO_CURVE, [], [reason]) | common | {"pixels": 0}
+        return _as_json(batches, [], stability.NO_CURVE, [], reason) | common | {"pixels": 0}
     chosen = [lengths[n] for n in quantiles]
     low, median, high = np.array(list(quantiles.values()), float).T
     noise = noise_levels(folder / "expected", region)
@@ -222,16 +222,12 @@ def _measure_region(
         ]
         curve = replace(curve, knee=None)
     expected = float(np.median(noise)) / np.sqrt(chosen)
-    facts = _as_json(batches, chosen, curve, expected.tolist(), warnings)
+    facts = _as_json(batches, chosen, curve, expected.tolist(), *warnings)
     return facts | common | {"pixels": pixels}
 
 
 def _as_json(
-    batches: Batches,
-    lengths: Sequence[int],
-    curve: AllanCurve,
-    expected: list[float],
-    warnings: list[str],
+    batches: Batches, lengths: list[int], curve: AllanCurve, expected: list[float], *warnings: str
 ) -> dict[str, Any]:
     return {
         "frames": [m * batches.frames for m in lengths],
@@ -244,7 +240,7 @@ def _as_json(
         "slope_err": curve.slope_error,
         "white_expected_px": expected,
         "knee_frames": None if curve.knee is None else curve.knee * batches.frames,
-        "warnings": warnings,
+        "warnings": list(warnings),
     }
 
 

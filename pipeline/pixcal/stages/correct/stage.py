@@ -80,9 +80,8 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         "effects": [t.plain for t in plan.every],
     }
     inputs = {"fit": fitted.key, "diagnose": diagnosed.key}
-    acquisition = load_run(run_dir)
     with lock(run_dir):
-        body = partial(_correct, run_dir, plan, acquisition, runtime)
+        body = partial(_correct, run_dir, plan, runtime)
         there = partial(published, run_dir, "corrected", "correction.json", SUFFIX)
         publish = partial(_publish, run_dir)
         return make(
@@ -101,9 +100,7 @@ def attempt(run_dir: Path, config: Config, runtime: Runtime) -> str | None:
     return None
 
 
-def _correct(
-    run_dir: Path, plan: Treatments, acquisition: Acquisition, runtime: Runtime, made: Build
-) -> None:
+def _correct(run_dir: Path, plan: Treatments, runtime: Runtime, made: Build) -> None:
     before = read_json(run_dir / "fit" / "fit.json")
     plan = remeasured(run_dir, plan, runtime)
     result: Json = {
@@ -118,15 +115,13 @@ def _correct(
         "sets_chi2_reduced": None,
     }
     if plan.corrected or plan.curved:
-        result |= _corrected_maps(run_dir, made, plan, acquisition, runtime)
+        result |= _corrected_maps(run_dir, made, plan, runtime)
     write_json(made.folder / "correction.json", result)
     made.summary = {"outputs": result["outputs"], "corrected": list(plan.corrected)}
 
 
-def _corrected_maps(
-    run_dir: Path, made: Build, plan: Treatments, acquisition: Acquisition, runtime: Runtime
-) -> Json:
-    before = read_json(run_dir / "fit" / "fit.json")
+def _corrected_maps(run_dir: Path, made: Build, plan: Treatments, runtime: Runtime) -> Json:
+    before, acquisition = read_json(run_dir / "fit" / "fit.json"), load_run(run_dir)
     for old in (made.scratch / "corrected", made.folder / "corrected.zarr"):
         shutil.rmtree(old, ignore_errors=True)
     create_group(made.scratch / "corrected")

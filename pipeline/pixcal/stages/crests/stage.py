@@ -18,7 +18,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels.optics import paraxial_vector
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.config import result_options
-from pixcal.model.errors import InputError, naming
+from pixcal.model.errors import naming
 from pixcal.model.options import Crests as Config
 from pixcal.report.crest_figures import CrestView, Extract, crest_figure, outermost
 from pixcal.report.drawing import png
@@ -49,11 +49,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     Reads ``RUN/reduce`` and, where it is there, ``RUN/fit``; makes ``RUN/crests`` and the products
     ``crests.json`` and ``crests-<set>.png``.
     """
-    acquisition = load_run(run_dir)
-    if not acquisition.frames.fringes:
-        raise InputError(
-            f"{run_dir}: the acquisition lists no fringes; crests needs frames.fringes"
-        )
+    acquisition = load_run(run_dir, "crests")
     with working(run_dir, "reduce") as inputs:
         facts: dict[str, Any] = {}
         if (run_dir / "fit" / MANIFEST).exists():

@@ -84,11 +84,7 @@ class FittedSet:
 
 
 def fit_sets(
-    sweep: Local,
-    reduced: Local,
-    facts: Mapping[str, dict[str, Any]],
-    acquisition: Acquisition,
-    model: str,
+    sweep: Local, reduced: Local, facts: Mapping[str, Any], acquisition: Acquisition, model: str
 ) -> list[FittedSet]:
     """Fit the shape of the fringes of every set, see `fit_set`."""
     swept = sweep / "sweep.zarr"

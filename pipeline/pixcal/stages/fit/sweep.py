@@ -68,17 +68,20 @@ LOOKS = 16
 LOOK_FRAMES = 128
 
 
-def load_run(run_dir: Path) -> Acquisition:
-    """Acquisition of a run that must have been reduced."""
+def load_run(run_dir: Path, command: str = "") -> Acquisition:
+    """Acquisition of a run that must have been reduced and, for a ``command``, have fringes."""
     require(run_dir, "reduce")
-    return read_acquisition(run_dir)
+    acquisition = read_acquisition(run_dir)
+    if command and not acquisition.frames.fringes:
+        raise InputError(
+            f"{run_dir}: the acquisition lists no fringes; {command} needs frames.fringes"
+        )
+    return acquisition
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Sweep every fringe set of a run (the caller holds the run's lock)."""
-    acquisition = load_run(run_dir)
-    if not acquisition.frames.fringes:
-        raise InputError(f"{run_dir}: the acquisition lists no fringes; fit needs frames.fringes")
+    acquisition = load_run(run_dir, "fit")
 
     def body(made: Build) -> None:
         with naming(str(run_dir)):
