@@ -76,8 +76,7 @@ class Examination:
 
     def bench(self, number: int) -> Bench:
         """Bench of a case; its random numbers are independent of those of the truth."""
-        rng = np.random.default_rng([self.seed, _BENCH, number])
-        return draw_bench(LAYOUTS[self.size], rng)
+        return draw_bench(LAYOUTS[self.size], np.random.default_rng([self.seed, _BENCH, number]))
 
 
 def draw_examination(cases: int, seed: int, size: str, bench: str = "both") -> Examination:
@@ -174,5 +173,4 @@ def _drawn(variants: Sequence[Variant], size: str, least: float, rng: np.random.
     variant = variants[int(rng.integers(len(variants)))]
     times = float(np.exp(rng.uniform(np.log(least), np.log(STRONGEST))))
     strength = times * variant.threshold(size)
-    made = variant.make(strength, rng)
-    return Drawn(variant.effect, variant.strength, strength, times, made)
+    return Drawn(variant.effect, variant.strength, strength, times, variant.make(strength, rng))

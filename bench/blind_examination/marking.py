@@ -113,8 +113,7 @@ def _marked(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -
     ]
     if not done:
         raise InputError(f"{folder}: no case was diagnosed; run 'pixcal blind run {folder}'")
-    mark = partial(_graded, folder, manifest, opened)
-    grades = run_tasks(mark, done, runtime, label="score")
+    grades = run_tasks(partial(_graded, folder, manifest, opened), done, runtime, label="score")
     if config.oracle:
         grades = _with_oracle(folder, opened, dict(zip(done, grades, strict=True)), config, runtime)
     missing = [name for n, name in enumerate(manifest.cases) if n not in done]

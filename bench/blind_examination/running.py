@@ -47,8 +47,7 @@ def run(folder: Path, config: RunConfig, runtime: Runtime) -> tuple[int, int]:
     ][: config.limit]
     over, each = share("diagnosing a case", manifest.size, len(pending), runtime)
     diagnose_case = partial(_case, folder, config, code_digest(), each)
-    failed = run_tasks(diagnose_case, pending, over, label="diagnose")
-    return len(pending), sum(failed)
+    return len(pending), sum(run_tasks(diagnose_case, pending, over, label="diagnose"))
 
 
 def share(what: str, size: str, cases: int, runtime: Runtime) -> tuple[Runtime, Runtime]:
@@ -102,8 +101,7 @@ def _case(
             shutil.rmtree(run_dir / name, ignore_errors=True)
     seconds = {"diagnosis": diagnosed - start, "maps": time.perf_counter() - diagnosed}
     rounded = {what: round(value, 1) for what, value in seconds.items()}
-    done = {"code": code, "seconds": rounded, "no_maps": without_maps}
-    write_json(run_dir / DONE, done)
+    write_json(run_dir / DONE, {"code": code, "seconds": rounded, "no_maps": without_maps})
     return failed
 
 

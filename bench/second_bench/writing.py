@@ -35,8 +35,7 @@ def write_acquisition(
             if bench.stamped or run.kind == "dark":
                 header["EXPTIME"] = run.exptime_s
             cube = np.ascontiguousarray(frames[first : first + PER_FILE][WINDOW])
-            file = out / run.name / f"{run.name}_{first:05d}.fits"
-            fits.PrimaryHDU(cube, header).writeto(file)
+            fits.PrimaryHDU(cube, header).writeto(out / run.name / f"{run.name}_{first:05d}.fits")
     (out / "acquisition.yaml").write_text(yaml.safe_dump(_described(bench), sort_keys=False))
 
 

@@ -74,8 +74,7 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: "Runtime") -
     """The scores."""
     from blind_examination import marking  # here: for a fast `pixcal --help`
 
-    result = marking.score(folder, sealed, config, runtime)
-    _show(result)
+    _show(marking.score(folder, sealed, config, runtime))
     for file in (folder / "score.json", folder / "score.md"):
         click.echo(f"  {file}")
 

@@ -63,8 +63,7 @@ def _show(result: Mapping[str, Any]) -> None:
     if result["summary"] is not None:
         click.echo("\nerrors of each map beyond noise, from the differences of all pairs, px")
         own = [map(_amount, facts["own"]) for facts in result["summary"].values()]
-        rows = list(zip(labels, *own, strict=True))
-        show_table(("", *result["summary"]), rows)
+        show_table(("", *result["summary"]), list(zip(labels, *own, strict=True)))
     show_notes(result["warnings"])
 
 

@@ -96,8 +96,7 @@ def explain(error: BaseException) -> tuple[int, str]:
             return 1, f"{error.filename}: {error.strerror}"
         case MemoryError():
             return 1, "out of memory; lower --memory or --workers"
-    name = type(error).__name__
-    return 1, f"internal error: {name}: {error} (PIXCAL_DEBUG=1 shows where)"
+    return 1, f"internal error: {type(error).__name__}: {error} (PIXCAL_DEBUG=1 shows where)"
 
 
 def one_line(message: str) -> str:

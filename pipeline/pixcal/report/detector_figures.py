@@ -90,8 +90,7 @@ def _spectra(axes: Axes, curves: Curves) -> None:
         axes.set_yscale("log")
         axes.minorticks_off()
     else:
-        top = max(max(curves[along]["amplitude"]) for along in AXES[0])
-        axes.set_ylim(0, 1.3 * top)
+        axes.set_ylim(0, 1.3 * max(max(curves[along]["amplitude"]) for along in AXES[0]))
     finish(axes)
     axes.legend(fontsize=9, frameon=False, ncols=2, loc="upper right")
 

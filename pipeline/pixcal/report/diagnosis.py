@@ -248,8 +248,7 @@ def rejected(result: DiagnosisContents) -> Table:
         size = _sigma(c["sigmas"]) if "sigmas" in c else "–"
         closed = percent(c["gap_closed"]) if c.get("tried_on_unseen_frames") else "–"
         rows.append([effect_title(result, c["effect"]), size, closed, c["rejected_because"]])
-    header = ["effect", "significance (σ)", "gap closed", "reason"]
-    return Table("Rejected effects", header, rows)
+    return Table("Rejected effects", ["effect", "significance (σ)", "gap closed", "reason"], rows)
 
 
 def frames_used(facts: Facts) -> Table:

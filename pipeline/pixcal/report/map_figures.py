@@ -116,8 +116,7 @@ def _nearby(values: F64) -> tuple[F64, F64, F64]:
     there = np.isfinite(values)
     count = np.add.reduceat(there, starts, dtype=float)
     total = np.add.reduceat(np.where(there, values, 0.0), starts)
-    empty = np.full(len(starts), np.nan)
-    mean = np.divide(total, count, out=empty, where=count > 0)
+    mean = np.divide(total, count, out=np.full(len(starts), np.nan), where=count > 0)
     low = np.fmin.reduceat(values, starts)
     high = np.fmax.reduceat(values, starts)
     return low[groups], mean[groups], high[groups]

@@ -135,8 +135,7 @@ def errors(maps: Sequence[MapContents]) -> Iterator[Panel]:
     """Error of each map of offsets."""
     for offset in maps:
         unit, symbol = unit_for([offset.sigma.median], "px"), SYMBOLS[offset.name]
-        label = f"σ ({unit.label})"
-        yield map_panel(f"error of {symbol}", label, offset.sigma, unit.factor)
+        yield map_panel(f"error of {symbol}", f"σ ({unit.label})", offset.sigma, unit.factor)
 
 
 def residuals(sets: Sequence[SetContents]) -> Iterator[Panel]:

@@ -111,8 +111,7 @@ def _block_sums(values: NDArray[Any], good: Mask, side: int) -> tuple[F64, F64]:
 
 
 def _ratio(above: NDArray[Any], below: NDArray[Any]) -> F64:
-    empty = np.full(above.shape, np.nan)
-    return np.asarray(np.divide(above, below, out=empty, where=below > 0))
+    return np.asarray(np.divide(above, below, out=np.full(above.shape, np.nan), where=below > 0))
 
 
 def bands(source: Source, side: int = 1) -> Iterator[tuple[int, NDArray[Any]]]:

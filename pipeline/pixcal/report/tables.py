@@ -220,8 +220,7 @@ def _stages(stages: Sequence[Mapping[str, Any]]) -> Iterator[Table]:
         facts = [stage["stage"], stage["pixcal"], str(stage["format"]), stage["key"]]
         rows.append([*facts, ", ".join(made_from) or "–", _listed(options) or "–"])
         files += [[name, key] for name, key in stage["inputs"].items() if name not in present]
-    header = ["stage", "pixcal", "format", "key", "made from", "options"]
-    yield Table("Stages", header, rows)
+    yield Table("Stages", ["stage", "pixcal", "format", "key", "made from", "options"], rows)
     if files:
         yield Table("Digests of the files", ["array", "digest"], files)
 

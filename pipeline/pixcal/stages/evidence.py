@@ -59,8 +59,7 @@ def evidence_of(
     }
     fringes = {}
     for listed in acquisition.frames.fringes:
-        place = origin, window
-        fringes[listed.name] = _fringes(run_dir, ingested, listed, (y, x), frames, place)
+        fringes[listed.name] = _fringes(run_dir, ingested, listed, (y, x), frames, (origin, window))
     used = read_json(run_dir / "reduce" / "reduce.json")
     without_dark = None if black is None else black.without_dark
     if without_dark is None:
@@ -118,8 +117,7 @@ def _fringes(
     start = FrameParameters(found.at(*centre)[frames], found.dk[frames], centre)
     facts = read_json(run_dir / "fit" / "fit.json")["sets"][name]
     theta = fitted_theta(swept, part, found.reference)
-    mask = ArrayReader(swept / "mask").read(y, x)
-    good = (mask == 0) & np.isfinite(theta).all(axis=0)
+    good = (ArrayReader(swept / "mask").read(y, x) == 0) & np.isfinite(theta).all(axis=0)
     read = ArrayReader(source.folder / "read_variance").read(y, x).astype(float)
     shot = ArrayReader(source.folder / "shot_factor").read(y, x).astype(float)
     (free, covariance), *halves = free_frames(codes, coding, start, theta, read, shot, good)

@@ -61,8 +61,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         inputs = {stage: manifest.key for stage, manifest in manifests.items()}
 
         def body(made: Build) -> None:
-            contents = _collect(run_dir, manifests, runtime)
-            page = render(contents)
+            page = render(_collect(run_dir, manifests, runtime))
             (made.folder / "report.html").write_text(page, encoding="utf-8")
             made.summary = {"bytes": len(page.encode()), "sections": page.count("<section")}
 

@@ -382,8 +382,7 @@ class ArrayReader:
         """A block, given (start, stop) of the first axes; fastest if aligned to chunks."""
         full = [(0, n) for n in self.shape]
         full[: len(ranges)] = [(max(0, a), min(b, n)) for (a, b), (_, n) in zip(ranges, full)]  # noqa: B905
-        shape = tuple(b - a for a, b in full)
-        block = np.empty(shape, self.dtype) if out is None else out
+        block = np.empty(tuple(b - a for a, b in full), self.dtype) if out is None else out
         if self._memory is not None:
             block[...] = self._memory.values[tuple(slice(*ends) for ends in full)]
             return block

@@ -95,8 +95,7 @@ class MemoryArray:
 
     def write(self, start: Sequence[int], data: "NDArray[Any]") -> None:
         """Write a block."""
-        at = tuple(slice(s, s + n) for s, n in zip(start, data.shape, strict=True))
-        self.values[at] = data
+        self.values[tuple(slice(s, s + n) for s, n in zip(start, data.shape, strict=True))] = data
 
     def chunk(self, index: Sequence[int]) -> "NDArray[Any]":
         """A chunk, padded at the edges; not to be changed."""

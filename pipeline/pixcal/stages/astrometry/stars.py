@@ -188,8 +188,7 @@ def error_maps(folder: Path, detector: PixelPositions, star: Star, runtime: Runt
     names = [f"{grid}_{component.name}" for grid in GRIDS for component in detector.components]
     writers = [create_map(folder / name, (ny, nx), chunks, units="pixel") for name in names]
     corners = list(product(range(0, ny, side), range(0, nx, side)))
-    task = partial(_tile, detector, star, writers)
-    parts = run_tasks(task, corners, runtime, label="error maps")
+    parts = run_tasks(partial(_tile, detector, star, writers), corners, runtime, label="error maps")
     for writer in writers:
         writer.finish()
     columns = -(-nx // side)

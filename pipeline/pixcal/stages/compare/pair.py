@@ -53,8 +53,7 @@ class Pair:
     @property
     def shown(self) -> int:
         """Side of the blocks of the map of differences, px: a power of two."""
-        side = _power_of_two(max(self.window) / SHOWN_BLOCKS)
-        return max(side, MIN_BLOCK, 1 << self.coarse)
+        return max(_power_of_two(max(self.window) / SHOWN_BLOCKS), MIN_BLOCK, 1 << self.coarse)
 
     @property
     def tile_side(self) -> tuple[int, int]:
@@ -213,8 +212,7 @@ def read_pixels(pair: Pair, sums: PairSums, runtime: Runtime) -> Pixels:
     pieces = run_tasks(task, pair.tiles(), runtime, label=f"pixels {pair.name}")
     histograms, pictures, listed, beyond, squares, _ = zip(*pieces, strict=True)
     far = sorted((f for some in listed for f in some), key=lambda f: -abs(f[2] / f[3]))
-    together = pair.together(squares)
-    return Pixels(sum(histograms), sum(pictures), far, sum(beyond), together, reach)
+    return Pixels(sum(histograms), sum(pictures), far, sum(beyond), pair.together(squares), reach)
 
 
 def _pixels_task(pair: Pair, projection: Projection, reach: float, tile: Tile) -> Pixels:

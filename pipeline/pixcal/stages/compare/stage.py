@@ -165,8 +165,7 @@ def compare_pair(
         )
     pixels = read_pixels(pair, sums, runtime)
     # If all pixels scatter more than noise, or are many, few of those far off are outliers.
-    chance = float(-ndtri(STRAY / sums.pixels))
-    limit = max(DISAGREE, chance) * max(1.0, pixels.spread)
+    limit = max(DISAGREE, float(-ndtri(STRAY / sums.pixels))) * max(1.0, pixels.spread)
     if any(abs(d / e) > limit for _, _, d, e in pixels.far):
         sums = read_sums(pair, runtime, (sums.projection, limit))
     return describe(pair, sums, pixels, limit, accuracy)

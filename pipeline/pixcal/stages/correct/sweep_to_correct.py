@@ -222,8 +222,7 @@ class RestoredSet(ReducedSet):
         sides = zip(part, self.shape, strict=True)
         around = [(max(0, a - halo), min(n, b + halo)) for (a, b), n in sides]
         first = block * self.block
-        frames = (first, min(first + self.block, self.n_frames))
-        codes = self.signal.read(frames, *around)
+        codes = self.signal.read((first, min(first + self.block, self.n_frames)), *around)
         both = zip(part, around, strict=True)
         inside = tuple(slice(a - start, b - start) for (a, b), (start, _) in both)
         flat, rate = (self._maps_of_charge[n].read(*around) for n in ("flat", "dark_rate"))

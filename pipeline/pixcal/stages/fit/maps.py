@@ -69,8 +69,7 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
         for n, at in enumerate(source.tiles())
     }
     strips = [[jobs[at] for at in strip] for strip in source.strips()]
-    task = partial(_write_strip, fitted, writers, both)
-    every = run_tasks(task, strips, runtime, label="maps")
+    every = run_tasks(partial(_write_strip, fitted, writers, both), strips, runtime, label="maps")
     for writer in writers.values():
         writer.finish()
     good, sigma, square, freedom = zip(*chain.from_iterable(every), strict=True)

@@ -79,8 +79,7 @@ def published(run_dir: Path, stage: str = "fit", facts: str = "fit.json", suffix
 def publish(run_dir: Path) -> None:
     """Write the products of a complete fit."""
     result = read_json(run_dir / "fit" / "fit.json")
-    key = read_json(run_dir / "fit" / "manifest.json")["key"]
-    header = header_of(run_dir, result, key)
+    header = header_of(run_dir, result, read_json(run_dir / "fit" / "manifest.json")["key"])
     publish_maps(run_dir, run_dir / "fit" / "fit.zarr", result["outputs"], header)
     write_json(run_dir / "products" / "fit.json", result)
 
@@ -150,7 +149,6 @@ def publish_maps(
         delta, sigma, mask = (
             ArrayReader(group / array) for array in (name, f"{name}_sigma", "mask")
         )
-        product = run_dir / "products" / f"{name}{suffix}.fits"
-        write_map(product, delta, sigma, mask, *header)
+        write_map(run_dir / "products" / f"{name}{suffix}.fits", delta, sigma, mask, *header)
     for other in {"delta_x", "delta_y", "delta_fringe"} - set(outputs):
         (run_dir / "products" / f"{other}{suffix}.fits").unlink(missing_ok=True)
