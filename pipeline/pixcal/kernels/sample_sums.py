@@ -7,8 +7,6 @@ import numpy as np
 from pixcal.kernels import kernel
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
-_FAST = {"reassoc", "contract", "nsz", "arcp"}
-
 
 def calm_residuals(
     samples: F32, model: F32, shot: F32, read: F32, good: Mask, most: float, limits: F64
@@ -115,7 +113,7 @@ def products_by_level(
     return np.stack([neighbour_products(part, pairs, steps) for part in parts])
 
 
-@kernel(fastmath=_FAST)
+@kernel(fastmath={"reassoc", "contract", "nsz", "arcp"})
 def _add_products(values: F32, pairs: F32, steps: Indices, every: int, sums: F64) -> None:
     for t in range(0, values.shape[0], every):
         for n in range(len(steps)):

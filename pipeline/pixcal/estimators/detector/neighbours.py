@@ -69,10 +69,8 @@ def shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
         pushes = boundary_pushes(noise.charge, shifts)
         for d, step in enumerate(DIRECTIONS):
             at = [2 * d, 2 * d + 1, n - 2, n - 1]
-            shared = (
-                shared_noise(noise.charge, pushes, shifts, step, (1, 0)),
-                shared_noise(noise.charge, pushes, shifts, step, (0, 1)),
-            )
+            given = noise.charge, pushes, shifts, step
+            shared = shared_noise(*given, (1, 0)), shared_noise(*given, (0, 1))
             more, more_right = pair_sums(noise, shared, step, REACH)
             # Only as many products are independent as degrees of freedom: one for two frames.
             normal[np.ix_(at, at)] += noise.kept * more
