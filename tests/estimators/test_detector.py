@@ -61,6 +61,22 @@ def test_a_pixel_without_samples_has_no_line() -> None:
     assert np.isfinite(line.rate).sum() == line.rate.size - 2
 
 
+def test_levels_of_a_colour_filter_stay_on_their_line() -> None:
+    """Half of the pixels see 40 % less light; noise moves the median between the two."""
+    rng = np.random.default_rng(5)
+    colour = np.where(np.indices((31, 37)).sum(axis=0) % 2, 0.6, 1.0)
+    times = np.array([0.1, 0.2, 0.4, 0.8])
+    signals = [rng.poisson(2e4 * t * colour).astype(float) for t in times]
+    steps = [
+        ExposureLevel(float(t), 1, s, s, float(s.mean()))
+        for t, s in zip(times, signals, strict=True)
+    ]
+    levels = step_levels(steps)
+    error = np.sqrt(levels / (0.8 * colour.size))
+    line = times * levels.sum() / times.sum()
+    assert np.all(np.abs(levels - line) < 4 * error)
+
+
 def test_the_response_is_all_charge_over_all_light() -> None:
     rate = np.random.default_rng(1).normal(1e5, 1e3, SHAPE)
     times = (0.1, 0.2, 0.4)

@@ -19,6 +19,7 @@ COLLAPSED = 0.25
 # how many errors it has to exceed that variance.
 SHOT, CERTAIN = 0.1, 5.0
 _OUTLYING, _CLIPPINGS = 0.01, 3  # probability of a clipped variance; iterations
+_TRIMMED = 0.1  # quantile of the pixels below and above which none gives the level of a tile
 NEARLY = 0.02  # relative distance from a pixel's own full well within which its signal is not used
 
 
@@ -105,17 +106,29 @@ def usual_variance(variance: NDArray[Any], dof: int) -> float:
 
 
 def step_levels(steps: Sequence[ExposureLevel]) -> F64:
-    """Median signal (step,) of the lit pixels of a tile; NaN if most are saturated.
+    """Signal (step,) of the median pixel of the lit ones of a tile; NaN if most are saturated.
 
-    All levels use the same pixels, and saturated ones rank brightest: without them the median would
-    be that of dim pixels.
+    All levels use the same pixels, those never saturated but where most are, without the brightest
+    and the dimmest tenth: medians of a colour filter's pixels would jump from colour to colour.
     """
+    levels = np.full(len(steps), np.nan)
     seen = lit(np.fmax.reduce([step.signal for step in steps]))
-    if not seen.any():
-        return np.full(len(steps), np.nan)
-    whole = (np.nan_to_num(step.signal[seen], nan=np.inf) for step in steps)
-    levels = np.array([median(signal) for signal in whole])
-    return np.where(np.isfinite(levels), levels, np.nan)
+    signal = np.stack([step.signal[seen] for step in steps])
+    usable = (
+        np.isfinite(signal).mean(axis=1) > 0.5 if seen.any() else np.zeros(len(steps), np.bool_)
+    )
+    signal = signal[usable]
+    common = np.isfinite(signal).all(axis=0)
+    if not usable.any() or not common.any():
+        return levels
+    total = np.array([step.frames for step in steps])[usable] @ signal
+    low, high = np.quantile(total[common], (_TRIMMED, 1 - _TRIMMED))
+    used = common & (total >= low) & (total <= high)
+    # Saturated pixels rank brightest: without them the median would be that of dim pixels.
+    usual = median(np.where(common, total, np.inf))
+    scale = usual / total[used].mean() if np.isfinite(usual) else 1.0
+    levels[usable] = scale * signal[:, used].mean(axis=1)
+    return levels
 
 
 def relative_response(steps: Sequence[ExposureLevel], levels: F64) -> tuple[F64, F64]:
