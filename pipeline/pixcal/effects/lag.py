@@ -1,5 +1,6 @@
 """Charge that stays behind in the pixel and comes out with later frames."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -15,6 +16,7 @@ from pixcal.estimators.detector.frame_lag import (
 )
 from pixcal.estimators.detector.lag_by_level import BANDS, LossFit, in_bands
 from pixcal.estimators.detector.noiseless_charge import missing_noise
+from pixcal.estimators.detector.persistence import LONGEST, Persistence, persistence
 from pixcal.estimators.diagnosis.evidence import MAX_SAMPLES, Evidence, FringeEvidence, central_crop
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import sigmas_of_best
@@ -26,6 +28,7 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 TAIL = 1e-3  # truncated tail of the release, added to the last frame; share of the charge left
+MOST_BACK = 60  # frames from which charge is released over seconds
 _TELL_LAMP = 3  # fewest flats per level to distinguish a warming lamp from lag
 
 
@@ -48,7 +51,7 @@ class Lag(Effect):
     absorbed_because = (
         "the fit absorbs a uniform lag; its variation moves phases by hundredths of the bound"
     )
-    optional_parameters = ("decay_frames", "spread", "quiet", "carried")
+    optional_parameters = ("decay_frames", "spread", "quiet", "carried", "decay_s")
     frames_needed = ("random",)
     remedy = (
         "fix on the bench: flush the sensor, or discard the first frame after a change of light"
@@ -68,7 +71,7 @@ class Lag(Effect):
         0.0,
         unit="frames",
         low=0,
-        high=MAX_DECAY,
+        high=LONGEST,
         doc="frames in which the release falls by a factor e; 0: all in the next frame",
     )
     spread: float = quantity(
@@ -110,6 +113,14 @@ class Lag(Effect):
         doc="part of the charge left by the last frame before a recording that "
         "is still there when it begins; 0: the detector is cleared",
     )
+    decay_s: float = quantity(
+        0.0,
+        unit="s",
+        low=0,
+        high=1e6,
+        doc="time in which the release falls by a factor e, in place of decay_frames and later; "
+        "0: the release follows the number of frames",
+    )
 
     @property
     def releases(self) -> F64:
@@ -125,7 +136,7 @@ class Lag(Effect):
 
     @property
     def frames_back(self) -> int:
-        return len(self.releases)
+        return MOST_BACK if self.decay_s else len(self.releases)
 
     @property
     def _keep(self) -> float:
@@ -136,13 +147,33 @@ class Lag(Effect):
         if self.capacity_e:
             return self._with_traps(charge, shot)
         found = charge - self._left_behind(charge, shot, shot.frame)
-        for back, release in enumerate(self.releases, start=1):
+        drawn = np.zeros_like(charge)
+        for back, release in enumerate(self._released(shot), start=1):
             before = self._charge_before(shot, back)
             if before is None:
                 break
             stayed = self._left_behind(before, shot, shot.frame - back, 1 - self.quiet)
             found += np.float32(release) * stayed
+            drawn += np.float32(release * (1 - release)) * stayed
+        if shot.bench.shot_noise and self.quiet < 1 and drawn.any():
+            # Each electron is released in a frame by chance.
+            normals = shot.normals(f"{self.name} release")
+            found += np.sqrt(np.float32(1 - self.quiet) * np.maximum(drawn, 0)) * normals
         return found
+
+    def _released(self, shot: Shot) -> Iterator[float]:
+        """Shares of the charge left by the frames before, from the last one on, in this frame."""
+        if not self.decay_s:
+            yield from self.releases
+            return
+        begin, end = shot.start_of(shot.frame), shot.start_of(shot.frame + 1)
+        for back in range(1, MOST_BACK + 1):
+            # Charge is left behind when a frame is read, just before the next one starts.
+            left_at = shot.start_of(shot.frame - back + 1)
+            held = np.exp(-(begin - left_at) / self.decay_s)
+            if held < TAIL:
+                return
+            yield float(held - np.exp(-(end - left_at) / self.decay_s))
 
     def _charge_before(self, shot: Shot, back: int) -> F32 | None:
         """Charge of an earlier frame, if carried over; None if there is none."""
@@ -224,6 +255,8 @@ class Lag(Effect):
         fringes the first frame of each flat tells.
         """
         if not evidence.fringes:
+            if (slow := persistence(evidence)) is not None:
+                return cls._of_persistence(slow)
             found = lag_of_flats(evidence)
             if found is None:
                 return None
@@ -273,6 +306,21 @@ class Lag(Effect):
             sigmas_of_best(common.sigmas, uneven.sigmas),
             "the contrast falls with the phase step from the previous frame"
             + (", unevenly from pixel to pixel" if unalike else ""),
+        )
+
+    @classmethod
+    def _of_persistence(cls, found: Persistence) -> Estimate:
+        share = float(np.clip(found.share, 0, 0.5))
+        lag = cls(share, 0.0 if found.in_seconds else found.decay, 0.0, carried=1.0)
+        lag = replace(lag, decay_s=found.decay) if found.in_seconds else lag
+        return Estimate(
+            lag,
+            {
+                "share": found.share_error,
+                "decay_s" if found.in_seconds else "decay_frames": found.decay_error,
+            },
+            found.share / found.share_error,
+            "the level of frames without light falls after light",
         )
 
     @classmethod

@@ -118,10 +118,12 @@ class _Chain:
         return None if before is None else _Chain(self.camera, before)
 
     def of(self, frame: int) -> "tuple[_Chain, int]":
-        """The chain of a frame and its number there, including frames before this recording."""
-        if frame >= 0 or self._before is None:
-            return self, frame
-        return self._before, frame + self._before.recording.count
+        """The chain of a frame and its number there, including frames of earlier recordings."""
+        chain = self
+        while frame < 0 and chain._before is not None:
+            chain = chain._before
+            frame += chain.recording.count
+        return chain, frame
 
     @cached_property
     def states(self) -> FrameStates:

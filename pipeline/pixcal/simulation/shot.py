@@ -39,7 +39,15 @@ class Shot:
     @property
     def time_s(self) -> float:
         """Start of the frame, from the start of the acquisition."""
-        return self.recording.start_s + float(self.recording.times_s[self.frame])
+        return self.start_of(self.frame)
+
+    def start_of(self, frame: int) -> float:
+        """Start of another frame, or of one after the last, s; numbers as in `charge`."""
+        chain, frame = self._chain.of(frame)
+        recording: Recording = chain.recording
+        last = min(frame, recording.count - 1)
+        late = (frame - last) * recording.period_s
+        return recording.start_s + float(recording.times_s[last]) + late
 
     @property
     def states(self) -> FrameStates:
@@ -61,7 +69,7 @@ class Shot:
     def charge(self, frame: int) -> F32 | None:
         """Charge of another frame, without this effect; None outside the recording.
 
-        Frames -1, -2, ... are the last ones of the preceding recording, if known.
+        Frames -1, -2, ... are the last ones of the preceding recordings, if known.
         """
         chain, frame = self._chain.of(frame)
         inside = 0 <= frame < chain.recording.count

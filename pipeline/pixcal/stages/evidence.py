@@ -200,6 +200,11 @@ def _start(ingested: Ingested, name: str) -> float:
     return float(begin[name] - np.min(list(begin.values()))) * DAY_S
 
 
+def frame_days(table: Mapping[str, list[Any]]) -> F64:
+    """Time (t,) of the frames of an array, days; a cube may have the stamp of its first plane."""
+    return np.asarray(begin_mjd(table) + np.array(table["time_s"], float) / DAY_S)
+
+
 def begin_mjd(table: Mapping[str, list[Any]]) -> float:
     """Time stamp of an array's frame 0, days; nan when unknown."""
     stamps = np.array(table["mjd"], float) - np.array(table["time_s"], float) / DAY_S

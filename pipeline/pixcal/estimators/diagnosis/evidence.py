@@ -109,6 +109,8 @@ class FringeEvidence:
         return free_frames(samples, Coding(1.0, 0.0, NO_SAMPLE), start, *pixels)
 
 
+SOON_S = 600.0  # time after light within which traps may still release charge
+
 Level = tuple[float, int]
 
 
@@ -231,6 +233,13 @@ class Evidence:
             for name, f in self.fringes.items()
         }
         return replace(self, fringes=fringes, stacks=())
+
+    def soon_after_light(self, stack: Stack) -> bool:
+        """Whether a series begins so soon after light that traps may still release charge."""
+        flats = [s.start_s + s.time_s for s in self.of_kind("flat")]
+        lit = np.concatenate([*flats, *(f.start_s + f.time_s for f in self.fringes.values()), []])
+        since = stack.start_s + stack.time_s[0] - lit
+        return bool(((since > 0) & (since < SOON_S)).any())
 
     def of_kind(self, kind: str) -> tuple[Stack, ...]:
         """Stacks of a kind, by exposure time."""

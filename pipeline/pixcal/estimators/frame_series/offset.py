@@ -33,7 +33,6 @@ NOISES = np.array([[1, 1, 1, 1], [1, 1, 0, 0], [1, 0, 1, 0]])
 MIN_NOISE = 0.05
 BELOW = 0.3
 _MIN_VARIANCE = 1e-6  # e-², of samples in pixels that are not good
-_SOON_S = 600.0  # time after light within which traps may still release charge
 KNOTS = 32  # most points of a course of fringes
 
 Course = tuple[str, F64, F64]
@@ -194,14 +193,7 @@ def unlit_stacks(evidence: Evidence, *kinds: str) -> list[Stack]:
 
     After light the level may fall for many frames, as in a detector that lags: that is no bias.
     """
-    flats = [s.start_s + s.time_s for s in evidence.of_kind("flat")]
-    times = np.concatenate([*flats, *(f.start_s + f.time_s for f in evidence.fringes.values()), []])
-
-    def soon(stack: Stack) -> bool:
-        since = stack.start_s + stack.time_s[0] - times
-        return bool(((since > 0) & (since < _SOON_S)).any())
-
-    return [s for s in evidence.stacks if s.kind in kinds and not soon(s)]
+    return [s for s in evidence.stacks if s.kind in kinds and not evidence.soon_after_light(s)]
 
 
 def dark_courses(evidence: Evidence) -> list[Course]:

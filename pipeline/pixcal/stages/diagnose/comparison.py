@@ -151,6 +151,13 @@ class Comparison:
         before = compare(self.data, self.nominal.expected)
         return remaining(before, compare(self.data, trial.expected), where).total
 
+    def residual_size(self, trial: Trial, where: set[Key]) -> float:
+        """Residual fraction of the gap in units of the nominal scatter, whatever the bench's own.
+
+        A bench whose simulations scatter widely makes differences less significant, not smaller.
+        """
+        return shrinkage(self.data, self.nominal, trial, where).gap.total
+
     def gap_of(self, *trials: Trial) -> set[Key]:
         """Test statistics that make up the gap for any of these benches."""
         return set().union(*(differing(self.nominal, trial, self.data) for trial in trials))

@@ -17,7 +17,7 @@ from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import plain_bench
 from pixcal.stages.diagnose.nominal import SetTruth
 from pixcal.stages.diagnose.parts import FrameSubset, Table
-from pixcal.stages.evidence import DAY_S, begin_mjd, groups
+from pixcal.stages.evidence import DAY_S, frame_days, groups
 
 _LATE = 0.05  # fraction of a period above which a frame counts as late
 _LIFTED = 8.0  # level without light after the pedestal, in units of the read noise
@@ -135,7 +135,7 @@ def _in_sequence(
     tables: Mapping[str, Table],
 ) -> list[Recording]:
     """Each recording linked to the preceding one, if time stamps identify it."""
-    stamps = [_days(tables[name])[numbers] for name, numbers in places]
+    stamps = [frame_days(tables[name])[numbers] for name, numbers in places]
     found = []
     for recording, own in zip(recordings, stamps, strict=True):
         earlier = [
@@ -148,14 +148,9 @@ def _in_sequence(
     return found
 
 
-def _days(table: Table) -> F64:
-    """Time (t,) of the frames of an array, days; a cube may have the stamp of its first plane."""
-    return np.asarray(begin_mjd(table) + np.array(table["time_s"], float) / DAY_S)
-
-
 def _start(tables: Mapping[str, Table]) -> dict[str, float]:
     """Start of each array after the first frame of the acquisition, s; in order if unknown."""
-    stamps = {name: _days(table) for name, table in tables.items()}
+    stamps = {name: frame_days(table) for name, table in tables.items()}
     if all(np.isfinite(s).all() for s in stamps.values()):
         first = min(float(s.min()) for s in stamps.values())
         return {name: float(s[0] - first) * DAY_S for name, s in stamps.items()}
@@ -176,13 +171,19 @@ def _light(
     """Light (t,) of flats of an exposure time (s; zero: unknown) and a step of the lamp."""
     exposure, step = exposure_and_step
     light = np.full(len(numbers), np.nan)
-    for one, half in zip(evidence, halves, strict=True):
+    # Charge left by light makes the dark signal of one half larger: both use the same.
+    black = [
+        one.gain * one.bias[one.good].mean() + exposure * one.dark_rate[one.good].mean()
+        for one in evidence
+    ]
+    for one, half, own_black in zip(evidence, halves, black, strict=True):
         own = np.flatnonzero(np.isin(numbers, half[name]))
         for stack in one.of_kind("flat"):
             known = np.isfinite(stack.exptime_s)
             same = np.isclose(stack.exptime_s, exposure) if known else exposure == 0
             if same and stack.step == step and len(stack.adu) == len(own):
-                light[own] = light_of(one, stack) / one.flat[one.good].mean()
+                above = light_of(one, stack) + own_black - np.mean(black)
+                light[own] = above / one.flat[one.good].mean()
     return light
 
 

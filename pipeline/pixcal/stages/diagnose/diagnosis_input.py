@@ -12,6 +12,7 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.stages import reduce
+from pixcal.stages.diagnose.dark_series import in_series
 from pixcal.stages.diagnose.frames_used import FramesUsed, frames_of, missing_frames
 from pixcal.stages.diagnose.measure_nominal import nominal_bench
 from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, RunFrames, evidence_of, take
@@ -61,11 +62,12 @@ def prepare_input(
     """
     ingested = Ingested(run_dir / "ingest")
     frames, shape = _run_frames(run_dir, ingested), ingested.shape
+    tables = frames.tables
     fringes = frames.acquisition.frames.fringes
-    first, parts = chosen_windows(shape, 0 if fringes else frames_of_half(ingested.tables))
+    first, parts = chosen_windows(shape, 0 if fringes else frames_of_half(tables))
     pixels = (first[0][1] - first[0][0]) * (first[1][1] - first[1][0])
     saturation = read_json(run_dir / "reduce" / "reduce.json")["saturation_adu"]
-    own = split(ingested.tables, pixels, saturation.get("full_frames", ()))
+    own = split(tables, pixels, saturation.get("full_frames", ()))
     _enough(own.test)
     runtime, few, room = _memory(own.test, pixels, runtime)
     windows: list[Window] = []
@@ -107,7 +109,7 @@ def _run_frames(run_dir: Path, ingested: Ingested) -> RunFrames:
     gain, subtracted = found["gain_e_per_adu"], float(found.get("subtracted_dark_e_s") or 0.0)
     return RunFrames(
         _acquisition(run_dir, ingested),
-        ingested.tables,
+        in_series(ingested.tables),
         {name: array.dtype for name, array in ingested.arrays.items()},
         _reduction(run_dir),
         Black(ingested.cut_off, gain.get("without_dark"), subtracted / float(gain["used"])),

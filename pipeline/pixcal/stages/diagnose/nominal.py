@@ -136,26 +136,25 @@ class NominalBench:
         )
         added = sum(effect.read_variance(self.bench.detector) for effect in effects)
         measured = self._electronics(measured, (seed, own_seed), change, added)
-        camera = Camera(bench, rows, [measured, *effects], maps=measured.maps)
         arrays = {
             name: np.empty((len(frames), *bench.detector.shape), self.frames.dtypes[name])
             for name, frames in half.items()
         }
         levels = measured.lamp.levels(self.recordings, undone)
-        taken = {
-            r.key: replace(
+        taken: dict[tuple[int, int], Recording] = {}
+        for r in sorted(self.recordings, key=lambda r: r.start_s):
+            taken[r.key] = replace(
                 r,
                 bench=bench,
                 window=window,
-                before=None,
+                before=None if r.before is None else taken.get(r.before.key),
                 electrons=levels.get(r.number, r.electrons) if r.kind == "flat" else r.electrons,
             )
-            for r in self.recordings
-        }
+        measured = _without_late_charge(measured, effects, bench, list(taken.values()))
+        camera = Camera(bench, rows, [measured, *effects], maps=measured.maps)
         for recording, (name, numbers) in zip(self.recordings, self.places, strict=True):
             wanted = np.flatnonzero(np.isin(numbers, half[name]))
-            before = None if recording.before is None else taken[recording.before.key]
-            own = replace(taken[recording.key], before=before)
+            own = taken[recording.key]
             top = detector.top_adu
             for frame, samples in camera.expose(own, wanted.tolist()):
                 at = int(np.searchsorted(half[name], numbers[frame]))
@@ -255,6 +254,28 @@ class NominalBench:
             for own, fit in zip(self.measured.sets, fits, strict=True)
         )
         return replace(self.measured, maps=maps, sets=sets)
+
+
+def _without_late_charge(
+    measured: Measured, effects: Sequence[Effect], bench: Bench, recordings: Sequence[Recording]
+) -> Measured:
+    """As measured, without the mean dark signal that effects add from frames before the darks."""
+    dark = [r for r in recordings if r.kind == "dark" and r.before is not None and r.exptime_s > 0]
+    if not dark or not any(effect.frames_back for effect in effects):
+        return measured
+    rows, total, seconds = (0, bench.detector.shape[0]), 0.0, 0.0
+    with_effects, without = (
+        Camera(bench, rows, [measured, *acting], maps=measured.maps, noise=False)
+        for acting in (effects, ())
+    )
+    for recording in dark:
+        frames = list(range(recording.count))
+        late, plain = (camera.analogue(recording, frames) for camera in (with_effects, without))
+        total += sum(float((a - b).mean()) for a, b in zip(late, plain, strict=True))
+        seconds += recording.count * recording.exptime_s
+    electrons = total / float(measured.maps.adu_per_e.mean())
+    rate = measured.maps.dark_rate - np.float32(electrons / seconds)
+    return replace(measured, maps=replace(measured.maps, dark_rate=np.maximum(rate, 0)))
 
 
 def uncoupled(dark: Dark, rng: np.random.Generator) -> Dark:

@@ -102,7 +102,7 @@ def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = 
 
     A long fringe set contributes `SAMPLES` to each half; without fringes, all frames together do.
     Flats with full pixels are left out unless all have them. Without fringes, the first flat of an
-    exposure time is in both halves: of flats recorded level by level it alone shows lag.
+    exposure time and the first dark after light are in both halves: they show lag most.
     """
     learn, test = {}, {}
     every = {name: _groups(name, table, full_flats) for name, table in tables.items()}
@@ -112,12 +112,14 @@ def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = 
         most = min(most, MOST_FRAMES)
     else:
         most = _equal_share([len(own) for of_name in every.values() for own in of_name], most)
+    after_light = {n: table["after_light"] for n, table in tables.items() if "after_light" in table}
     for name, of_name in every.items():
         fitted, held_out = [], []
         for own in of_name:
             one, other = _halves(own, most)
             fitted.append(one)
-            held_out.append(other if fringes or name != "flat" else np.union1d(other, own[:1]))
+            lags = name == "flat" or (name in after_light and after_light[name][own[0]])
+            held_out.append(np.union1d(other, own[:1]) if lags and not fringes else other)
         learn[name] = np.sort(np.concatenate(fitted))
         test[name] = np.sort(np.concatenate(held_out))
     short = (name for name, of_name in every.items() if min(map(len, of_name)) < FEWEST)

@@ -1,0 +1,169 @@
+"""Charge of earlier frames in frames without light that follow light: how much, how long."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.kernels.sample_sums import frame_means
+from pixcal.model.arrays import F64, Indices
+
+_SURE = 5.0  # standard errors of the share
+_PARAMETERS = 2  # share and decay
+LONGEST = 15.0  # longest decay, in frames or median periods
+_SHORTEST = 0.1
+_OF_MODEL = 2e-3  # least relative error: frames between series are not all known
+_ROUNDS = 3  # of the fit, each with the light that the last one gives
+_STEP = 0.01  # relative, for derivatives by the decay
+_REACH = 30  # most frames of one series whose samples are in the other half of the frames
+
+
+@dataclass(frozen=True)
+class Persistence:
+    """Exponential release of a share of the charge of each frame."""
+
+    share: float
+    share_error: float
+    decay: float  # in which the release falls by a factor e, s or frames
+    decay_error: float
+    in_seconds: bool
+
+
+@dataclass(frozen=True)
+class _Sequence:
+    """All frames without gaps, in order of time."""
+
+    charge: F64  # (t,) mean that light and dark signal give, e-
+    passed: F64  # (t,) from the start of the frame to that of the next one, s
+    places: tuple[tuple[Stack, Indices, F64], ...]  # measured frames of each series, and means, e-
+
+    def released(self, decay: float, in_seconds: bool) -> F64:
+        """Charge (t,) that comes out in each frame, for a share of one."""
+        spans = self.passed / decay if in_seconds else np.full(len(self.passed), 1 / decay)
+        found, held = np.empty(len(spans)), 0.0
+        for n, kept in enumerate(np.exp(-spans)):
+            found[n] = (1 - kept) * held
+            held = kept * held + self.charge[n]
+        return found
+
+    def of_light(self, lag: Persistence) -> "_Sequence":
+        """Without what the frames lose and gain; the light of a series is steady."""
+        released = self.released(lag.decay, lag.in_seconds)
+        charge = self.charge.copy()
+        ends = [*(int(at[0]) for _, at, _ in self.places[1:]), len(charge)]
+        for (_, at, means), end in zip(self.places, ends, strict=True):
+            light = float((means - lag.share * released[at]).mean()) / (1 - lag.share)
+            charge[at[0] : end] = max(light, 0.0)
+        return replace(self, charge=charge)
+
+
+def persistence(evidence: Evidence) -> Persistence | None:
+    """Fit of the level of frames without light soon after light; None without significant one.
+
+    Whether it decays over time or over frames is decided by the flats.
+    """
+    sequence = _sequence(evidence)
+    if sequence is None:
+        return None
+    lit = [(at, m, 1 / m.mean()) for s, at, m in sequence.places if s.kind == "flat" and m.all()]
+    dark = [
+        (at, means, 1.0)
+        for stack, at, means in sequence.places
+        if stack.kind != "flat" and evidence.soon_after_light(stack)
+    ]
+    freedom = sum(len(at) - 1 for at, _, _ in dark) - _PARAMETERS
+    if freedom < 1:
+        return None
+    least = evidence.read_noise**2 / evidence.good.sum()
+    found = [_fit(sequence, dark, mode, freedom, least) for mode in (False, True)]
+    left = np.array([[_misfit(sequence, of, one) for of in (dark, lit)] for one in found])
+    scale = np.maximum(left.min(axis=0), [freedom * least, 1e-12])
+    count = np.array([freedom, sum(len(at) - 1 for at, _, _ in lit)])
+    best = found[int(np.argmin((left / scale) @ count))]
+    for _ in range(_ROUNDS):
+        best = _fit(sequence.of_light(best), dark, best.in_seconds, freedom, least)
+    return best if best.share > _SURE * best.share_error else None
+
+
+Series = Sequence[tuple[Indices, F64, float]]
+
+
+def _sequence(evidence: Evidence) -> _Sequence | None:
+    """Frames in order of time, those of the other half at the level of their series.
+
+    None where time stamps are unknown, or series alternate.
+    """
+    stacks = sorted(evidence.stacks, key=lambda s: s.start_s + s.time_s[0])
+    begin = [float(s.start_s + s.time_s[0]) for s in stacks]
+    end = [float(s.start_s + s.time_s[-1]) for s in stacks]
+    if not stacks or not np.isfinite([*begin, *end]).all():
+        return None
+    if any(last >= first for last, first in zip(end, begin[1:], strict=False)):
+        return None
+    times: list[float] = []
+    charge: list[float] = []
+    places = []
+    for stack, following in zip(stacks, [*begin[1:], np.inf], strict=True):
+        number = stack.frame - stack.frame[0]
+        start = stack.start_s + stack.time_s
+        span = (start[-1] - start[0]) / number[-1] if number[-1] else stack.exptime_s
+        span = float(span) if np.isfinite(span) and span > 0 else 1.0
+        last = int(number[-1])
+        if np.isfinite(following):
+            last += min(max(int((following - start[-1]) / span - 0.5), 0), _REACH)
+        own = np.arange(last + 1)
+        means = frame_means(stack.adu, evidence.good) - evidence.bias[evidence.good].mean()
+        means = means * evidence.gain
+        places.append((stack, len(times) + number, means))
+        known = np.interp(own, number, start) + span * np.maximum(own - number[-1], 0)
+        times += known.tolist()
+        charge += [max(float(means.mean()), 0.0)] * len(own)
+    passed = np.append(np.diff(times), span)
+    return _Sequence(np.array(charge), passed, tuple(places))
+
+
+def _fit(
+    sequence: _Sequence, series: Series, in_seconds: bool, freedom: int, least: float
+) -> Persistence:
+    """Share and decay of least squares; ``least``: smallest variance of a frame's mean, e-²."""
+
+    def share(decay: float) -> tuple[float, float, F64]:
+        model, levels = _centred(sequence.released(decay, in_seconds), series)
+        square = float(model @ model)
+        size = float(model @ levels) / square if square > 0 else 0.0
+        rest = levels - size * model
+        return size, float(rest @ rest), model
+
+    unit = float(np.median(sequence.passed)) if in_seconds else 1.0
+    if in_seconds:
+        unit = float(np.median([p for at, _, _ in series for p in sequence.passed[at]]))
+    bounds = tuple(float(np.log(unit * d)) for d in (_SHORTEST, LONGEST))
+    found = minimize_scalar(lambda x: share(float(np.exp(x)))[1], bounds=bounds, method="bounded")
+    decay = float(np.exp(found.x))
+    size, left, model = share(decay)
+    turned = (share(decay * (1 + _STEP))[2] - model) * size / (_STEP * decay)
+    design = np.stack([model, turned], axis=1)
+    variance = max(left / freedom, least)
+    errors = np.sqrt(variance * np.diag(np.linalg.pinv(design.T @ design)))
+    errors = np.hypot(errors, _OF_MODEL * np.array([size, decay]))
+    return Persistence(size, float(errors[0]), decay, float(errors[1]), in_seconds)
+
+
+def _misfit(sequence: _Sequence, series: Series, found: Persistence) -> float:
+    """Sum of squares that a persistence leaves of the levels about their means."""
+    if not series:
+        return 0.0
+    model, levels = _centred(sequence.released(found.decay, found.in_seconds), series)
+    return float(((levels - found.share * model) ** 2).sum())
+
+
+def _centred(model: F64, series: Series) -> tuple[F64, F64]:
+    """Model and levels of all series about their means, scaled."""
+    pairs = [
+        ((model[at] - model[at].mean()) * scale, (levels - levels.mean()) * scale)
+        for at, levels, scale in series
+    ]
+    first, other = zip(*pairs, strict=True)
+    return np.concatenate(first), np.concatenate(other)

@@ -1,0 +1,121 @@
+"""Charge that comes out of traps in frames without light: found again, and simulated so."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from all_frames import frames_of
+
+from pixcal.effects.lag import Lag
+from pixcal.estimators.detector.persistence import persistence
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.model.bench import Bench
+from pixcal.simulation.recording import recordings
+from pixcal.stages.diagnose.dark_series import in_series
+
+BIAS, READ_NOISE, SHAPE = 300.0, 6.0, (37, 41)
+DEAD_S = 1.5  # between frames
+
+
+def recorded(share: float, kept: Callable[[float], float], seed: int = 3) -> Evidence:
+    """Bias, flats and darks of a camera whose traps hold whole electrons.
+
+    ``kept``: part of the held charge that stays after a time, s.
+    """
+    rng = np.random.default_rng(seed)
+    held, clock, stacks = np.zeros(SHAPE, int), 0.0, []
+    series = [("bias", 0.0, 0.0, 8), *(("flat", t, 4000 * t, 6) for t in (0.5, 2.0, 6.0))]
+    for kind, seconds, light, count in [*series, ("dark", 10.0, 0.0, 12)]:
+        frames, times = [], []
+        for _ in range(count):
+            charge = rng.poisson(light, SHAPE)
+            released = rng.binomial(held, 1 - kept(seconds + DEAD_S))
+            taken = rng.binomial(charge, share)
+            held += taken - released
+            frames.append(BIAS + charge - taken + released + rng.normal(0, READ_NOISE, SHAPE))
+            times.append(clock)
+            clock += seconds + DEAD_S
+        time = np.array(times)
+        start, number = time[0], np.arange(count)
+        stacks.append(Stack(kind, seconds, number, time - start, np.array(frames), start))
+    maps = {"bias": np.full(SHAPE, BIAS), "dark_rate": np.zeros(SHAPE), "flat": np.ones(SHAPE)}
+    noise, good = (READ_NOISE, READ_NOISE), np.ones(SHAPE, np.bool_)
+    rest = {"saturation_adu": 65535, "pitch_um": 5.0, "wavelength_nm": 600.0, "distance_mm": 400.0}
+    return Evidence({}, tuple(stacks), 1.0, *noise, **maps, good=good, **rest)
+
+
+@pytest.mark.parametrize(
+    ("decay", "in_seconds"), [(0.8, False), (3.0, False), (15.0, True), (50.0, True)]
+)
+def test_traps_are_found_again_by_frames_or_by_time(decay: float, in_seconds: bool) -> None:
+    evidence = recorded(0.01, lambda t: float(np.exp(-(t if in_seconds else 1) / decay)))
+    found = persistence(evidence)
+    assert found is not None
+    assert found.in_seconds == in_seconds
+    assert abs(found.share - 0.01) < 4 * found.share_error < 1e-3
+    assert abs(found.decay - decay) < 4 * found.decay_error < 0.4 * decay
+    estimate = Lag.estimate(evidence)
+    assert estimate is not None
+    assert isinstance(estimate.effect, Lag)
+    assert (estimate.effect.decay_s > 0) == in_seconds
+    assert estimate.significance > 20
+
+
+def test_a_camera_without_traps_has_none() -> None:
+    assert persistence(recorded(0.0, lambda _: 0.0)) is None
+
+
+def test_darks_after_flats_hold_what_came_out_by_then_with_its_shot_noise(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    """Levels by the sum over all earlier frames; the variance is that of single electrons."""
+    changes = {
+        "detector.shape": [61, 64],
+        "detector.dark_e_s": 0.0,
+        "detector.read_noise_e": 0.0,
+        "detector.prnu_rms": 0.0,
+        "frames.flats": [{"exptime_s": 0.05, "count": 3}, {"exptime_s": 0.1, "count": 5}],
+    }
+    bench, lag = make_effect_bench(changes), Lag(0.05, spread=0.0, carried=1.0, decay_s=0.4)
+    first, second = (r for r in recordings(bench) if r.kind == "flat")
+    dark = next(r for r in recordings(bench) if r.kind == "dark")
+    start = second.start_s + second.count * second.period_s
+    second = replace(second, before=first)
+    dark = replace(dark, before=second, start_s=start, count=4)
+    adu = frames_of(bench, dark, [lag]).astype(float) - frames_of(bench, dark).astype(float)
+    made = adu * bench.detector.gain_e_per_adu
+    begins = [
+        (r.start_s + (n + 1) * r.period_s, r.electrons)
+        for r in (first, second)
+        for n in range(r.count)
+    ]
+    for n, frame in enumerate(made):
+        at = start + n * dark.period_s
+        held = sum(q * 0.05 * np.exp(-(at - t) / 0.4) for t, q in begins)
+        expected = held * (1 - np.exp(-dark.period_s / 0.4))
+        few = 5 * np.sqrt(expected / frame.size)
+        assert frame.mean() == pytest.approx(expected, abs=few + 0.003 * expected)
+        assert frame.var() == pytest.approx(expected, rel=0.2)
+
+
+def table(*days: float, seconds: float = 1.0) -> dict[str, list[float]]:
+    time = [86400 * (day - days[0]) for day in days]
+    return {"exptime_s": [seconds] * len(days), "mjd": list(days), "time_s": time}
+
+
+def test_light_divides_darks_that_follow_it_at_once() -> None:
+    minute = 1 / 1440
+    before, after = [n * minute for n in range(5)], [(20 + n) * minute for n in range(4)]
+    late = [(400 + n) * minute for n in range(4)]
+    flats = table(*((10 + n) * minute for n in range(8)), seconds=3.0)
+    found = in_series({"dark": table(*before, *after, *late), "flat": flats})
+    assert found["dark"]["step"] == [0] * 5 + [1] * 8
+    assert found["dark"]["after_light"] == [False] * 5 + [True] * 8
+    assert "step" not in found["flat"]
+    # Hours later, or with too few frames for a series of their own, they are not divided.
+    assert in_series({"dark": table(*before, *late), "flat": flats})["dark"]["step"] == [0] * 9
+    few = in_series({"dark": table(*before, *after[:3]), "flat": flats})["dark"]
+    assert few["step"] == [0] * 8
+    assert few["after_light"] == [False] * 8
+    assert in_series({"dark": table(*before)}) == {"dark": table(*before)}
