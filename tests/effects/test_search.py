@@ -14,7 +14,7 @@ from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
 from pixcal.stages.diagnose.comparison import Comparison, differing, gap_interval, shrinkage
-from pixcal.stages.diagnose.rejection import doubtful
+from pixcal.stages.diagnose.rejection import doubtful, unhelpful
 from pixcal.stages.diagnose.search import (
     CONFIRM_SIMULATIONS,
     MAX_CAUSES,
@@ -416,6 +416,23 @@ def test_two_causes_that_only_make_good_for_each_other_are_not_claimed(
     monkeypatch.setattr(comparison, "residual", lambda trial, _: left[trial.log_likelihood])
     named = {name: replace(candidate(name, 1.0), alone=single) for name in ("left", "right")}
     rejected = doubtful(comparison, both, dict.fromkeys(named, without), named)
+    assert (rejected is None) == claimed
+
+
+@pytest.mark.parametrize(
+    ("with_both", "without", "alone", "claimed"),
+    [(1.1, 1.0, 0.5, False), (0.5, 0.7, 1.0, False), (0.5, 0.7, 0.8, True), (0.1, 0.7, 1.0, True)],
+)
+def test_a_cause_with_which_differences_are_no_smaller_is_not_claimed(
+    monkeypatch: pytest.MonkeyPatch, with_both: float, without: float, alone: float, claimed: bool
+) -> None:
+    """They may be less significant, as simulations with it scatter more."""
+    comparison = Comparison(REFERENCE, REFERENCE.on_scale(curves((), 500)))
+    both, fewer, single = (replace(comparison.nominal, log_likelihood=n) for n in (2.0, 1.0, 0.0))
+    size = {2.0: with_both, 1.0: without, 0.0: alone}
+    monkeypatch.setattr(comparison, "residual_size", lambda t, _: size[t.log_likelihood])
+    named = {name: replace(candidate(name, 1.0), alone=single) for name in ("left", "right")}
+    rejected = unhelpful(comparison, both, dict.fromkeys(named, fewer), named)
     assert (rejected is None) == claimed
 
 

@@ -8,7 +8,15 @@ from pixcal.effects import effects
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.simulation.effect import Effect
-from pixcal.stages.diagnose.frames_used import MORE, RANDOM, missing_frames, recommend_frames
+from pixcal.simulation.forward import DOMAINS
+from pixcal.stages.diagnose.frames_used import (
+    CLOSER_LOOK,
+    MORE,
+    RANDOM,
+    missing_frames,
+    recommend_closer_look,
+    recommend_frames,
+)
 
 LADDER = (0.01, 0.02, 0.03)
 FOUR = ((6.0, 0.0), (-9.0, 0.1), (0.0, 6.0), (0.0, 9.0))
@@ -135,3 +143,9 @@ def test_effects_name_kinds_of_frames_that_there_are() -> None:
     known = {kind for lacking in bare for kind in lacking}
     for kind in (*effects().values(), Effect):
         assert set(kind.frames_needed) <= known
+
+
+def test_an_unexplained_difference_is_looked_at_more_closely_in_its_domain() -> None:
+    assert set(CLOSER_LOOK) == set(DOMAINS)
+    assert recommend_closer_look({}, "time") == [CLOSER_LOOK["time"]]
+    assert recommend_closer_look({"dark": "dark frames"}, "time") == ["dark frames"]

@@ -152,10 +152,7 @@ class Comparison:
         return remaining(before, compare(self.data, trial.expected), where).total
 
     def residual_size(self, trial: Trial, where: set[Key]) -> float:
-        """Residual fraction of the gap in units of the nominal scatter, whatever the bench's own.
-
-        A bench whose simulations scatter widely makes differences less significant, not smaller.
-        """
+        """The same by effect sizes, as in the reported gap, instead of significances."""
         return shrinkage(self.data, self.nominal, trial, where).gap.total
 
     def gap_of(self, *trials: Trial) -> set[Key]:

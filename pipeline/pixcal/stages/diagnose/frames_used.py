@@ -19,6 +19,15 @@ LADDER = 3  # exposure times of flats for a linearity curve
 # with equal phase steps, light of neighbouring frames cannot be detected
 RANDOM = "fringes with random phases"
 MORE = "more frames of the same kind"
+# frames that show more of an unexplained difference, by its domain
+CLOSER_LOOK = {
+    "space": "flats with the detector turned or shifted, which separate its patterns from the "
+    "light's",
+    "time": "a long series of frames of one kind under steady conditions, with DATE-OBS and "
+    "CCD-TEMP in the headers",
+    "intensity": "flats of ten levels up to saturation, in rising and in falling order",
+    "noise": "fifty bias frames and fifty flats of one level",
+}
 FRINGES = "fringes"  # for effects that other frames do not show
 
 
@@ -86,6 +95,12 @@ def recommend_frames(
         if frames := [words for name, words in missing.items() if name in wanted]:
             return frames
     return [MORE]
+
+
+def recommend_closer_look(missing: Mapping[str, str], domain: str) -> list[str]:
+    """Frames for an unexplained difference: those that are missing, or more in its domain."""
+    frames = recommend_frames(missing)
+    return frames if frames != [MORE] else [CLOSER_LOOK[domain]]
 
 
 def _axes(baselines: Iterable[Sequence[float]]) -> list[tuple[str, set[float]]]:

@@ -104,6 +104,34 @@ def all_close_little(
     return closed if little and sum(closed.values()) < MIN_JOINT_GAP_CLOSED else {}
 
 
+def unhelpful(
+    comparison: Comparison,
+    current: Trial,
+    without: Mapping[str, Trial],
+    candidates: Mapping[str, Candidate],
+) -> Rejection | None:
+    """A cause with which the differences are no smaller, beside the others or, if unknown, alone.
+
+    Where an unknown cause is left, causes that close nothing alone only compensate others.
+    """
+    where = comparison.gap_of(current)
+    left = comparison.residual_size(current, where)
+    gains = {n: comparison.residual_size(trial, where) - left for n, trial in without.items()}
+    least = min(gains, key=lambda n: gains[n], default=None)
+    if least is not None and gains[least] > 0 and left > MAX_RESIDUAL_GAP:
+        alone = {n: candidates[n].alone for n in gains}
+        closed = {
+            n: 1 - comparison.residual_size(trial, where)
+            for n, trial in alone.items()
+            if trial is not None
+        }
+        gains = {n: one for n, one in closed.items() if one <= 0}
+        least = min(gains, key=lambda n: gains[n], default=None)
+    if least is None or gains[least] > 0:
+        return None
+    return least, "the differences are no smaller with it; it may be a proxy for an unknown cause"
+
+
 def doubtful(
     comparison: Comparison,
     current: Trial,
@@ -117,8 +145,6 @@ def doubtful(
     """
     where = comparison.gap_of(current)
     open_still = comparison.residual(current, where)
-    if (useless := _useless(comparison, current, without, candidates)) is not None:
-        return useless
     closed = {n: comparison.residual(trial, where) - open_still for n, trial in without.items()}
     imitated = {
         name
@@ -159,34 +185,6 @@ def doubtful(
         f"closes only {_weighted(closed[least])}, and {why}; it may only describe how the other "
         "causes deviate from their laws",
     )
-
-
-def _useless(
-    comparison: Comparison,
-    current: Trial,
-    without: Mapping[str, Trial],
-    candidates: Mapping[str, Candidate],
-) -> Rejection | None:
-    """A cause with which the differences are no smaller, beside the others or, if unknown, alone.
-
-    Where an unknown cause is left, causes that close nothing alone only compensate others.
-    """
-    where = comparison.gap_of(current)
-    left = comparison.residual_size(current, where)
-    gains = {n: comparison.residual_size(trial, where) - left for n, trial in without.items()}
-    least = min(gains, key=lambda n: gains[n], default=None)
-    if least is not None and gains[least] > 0 and left > MAX_RESIDUAL_GAP:
-        alone = {n: candidates[n].alone for n in gains}
-        closed = {
-            n: 1 - comparison.residual_size(trial, where)
-            for n, trial in alone.items()
-            if trial is not None
-        }
-        gains = {n: one for n, one in closed.items() if one <= 0}
-        least = min(gains, key=lambda n: gains[n], default=None)
-    if least is None or gains[least] > 0:
-        return None
-    return least, "the differences are no smaller with it; it may be a proxy for an unknown cause"
 
 
 @dataclass(frozen=True)

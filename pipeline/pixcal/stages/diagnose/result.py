@@ -25,7 +25,12 @@ from pixcal.report.diagnosis_words import place
 from pixcal.simulation.effect import DOMAINS
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
 from pixcal.stages.diagnose.comparison import Shrinkage, Trial, differing, gap_interval, shrinkage
-from pixcal.stages.diagnose.frames_used import FRINGES, FramesUsed, recommend_frames
+from pixcal.stages.diagnose.frames_used import (
+    FRINGES,
+    FramesUsed,
+    recommend_closer_look,
+    recommend_frames,
+)
 from pixcal.stages.diagnose.thresholds import EXPLAINED, MAX_RESIDUAL_SHARE, MAX_RESIDUAL_SIGMA
 
 Json = dict[str, Any]
@@ -110,6 +115,7 @@ class _Description:
         """Contents of ``diagnosis.json``."""
         found, final, verdict = self.found, self.final, self._verdict()
         causes = [self._cause(name) for name in found.accepted]
+        where = self._where()
         return {
             "schema": SCHEMA,
             "pixcal": __version__,
@@ -120,18 +126,14 @@ class _Description:
                 "after": rounded(final.gap.total),
                 "interval": [rounded(v) for v in gap_interval(self.data, final, found.final)],
                 "domains": {d: [rounded(v) for v in final.gap.of_domain(d)] for d in DOMAINS},
-                "where": self._where(),
+                "where": where,
                 "absolute": self._absolute(),
                 "places": list(places),
             },
             "candidates": [self._candidate(c) for c in found.candidates.values()],
             "not_tested": self._not_tested(),
             "not_compared": not_compared(self.measured, self.data),
-            "more_would_tell": (
-                recommend_frames(self.facts.missing_frames)
-                if verdict in ("unexplained", "partly explained")
-                else []
-            ),
+            "more_would_tell": self._more_would_tell(where, verdict),
             "statistics": len(final.before),
             "looked_at": to_plain(self.facts),
         }
@@ -201,6 +203,13 @@ class _Description:
             "not_told_apart_from": list(alike),
             "would_decide": recommend_frames(self.facts.missing_frames, kinds) if alike else [],
         }
+
+    def _more_would_tell(self, where: Sequence[Json], verdict: str) -> list[str]:
+        """Frames to record where a gap remains."""
+        if verdict not in ("unexplained", "partly explained") or not where:
+            return []
+        largest = max(where, key=lambda entry: abs(entry["z_after"]))
+        return recommend_closer_look(self.facts.missing_frames, largest["domain"])
 
     def _not_tested(self) -> Json:
         """Effects that these frames cannot show, by the frames that could."""

@@ -34,6 +34,7 @@ from pixcal.stages.diagnose.rejection import (
     possible_proxy,
     redundant,
     similar_to,
+    unhelpful,
 )
 from pixcal.stages.diagnose.thresholds import (
     MIN_JOINT_GAP_CLOSED,
@@ -399,10 +400,13 @@ class Search:
     def _prune_causes(self) -> SearchResult:
         """Leave each cause out in turn, and reject redundant and doubtful ones."""
         candidates, effects, current = self._candidates, self._causes.effects, self._causes.current
+        self._weigh_alone(effects)
         while True:
             without = self._each_left_out(effects)
-            rejected = redundant(self.comparison, current, without) or doubtful(
-                self.comparison, current, without, candidates
+            rejected = (
+                redundant(self.comparison, current, without)
+                or unhelpful(self.comparison, current, without, candidates)
+                or doubtful(self.comparison, current, without, candidates)
             )
             if rejected is None:
                 break
@@ -418,11 +422,7 @@ class Search:
             _reject(name, explained_by_other_law(by), effects, candidates)
             effects |= {one: e for one in effects for e in current.effects if e.name == one}
             without = self._each_left_out(effects)
-        for name, effect in effects.items():
-            # As many simulations as for all causes: three show random effects poorly.
-            alone = self._confirmed((effect,))
-            if not isinstance(alone, str):
-                candidates[name].alone = alone
+        self._weigh_alone(effects)
         alike = self._causes.alike
         alike = {n: tuple(a for a in alike[n] if a not in effects) for n in effects}
         return SearchResult(
@@ -434,6 +434,13 @@ class Search:
             {name: others for name, others in alike.items() if others},
             self._by_laws(effects),
         )
+
+    def _weigh_alone(self, effects: Mapping[str, Effect]) -> None:
+        """Simulate each cause alone as often as all causes: few show random effects poorly."""
+        for name, effect in effects.items():
+            alone = self._confirmed((effect,))
+            if not isinstance(alone, str):
+                self._candidates[name].alone = alone
 
     def _replaceable_by_replay(
         self, effects: Mapping[str, Effect], current: Trial

@@ -113,7 +113,8 @@ def _declared_gain_warnings(fit: GainFit, summary: Summary, used: float) -> list
             else ""
         )
         + (
-            "correct it, or use '--gain measured'; the declared value is used now"
+            "correct it or use '--gain measured', unless the diagnosis names an effect that "
+            "changes it; the declared value is used now"
             if used == declared
             else "the measured value is used"
         )
