@@ -171,19 +171,23 @@ def _light(
     """Light (t,) of flats of an exposure time (s; zero: unknown) and a step of the lamp."""
     exposure, step = exposure_and_step
     light = np.full(len(numbers), np.nan)
-    # Charge left by light makes the dark signal of one half larger: both use the same.
+    # Both halves use the same dark signal, which charge left by light makes larger in one of them,
+    # and flats of the same mean, since the medians of colours jump.
     black = [
         one.gain * one.bias[one.good].mean() + exposure * one.dark_rate[one.good].mean()
         for one in evidence
     ]
-    for one, half, own_black in zip(evidence, halves, black, strict=True):
+    good = np.all([one.good for one in evidence], axis=0)
+    usual = [one.flat[good].mean() for one in evidence]
+    for one, half, own_black, own_usual in zip(evidence, halves, black, usual, strict=True):
         own = np.flatnonzero(np.isin(numbers, half[name]))
         for stack in one.of_kind("flat"):
             known = np.isfinite(stack.exptime_s)
             same = np.isclose(stack.exptime_s, exposure) if known else exposure == 0
             if same and stack.step == step and len(stack.adu) == len(own):
                 above = light_of(one, stack) + own_black - np.mean(black)
-                light[own] = above / one.flat[one.good].mean()
+                relative = one.flat[one.good].mean() / own_usual
+                light[own] = above / (relative * np.mean(usual))
     return light
 
 

@@ -34,16 +34,20 @@ class FlatLight:
     # by the number of a recording, the light (t,) of each frame over the mean; NaN for frames that
     # are drawn: the first, which may lack what stayed behind, and those not looked at
     frames: Mapping[int, F64] = field(default_factory=dict)
+    # for the same recordings, the light of the first frame that the next ones let expect, and its
+    # scatter over the flicker
+    firsts: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, evidence: Sequence[Evidence], light: Mapping[int, F64]) -> "FlatLight":
         """From parts of the frames; ``light`` of frames (t,) by recording, NaN if not measured."""
         found = [ladder(one) for one in evidence]
-        frames = {}
+        frames, firsts = {}, {}
         for number, own in light.items():
             if np.isfinite(own).sum() >= SERIES:
                 frames[number] = own / np.nanmean(own)
                 frames[number][0] = np.nan
+                firsts[number] = _first(frames[number])
         flickers, freedoms = zip(*map(flicker, evidence), strict=True)
         return cls(
             float(np.mean(flickers)),
@@ -54,6 +58,7 @@ class FlatLight:
             frozenset(float(t) for one in found if one is not None for t in one.off),
             min(freedoms),
             frames,
+            firsts,
         )
 
     def factor(self, recording: Recording, frame: int) -> float:
@@ -65,6 +70,10 @@ class FlatLight:
         if known is not None and np.isfinite(known[frame]):
             return level * float(known[frame])
         flicker = self._flicker(recording.bench.seed)
+        if frame == 0 and recording.number in self.firsts:
+            expected, scatter = self.firsts[recording.number]
+            drawn = float(recording.rng("lamp", frame).standard_normal())
+            return level * (expected + scatter * flicker * drawn)
         flicker *= float(recording.rng("lamp", frame).standard_normal())
         rise = self._rise(recording.bench.seed) * (frame - (recording.count - 1) / 2)
         return level * (1 + flicker + rise)
@@ -97,3 +106,11 @@ class FlatLight:
             below = below & own if (below & own).any() else own
             levels = np.where(own, straight_line(times[below], levels[below], times), levels)
         return {r.number: float(level) for r, level in zip(flats, levels, strict=True)}
+
+
+def _first(light: F64) -> tuple[float, float]:
+    """Light of frame 0 from a parabola through the next frames (t,), and its relative scatter."""
+    time = np.flatnonzero(np.isfinite(light))[: SERIES - 1]
+    design = np.vander(time, 3, increasing=True).astype(float)
+    value = float(np.linalg.lstsq(design, light[time])[0][0])
+    return value, float(np.sqrt(1 + np.linalg.inv(design.T @ design)[0, 0]))
