@@ -197,10 +197,10 @@ def _unpack_gzip(file: FrameFile, handle: io.FileIO, out: BinaryIO) -> None:
 
 
 def _tiles_at_once(file: FrameFile) -> tuple[int, int]:
-    """(planes, rows) decoded at once: whole tiles, some MiB of them."""
+    """(planes, rows) decoded at once: whole tiles, about a MiB of them."""
     planes, rows = file.tile
     tile_bytes = planes * rows * file.shape[2] * file.coding.stored.itemsize
-    rows *= max(1, 8 << 20 // tile_bytes)
+    rows *= max(1, _PIECE // tile_bytes)
     # Several small frames at once: astropy reads the header again for each piece.
     return planes * max(1, rows // file.shape[1]), rows
 
