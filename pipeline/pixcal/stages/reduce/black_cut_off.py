@@ -44,6 +44,9 @@ class CutOff:
     def of(cls, frames: Reader, step: float) -> "CutOff | None":
         """Cut-off of the first frames, whose samples are multiples of a step; None if none."""
         samples = middle_rows(frames, 0, _FRAMES)
+        samples = samples[np.isfinite(samples).all(axis=(1, 2))]
+        if not len(samples):
+            return None
         lower, upper = np.quantile(samples, ndtr([1.0, 2.0]))
         noise, code = float(upper - lower), 0
         if len(samples) > 1 and of_whole_numbers(frames):

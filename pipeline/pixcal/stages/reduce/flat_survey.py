@@ -72,8 +72,9 @@ class FlatSurvey:
         levels: list[float] = []
         tops: list[_Top] = []
         blocks = range(0, flats.shape[0], TOGETHER)
-        for samples in (s for n in blocks for s in middle_rows(flats, n, n + TOGETHER)):
-            levels.append(float(np.nanmean(samples)) - pedestal)
+        for frame in (s for n in blocks for s in middle_rows(flats, n, n + TOGETHER)):
+            samples = frame[np.isfinite(frame)] if np.isfinite(frame).any() else np.array(pedestal)
+            levels.append(float(samples.mean(dtype=float)) - pedestal)
             if whole:
                 top = int(samples.max())
                 near = samples[samples >= top - NEIGHBOURS * step].astype(np.int64)
@@ -169,13 +170,13 @@ def of_whole_numbers(frames: Reader) -> bool:
     if frames.dtype.kind in "iu":
         return True
     ends = (middle_rows(frames, n, n + 1) for n in {0, frames.shape[0] - 1})
-    return all(np.array_equal(np.rint(samples), samples) for samples in ends)
+    return all(np.array_equal(np.rint(samples), samples, equal_nan=True) for samples in ends)
 
 
 def code_step(arrays: Sequence[Reader]) -> int:
     """Largest step of which all surveyed samples are multiples; 1 if they are few."""
-    ends = ((array, n) for array in arrays for n in {0, array.shape[0] - 1})
-    codes = {int(code) for array, n in ends for code in np.unique(middle_rows(array, n, n + 1))}
+    ends = [middle_rows(a, n, n + 1) for a in arrays for n in {0, a.shape[0] - 1}]
+    codes = {int(code) for rows in ends for code in np.unique(rows[np.isfinite(rows)])}
     return math.gcd(*codes) if len(codes) >= NEIGHBOURS else 1
 
 

@@ -124,7 +124,8 @@ def code_counts(groups: Sequence[Group], job: Measuring) -> F64:
     for group in groups:
         reader = job.frames[group.array]
         for n in group.frames:
-            codes = np.maximum(middle_rows(reader, n, n + 1).ravel(), 0) // job.quantum
+            rows = middle_rows(reader, n, n + 1)
+            codes = np.maximum(rows[np.isfinite(rows)], 0) // job.quantum
             own = np.bincount(codes.astype(np.int64), minlength=len(found)).astype(float)
             own[: len(found)] += found
             found = own
