@@ -182,15 +182,17 @@ def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> U
     limits, medians = job.options, job.usual
     # A level at the boundary of two codes gives either one, however low the noise.
     least = 3 * (job.floor / job.gain) ** 2
+    warm = np.zeros(mask.shape, np.bool_)
+    if job.has_rate:
+        warm = hot(
+            found["dark_rate"], found["dark_rate_error"], medians.dark_rate_sigma, limits.hot_sigma
+        )
+        mask[warm] |= np.uint8(PixelFlag.HOT)
     if job.has_flat:
         mask[~np.isfinite(flat)] |= np.uint8(PixelFlag.NO_DATA)
         where = dead(flat, error, limits.dead_below, limits.dead_above, FLAT_FLOOR)
-        mask[where] |= np.uint8(PixelFlag.DEAD)
-    if job.has_rate:
-        where = hot(
-            found["dark_rate"], found["dark_rate_error"], medians.dark_rate_sigma, limits.hot_sigma
-        )
-        mask[where] |= np.uint8(PixelFlag.HOT)
+        # The response of a hot pixel that its dark signal fills is not known.
+        mask[where & ~(warm & (flat > FLAT_FLOOR))] |= np.uint8(PixelFlag.DEAD)
     if np.isfinite(medians.dark_variance):
         variance, dof = found["dark_variance"], found["dark_dof"]
         where = noisy(

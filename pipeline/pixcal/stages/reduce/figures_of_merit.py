@@ -49,7 +49,7 @@ def characterise(
     top, reached = _top(summary, job, clipped)
     top = top if job.dark else None  # levels above an unknown bias are meaningless
     middle = middle_of(source.shape)
-    halves = read_halves(made, source, summary, top, middle, runtime)
+    halves = read_halves(made, source, summary, top, middle, entry["used"], runtime)
     note = "" if measured else "declared, not measured"
     found: Json = {"conversion_gain": _figure("conversion gain", "e-/ADU", gain, note)}
     noise = _read_noise(found, summary, gain[0], source.quantum)

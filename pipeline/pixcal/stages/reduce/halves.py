@@ -51,9 +51,13 @@ def read_halves(
     summary: Summary,
     top: Measure | None,
     middle: Window,
+    gain: float,
     runtime: Runtime,
 ) -> Halves:
-    """Read the bias frames and the flats near half of the saturation ``top`` (ADU above bias)."""
+    """Read the bias frames and the flats near half of the saturation ``top`` (ADU above bias).
+
+    ``gain``: of the dark signal's map, e-/ADU.
+    """
     dark, flat = source.exposures.read_series, _half_full(source, summary, top)
     mask = ArrayReader(made.folder / "calibration.zarr" / "mask").read(*middle)
     # Nonlinearity depends on response: without these pixels, it would look more uniform.
@@ -71,10 +75,14 @@ def read_halves(
     good &= np.isfinite(whole).all(axis=0)
     if good.sum() < _MIN_PIXELS:
         return Halves(None, None, good)
+    maps = made.folder / "calibration.zarr"
     if dark is None:
-        pedestal = ArrayReader(made.folder / "calibration.zarr" / "bias").read(*middle)
-        return Halves(None, whole - pedestal, good)
-    return Halves(whole[:2], whole[2:] - whole[:2] if flat is not None else None, good)
+        return Halves(None, whole - ArrayReader(maps / "bias").read(*middle), good)
+    if flat is None:
+        return Halves(whole, None, good)
+    seconds = flat.exptime * source.exposures.known - dark.exptime
+    rate = ArrayReader(maps / "dark_rate").read(*middle) / gain
+    return Halves(whole[:2], whole[2:] - whole[:2] - seconds * rate, good)
 
 
 def _half_full(source: Ingested, summary: Summary, top: Measure | None) -> Group | None:
