@@ -183,3 +183,16 @@ def test_levels_are_those_of_pixels_that_see_the_lamp() -> None:
     assert levels[1] == pytest.approx(2 * levels[0])
     assert levels[0] == pytest.approx(1e3, rel=0.01)
     assert np.isnan(levels[2])
+
+
+@pytest.mark.parametrize("late", [0.02, -0.01, 0.0])
+def test_exposures_longer_than_stated_shift_the_zero_of_the_line(late: float) -> None:
+    times = np.array([0.2, 0.5, 1.0, 2.0, 3.0, 4.0])
+    noise = 1e-5 * np.random.default_rng(3).standard_normal(6)
+    found = linearity(times, 1e4 * (times + late) * (1 + noise), np.ones(6, np.bool_))
+    assert found is not None
+    value, error = found.late
+    assert abs(value - late) < 4 * error < 1e-4
+    few = linearity(times[:3], 1e4 * times[:3], np.ones(3, np.bool_))
+    assert few is not None
+    assert np.isinf(few.late[1])

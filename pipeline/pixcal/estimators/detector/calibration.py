@@ -187,6 +187,9 @@ class Linearity:
     # exposure times
     slope: float
     intercept: float
+    # seconds by which exposures are longer than stated, if that gives the intercept, and its error
+    # from the scatter about the line; infinite with `MIN_STEPS` levels
+    late: tuple[float, float]
 
 
 def linearity(exptimes: F64, levels: F64, used: Mask) -> Linearity | None:
@@ -200,10 +203,15 @@ def linearity(exptimes: F64, levels: F64, used: Mask) -> Linearity | None:
         return None
     weight = 1 / levels[used]
     design = np.stack([exptimes[used], np.ones(used.sum())], axis=1)
-    slope, intercept = np.linalg.lstsq(design * weight[:, None], np.ones(len(weight)))[0]
+    weighted = design * weight[:, None]
+    slope, intercept = np.linalg.lstsq(weighted, np.ones(len(weight)))[0]
     deviation = np.full(len(levels), np.nan)
     line = slope * exptimes[used] + intercept
     deviation[used] = levels[used] / line - 1
-    return Linearity(
-        float(np.abs(deviation[used]).max()), deviation, float(slope), float(intercept)
-    )
+    freedom = len(weight) - MIN_STEPS + 1
+    scatter = (deviation[used] ** 2).sum() / freedom if len(weight) > MIN_STEPS else np.inf
+    # Of the ratio of both: the slope's error hardly counts, as the line begins near zero.
+    error = float(np.sqrt(scatter * np.linalg.inv(weighted.T @ weighted)[1, 1]) / slope)
+    largest = float(np.abs(deviation[used]).max())
+    late = float(intercept / slope), abs(error)
+    return Linearity(largest, deviation, float(slope), float(intercept), late)

@@ -275,6 +275,7 @@ def linearity_report(summary: Summary, job: Measuring, gain: float) -> dict[str,
     return {
         "max_deviation_percent": 100 * summary.linearity.max_deviation,
         "intercept_adu": summary.linearity.intercept,
+        "exposure_offset_s": summary.linearity.late[0],
         "levels": [
             {
                 "exptime_s": group.exptime,

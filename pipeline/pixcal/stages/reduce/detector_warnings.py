@@ -2,10 +2,14 @@
 
 from pixcal.kernels.gain_fit import GainFit
 from pixcal.kernels.photon_transfer import SHARED
+from pixcal.report.text import with_error
 from pixcal.stages.reduce.detector_summary import Summary
 
 _ROUGH = 10.0  # reduced chi-square above which a photon-transfer curve is not smooth
 _LINEARITY = 0.02
+# of an exposure-time offset that is reported: its least errors, share of the shortest flats, and
+# ratio of that share to the deviations from the line
+_SURE, _LATE, _CURVED = 5.0, 0.005, 20.0
 _OF_STEP = 0.1  # relative tolerance to recognise a gain declared per step of the converter
 
 
@@ -38,6 +42,7 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
             "time: the response of all pixels, or the lamp, is not linear; no pixels are flagged "
             "NONLINEAR for it"
         )
+    warnings += _exposure_warnings(summary)
     noise = summary.declared.read_noise_e
     measured = summary.noise_measured_e(summary.before_rounding, gain)
     if measured is not None and summary.before_rounding is not None:
@@ -93,6 +98,23 @@ def _gain_warnings(fit: GainFit, summary: Summary, used: float) -> list[str]:
             "effect"
         )
     return warnings + _declared_gain_warnings(fit, summary, used)
+
+
+def _exposure_warnings(summary: Summary) -> list[str]:
+    """That exposures are longer or shorter than stated, if levels are straight but for that."""
+    straight = summary.linearity
+    if straight is None or summary.read_noise is None:  # else the level without light is unknown
+        return []
+    late, error = straight.late
+    share = abs(straight.intercept) / summary.levels[summary.usable].min()
+    if abs(late) < _SURE * error or share < max(_LATE, _CURVED * straight.max_deviation):
+        return []
+    return [
+        f"the levels of the flats are on a line that is zero at {with_error(-late, error)} s: the "
+        f"shortest flats have {100 * share:.2g} % {'more' if late > 0 else 'less'} light than "
+        "their exposure times say, as with a slow shutter or a delayed lamp; the linearity error "
+        "is the distance from this line"
+    ]
 
 
 def _declared_gain_warnings(fit: GainFit, summary: Summary, used: float) -> list[str]:

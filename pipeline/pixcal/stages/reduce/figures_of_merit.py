@@ -64,6 +64,9 @@ def characterise(
     if halves.dark is not None:
         electrons = halves.dark * gain[0]
         facts["warnings"] += _spread(found, curves, "dsnu", "e-", electrons, halves.good)
+        if source.exposures.read_series and source.exposures.read_series.array in source.cut_off:
+            said = found["dsnu"]["note"], "lower limit: dark pixels are cut off at the lowest code"
+            found["dsnu"]["note"] = "; ".join(filter(None, said))
     if halves.flat is not None:
         percent = np.stack([100 * emva.without_trend(half, halves.good) for half in halves.flat])
         facts["warnings"] += _spread(found, curves, "prnu", "%", percent, halves.good)
