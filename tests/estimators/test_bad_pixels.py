@@ -116,6 +116,14 @@ def test_a_curve_that_all_pixels_share_flags_none() -> None:
     assert not nonlinear(bent, step_levels(bent), 0.03).any()
 
 
+def test_rows_lit_otherwise_at_each_step_are_not_nonlinear_but_their_bent_pixels_are() -> None:
+    steps, _ = ladder(np.random.default_rng(8), (101, 100))
+    for n, step in enumerate(steps):
+        step.signal[:] *= (1 + 0.1 * np.sin(0.1 * np.arange(101) + n))[:, None]
+        step.signal[30, 4] *= 1 - 0.3 * step.exptime
+    assert np.argwhere(nonlinear(steps, step_levels(steps), 0.03)).tolist() == [[30, 4]]
+
+
 def test_a_pixel_that_bends_is_nonlinear() -> None:
     steps, _ = ladder(np.random.default_rng(7), (50, 60))
     for step in steps:

@@ -64,8 +64,8 @@ class GainError(Effect):
 
     relative: float = quantity(
         0.03,
-        low=-0.9,
-        high=9.0,
+        low=-0.9999,
+        high=9999.0,
         doc="true gain over the gain used, minus 1; the variance of "
         "shot noise in ADU is smaller by as much",
     )
@@ -100,7 +100,7 @@ class GainError(Effect):
         share, error = _joined(found)
         relative, error = 1 / share - 1, error / share**2
         return Estimate(
-            cls(float(np.clip(relative, -0.9, 9.0))),
+            cls(float(np.clip(relative, -0.9999, 9999.0))),
             {"relative": float(error)},
             float(abs(relative) / error),
             f"noise that grows with the level in the {' and the '.join(found)} is "

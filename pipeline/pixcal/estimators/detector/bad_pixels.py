@@ -29,6 +29,7 @@ _KURTOSIS_SAMPLES = 32
 _CURVES = 2
 _DEGREE = 3
 _FARTHEST = 4.0
+_RARE = 0.01  # share of samples above which departures are not those of single pixels
 _CLIPPINGS = 4
 _CLIP = 4.0
 _POPULATION = 4.0  # standard deviations of log noise up to which pixels are of one population
@@ -186,17 +187,37 @@ def nonlinear(steps: Sequence[ExposureLevel], levels: F64, limit: float) -> Mask
         error = np.sqrt(variance) / levels
         weight = np.where(np.isfinite(share) & (error > 0) & (levels > 0), error**-2, 0.0)
         share = np.where(weight > 0, share, 0.0)
-        for _ in range(_CURVES):
-            mean = (weight * share).sum(axis=0) / weight.sum(axis=0)
-            share = share - mean * _common(share / mean - 1, mean, weight > 0)
-        total = weight.sum(axis=0)
-        mean = (weight * share).sum(axis=0) / total
-        # A step is part of the mean, so their difference varies less than the step alone.
-        spread = np.sqrt(np.maximum(error**2 - 1 / total, 0))
-        off = np.abs(share - mean)
-        beyond = (off > limit * np.abs(mean)) & (off > _MANY_SIGNIFICANT * spread) & (weight > 0)
+        beyond = _departing(share, error, weight, limit)
+        if beyond.mean() > _RARE:
+            # Light that changes with the step, as that of a lamp that flickers in the rows.
+            for axis in (2, 1):
+                mean = (weight * share).sum(axis=0) / weight.sum(axis=0)
+                rest = np.where(weight > 0, share / mean - 1, np.nan)
+                common = np.nan_to_num(_line_medians(rest, axis))
+                share = share - np.where(weight > 0, mean * common, 0.0)
+            beyond = _departing(share, error, weight, limit)
     enough = (weight > 0).sum(axis=0) >= MIN_STEPS
     return np.asarray(beyond.any(axis=0) & enough)
+
+
+def _departing(share: F64, error: F64, weight: F64, limit: float) -> Mask:
+    """Where shares (step, y, x) of the level depart from the curve of equally bright pixels."""
+    total = weight.sum(axis=0)
+    for _ in range(_CURVES):
+        mean = (weight * share).sum(axis=0) / total
+        share = share - mean * _common(share / mean - 1, mean, weight > 0)
+    mean = (weight * share).sum(axis=0) / total
+    # A step is part of the mean, so their difference varies less than the step alone.
+    spread = np.sqrt(np.maximum(error**2 - 1 / total, 0))
+    off = np.abs(share - mean)
+    found = (off > limit * np.abs(mean)) & (off > _MANY_SIGNIFICANT * spread) & (weight > 0)
+    return np.asarray(found)
+
+
+def _line_medians(values: F64, axis: int) -> F64:
+    """Median of the finite values along an axis, which is kept; NaN where there are none."""
+    empty = np.isnan(values).all(axis=axis, keepdims=True)
+    return np.where(empty, np.nan, np.nanmedian(np.where(empty, 0, values), axis, keepdims=True))
 
 
 def _common(off: F64, brightness: F64, used: Mask) -> F64:
