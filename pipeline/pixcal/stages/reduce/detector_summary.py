@@ -34,6 +34,7 @@ _GAIN_ERROR = 0.2
 _GUESS_ERROR = 0.1  # relative error of gain and read noise in `Measuring`
 # variance of a sample, in square codes, above which rounding adds the same at every level
 _SMOOTH = 0.25 + SHEPPARD
+_BENT = 0.02  # largest deviation from a line with an offset in exposure time that one lamp gives
 _LAMP = 0.3  # relative change of light per second that shows that flats are not of one lamp
 _LIT = 5.0  # least response of the median pixel over its error: below it the flat would be noise
 
@@ -126,8 +127,10 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     ends = full_level(points), math.inf if well is None else well[0]
     top = float(np.fmin(job.saturation - medians.bias, ends[0] if ends[0] < math.inf else ends[1]))
     straight = None
-    if job.flats_timed and job.flat and _one_lamp(times[usable], levels[usable]):
+    if job.flats_timed and job.flat and len(set(times[usable])) == usable.sum():
         straight = linearity(times, levels, usable)
+        if not _one_lamp(times[usable], levels[usable], straight):
+            straight = None
     charge = 0.0 if job.read_series is None else rate * job.read_series.exptime
     gain, wander, lost = None, read_noise.bias_wander(job), read_noise.lost_in_blocks(job)
     # Shot noise of the dark signal is not read noise; its size depends on the gain.
@@ -261,10 +264,14 @@ def _light(tables: F64, levels: F64, usable: Mask, job: Measuring) -> F64:
     return share
 
 
-def _one_lamp(times: F64, levels: F64) -> bool:
-    """Whether flats (s, ADU) can be of one lamp; not if one exposure time has several levels."""
+def _one_lamp(times: F64, levels: F64, straight: Linearity | None) -> bool:
+    """Whether flats (s, ADU) can be of one lamp, perhaps with exposures longer than stated."""
     rates = levels / times
-    return len(np.unique(times)) == len(times) > 0 and bool(rates.max() < (1 + _LAMP) * rates.min())
+    if not len(rates) or rates.max() < (1 + _LAMP) * rates.min():
+        return len(rates) > 0
+    return (
+        straight is not None and math.isfinite(straight.late[1]) and straight.max_deviation < _BENT
+    )
 
 
 def linearity_report(summary: Summary, job: Measuring, gain: float) -> dict[str, Any] | None:

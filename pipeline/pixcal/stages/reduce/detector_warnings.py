@@ -1,7 +1,12 @@
 """Warnings on a detector that behaves badly, or differs from its declaration."""
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from pixcal.kernels.gain_fit import GainFit
 from pixcal.kernels.photon_transfer import SHARED
+from pixcal.model.arrays import F64
 from pixcal.report.text import with_error
 from pixcal.stages.reduce.detector_summary import Summary
 
@@ -10,6 +15,8 @@ _LINEARITY = 0.02
 # of an exposure-time offset that is reported: its least errors, share of the shortest flats, and
 # ratio of that share to the deviations from the line
 _SURE, _LATE, _CURVED = 5.0, 0.005, 20.0
+# of a lamp that is reported as unsteady: fewest flats of a series, change over it, and scatter
+_FEWEST, _DRIFT, _SCATTER = 4, 0.01, 0.02
 _OF_STEP = 0.1  # relative tolerance to recognise a gain declared per step of the converter
 
 
@@ -98,6 +105,28 @@ def _gain_warnings(fit: GainFit, summary: Summary, used: float) -> list[str]:
             "effect"
         )
     return warnings + _declared_gain_warnings(fit, summary, used)
+
+
+def lamp_warnings(series: Sequence[tuple[float, F64]]) -> list[str]:
+    """That the light of flats (t,) of an exposure time (s) drifts or scatters within the series."""
+    found = {"drifts": (0.0, 0.0), "scatters": (0.0, 0.0)}
+    for seconds, levels in series:
+        if len(levels) < _FEWEST or levels.mean() <= 0:
+            continue
+        light, time = levels / levels.mean(), np.arange(len(levels))
+        line = np.polyfit(time, light, 1)
+        drift, scatter = abs(line[0]) * time[-1], float(np.std(np.diff(light)) / np.sqrt(2))
+        if drift > _DRIFT and drift > _SURE * scatter:
+            found["drifts"] = max(found["drifts"], (drift, seconds))
+        elif scatter > _SCATTER:
+            found["scatters"] = max(found["scatters"], (scatter, seconds))
+    how = {"drifts": "over their series", "scatters": "rms from frame to frame"}
+    return [
+        f"the light of the flats {what} by up to {100 * size:.2g} % {how[what]} (exposures of "
+        f"{seconds:g} s): gain and noise allow for it; linearity needs a steady lamp"
+        for what, (size, seconds) in found.items()
+        if size
+    ]
 
 
 def _exposure_warnings(summary: Summary) -> list[str]:

@@ -23,7 +23,7 @@ from pixcal.stages.reduce.black_cut_off import cut_off_warnings
 from pixcal.stages.reduce.calibration import Finishing, calibration_writers, finish
 from pixcal.stages.reduce.columns import run_noted, strip_width
 from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
-from pixcal.stages.reduce.detector_warnings import detector_warnings
+from pixcal.stages.reduce.detector_warnings import detector_warnings, lamp_warnings
 from pixcal.stages.reduce.electrons import convert_bytes
 from pixcal.stages.reduce.figures_of_merit import characterise
 from pixcal.stages.reduce.flat_survey import rough_gain
@@ -235,6 +235,9 @@ def _report(
     warnings = [*source.exposures.warnings, *cut_off_warnings(source.cut_off)]
     warnings += subtracted_warnings(job.subtracted, found.gain)
     warnings += detector_warnings(summary, found.gain, piled)
+    if source.survey is not None and source.exposures.known:
+        light = source.survey.levels
+        warnings += lamp_warnings([(g.exptime, light[list(g.frames)]) for g in job.flat])
     declared = source.detector.saturation_adu is not None
     warnings += _dark_lines(ArrayReader(made.folder / "calibration.zarr" / "mask"), source.shape)
     for name, facts in sets.items():
