@@ -11,6 +11,7 @@ from pixcal.effects.lag import Lag
 from pixcal.estimators.detector.persistence import persistence
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.model.bench import Bench
+from pixcal.model.errors import InputError
 from pixcal.simulation.recording import recordings
 from pixcal.stages.diagnose.dark_series import in_series
 
@@ -18,16 +19,21 @@ BIAS, READ_NOISE, SHAPE = 300.0, 6.0, (37, 41)
 DEAD_S = 1.5  # between frames
 
 
-def recorded(share: float, kept: Callable[[float], float], seed: int = 3) -> Evidence:
+def recorded(
+    share: float, kept: Callable[[float], float], pause: float = 0.0, stamp: float = 0.0
+) -> Evidence:
     """Bias, flats and darks of a camera whose traps hold whole electrons.
 
-    ``kept``: part of the held charge that stays after a time, s.
+    ``kept``: part of the held charge that stays after a time, s; ``pause``: before the darks, s;
+    ``stamp``: unit of the time stamps, s.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(3)
     held, clock, stacks = np.zeros(SHAPE, int), 0.0, []
     series = [("bias", 0.0, 0.0, 8), *(("flat", t, 4000 * t, 6) for t in (0.5, 2.0, 6.0))]
     for kind, seconds, light, count in [*series, ("dark", 10.0, 0.0, 12)]:
         frames, times = [], []
+        if kind == "dark" and pause:
+            held, clock = rng.binomial(held, kept(pause)), clock + pause
         for _ in range(count):
             charge = rng.poisson(light, SHAPE)
             released = rng.binomial(held, 1 - kept(seconds + DEAD_S))
@@ -36,7 +42,7 @@ def recorded(share: float, kept: Callable[[float], float], seed: int = 3) -> Evi
             frames.append(BIAS + charge - taken + released + rng.normal(0, READ_NOISE, SHAPE))
             times.append(clock)
             clock += seconds + DEAD_S
-        time = np.array(times)
+        time = np.floor(np.array(times) / stamp) * stamp if stamp else np.array(times)
         start, number = time[0], np.arange(count)
         stacks.append(Stack(kind, seconds, number, time - start, np.array(frames), start))
     maps = {"bias": np.full(SHAPE, BIAS), "dark_rate": np.zeros(SHAPE), "flat": np.ones(SHAPE)}
@@ -46,10 +52,21 @@ def recorded(share: float, kept: Callable[[float], float], seed: int = 3) -> Evi
 
 
 @pytest.mark.parametrize(
-    ("decay", "in_seconds"), [(0.8, False), (3.0, False), (15.0, True), (50.0, True)]
+    ("decay", "in_seconds", "pause", "stamp"),
+    [
+        (0.8, False, 0, 0),
+        (3.0, False, 0, 1),
+        (15.0, True, 0, 0),
+        (50.0, True, 0, 0),
+        (50.0, True, 60, 1),
+    ],
 )
-def test_traps_are_found_again_by_frames_or_by_time(decay: float, in_seconds: bool) -> None:
-    evidence = recorded(0.01, lambda t: float(np.exp(-(t if in_seconds else 1) / decay)))
+def test_traps_are_found_again_by_frames_or_by_time(
+    decay: float, in_seconds: bool, pause: float, stamp: float
+) -> None:
+    evidence = recorded(
+        0.01, lambda t: float(np.exp(-(t if in_seconds else 1) / decay)), pause, stamp
+    )
     found = persistence(evidence)
     assert found is not None
     assert found.in_seconds == in_seconds
@@ -64,6 +81,7 @@ def test_traps_are_found_again_by_frames_or_by_time(decay: float, in_seconds: bo
 
 def test_a_camera_without_traps_has_none() -> None:
     assert persistence(recorded(0.0, lambda _: 0.0)) is None
+    assert persistence(recorded(0.0, lambda _: 0.0, stamp=60.0)) is None
 
 
 def test_darks_after_flats_hold_what_came_out_by_then_with_its_shot_noise(
@@ -118,4 +136,28 @@ def test_light_divides_darks_that_follow_it_at_once() -> None:
     few = in_series({"dark": table(*before, *after[:3]), "flat": flats})["dark"]
     assert few["step"] == [0] * 8
     assert few["after_light"] == [False] * 8
-    assert in_series({"dark": table(*before)}) == {"dark": table(*before)}
+    assert "step" not in in_series({"dark": table(*before)})["dark"]
+    assert few["last"] == [7] * 8
+    assert found["dark"]["last"] == [4] * 5 + [12] * 8
+
+
+def test_charge_decays_in_a_pause_before_the_darks(make_effect_bench: Callable[..., Bench]) -> None:
+    changes = {
+        "detector.shape": [31, 37],
+        "detector.dark_e_s": 0.0,
+        "detector.read_noise_e": 0.0,
+        "frames.flats": [{"exptime_s": 0.1, "count": 3}],
+    }
+    bench, lag = make_effect_bench(changes), Lag(0.05, spread=0.0, carried=1.0, decay_s=0.4)
+    bench = replace(bench, shot_noise=False)
+    flat = next(r for r in recordings(bench) if r.kind == "flat")
+    dark = next(r for r in recordings(bench) if r.kind == "dark")
+    end = flat.start_s + flat.count * flat.period_s
+    late = []
+    for pause in (0.0, 0.3):
+        after = replace(dark, before=flat, start_s=end + pause, count=1)
+        late.append(frames_of(bench, after, [lag])[0].astype(float).mean())
+    late = np.array(late) - frames_of(bench, replace(dark, count=1))[0].mean()
+    assert late[1] / late[0] == pytest.approx(np.exp(-0.3 / 0.4), rel=0.02)
+    with pytest.raises(InputError, match="decay_s"):
+        replace(lag, capacity_e=1e4).check(bench)

@@ -423,7 +423,7 @@ def test_two_causes_that_only_make_good_for_each_other_are_not_claimed(
     ("with_both", "without", "alone", "claimed"),
     [(1.1, 1.0, 0.5, False), (0.5, 0.7, 1.0, False), (0.5, 0.7, 0.8, True), (0.1, 0.7, 1.0, True)],
 )
-def test_a_cause_with_which_differences_are_no_smaller_is_not_claimed(
+def test_a_cause_that_does_not_reduce_the_differences_is_not_claimed(
     monkeypatch: pytest.MonkeyPatch, with_both: float, without: float, alone: float, claimed: bool
 ) -> None:
     """They may be less significant, as simulations with it scatter more."""

@@ -22,8 +22,9 @@ from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import sigmas_of_best
 from pixcal.kernels.transfer import fill_traps, left_behind
 from pixcal.model.arrays import F32, F64
-from pixcal.model.bench import SimulatedDetector
+from pixcal.model.bench import Bench, SimulatedDetector
 from pixcal.model.config import quantity
+from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
@@ -143,6 +144,11 @@ class Lag(Effect):
         """Share of the held charge that stays for another frame."""
         return float(np.exp(-1 / self.decay_frames)) if self.decay_frames else 0.0
 
+    def check(self, bench: Bench) -> None:
+        """As in `ForwardModel.check`: traps are emptied frame by frame."""
+        if self.capacity_e and self.decay_s:
+            raise InputError("lag.decay_s: not with capacity_e, give decay_frames; or remove one")
+
     def charge(self, charge: F32, shot: Shot) -> F32:
         if self.capacity_e:
             return self._with_traps(charge, shot)
@@ -166,10 +172,11 @@ class Lag(Effect):
         if not self.decay_s:
             yield from self.releases
             return
-        begin, end = shot.start_of(shot.frame), shot.start_of(shot.frame + 1)
+        begin, end = shot.start_of(shot.frame), shot.end_of(shot.frame)
         for back in range(1, MOST_BACK + 1):
-            # Charge is left behind when a frame is read, just before the next one starts.
-            left_at = shot.start_of(shot.frame - back + 1)
+            if shot.charge(shot.frame - back) is None:
+                return
+            left_at = min(shot.end_of(shot.frame - back), begin)
             held = np.exp(-(begin - left_at) / self.decay_s)
             if held < TAIL:
                 return
@@ -320,7 +327,7 @@ class Lag(Effect):
                 "decay_s" if found.in_seconds else "decay_frames": found.decay_error,
             },
             found.share / found.share_error,
-            "the level of frames without light falls after light",
+            "the dark level decays after exposure to light",
         )
 
     @classmethod

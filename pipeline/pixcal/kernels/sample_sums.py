@@ -32,7 +32,7 @@ def calm_residuals(
         rest = own - signal
         inside = good & (rest * rest < square * noise)
         np.copyto(kept[t], rest, where=inside)
-        np.divide(rest, np.sqrt(noise), out=calm[t], where=inside)
+        np.divide(rest, np.sqrt(noise, where=inside, out=noise.copy()), out=calm[t], where=inside)
         variance[t] = np.sum(noise, dtype=float, where=good)
         beyond += count_beyond(rest, noise, good, limits)
     return calm, kept, variance / max(int(np.count_nonzero(good)), 1), beyond

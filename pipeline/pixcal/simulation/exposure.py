@@ -106,7 +106,7 @@ class _Chain:
         back = [1 + e.frames_back for e in self.effects if e.frames_back]
         # Of a frame and preceding ones, each before and after the effect that uses them.
         self._charges = _Latest[tuple[int, int]](2 * max(back, default=1))
-        self._kept_normals = _Latest[tuple[int, str]](2 * sum(back))
+        self._kept_normals = _Latest[tuple[int, str]](sum(back))
         self._margins: dict[int, tuple[LightMaps, F32]] = {}
         self._noise: tuple[int, F32] | None = None
         self._samples = np.empty(self.dark.shape, np.uint16)

@@ -42,12 +42,18 @@ class Shot:
         return self.start_of(self.frame)
 
     def start_of(self, frame: int) -> float:
-        """Start of another frame, or of one after the last, s; numbers as in `charge`."""
+        """Start of another frame, s; numbers as in `charge`."""
         chain, frame = self._chain.of(frame)
         recording: Recording = chain.recording
-        last = min(frame, recording.count - 1)
-        late = (frame - last) * recording.period_s
-        return recording.start_s + float(recording.times_s[last]) + late
+        return recording.start_s + float(recording.times_s[frame])
+
+    def end_of(self, frame: int) -> float:
+        """When another frame is read, s: as the next one starts, or a period after the last one."""
+        chain, frame = self._chain.of(frame)
+        recording: Recording = chain.recording
+        if frame + 1 < recording.count:
+            return recording.start_s + float(recording.times_s[frame + 1])
+        return recording.start_s + float(recording.times_s[frame]) + recording.period_s
 
     @property
     def states(self) -> FrameStates:
@@ -99,6 +105,7 @@ class Shot:
         For this frame, or another one of the recording.
         """
         chain, frame = self._chain.of(self.frame if frame is None else frame)
-        looks_back = chain.effects[self._at].frames_back > 0
-        normals: F32 = chain.normals(effect, frame, keep=looks_back)
+        own = chain.effects[self._at]
+        again = own.frames_back > 0 and effect == own.name
+        normals: F32 = chain.normals(effect, frame, keep=again)
         return normals

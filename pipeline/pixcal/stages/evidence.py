@@ -177,7 +177,8 @@ def _stacks(ingested: Ingested, part: Part) -> tuple[Stack, ...]:
             adu, start = frames[own].astype(np.float32), _start(ingested, kind)
             step = int(table["step"][own[0]]) if table.get("step") else 0
             exposure, numbers = float(exposures[own[0]]), frame_numbers(table)[own]
-            found.append(Stack(kind, exposure, numbers, times[own], adu, start, step))
+            last = int(table["last"][own[0]]) if table.get("last") else -1
+            found.append(Stack(kind, exposure, numbers, times[own], adu, start, step, last))
     return tuple(found)
 
 

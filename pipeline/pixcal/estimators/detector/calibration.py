@@ -123,7 +123,8 @@ def step_levels(steps: Sequence[ExposureLevel]) -> F64:
         return levels
     total = np.array([step.frames for step in steps])[usable] @ signal
     low, high = np.quantile(total[common], (_TRIMMED, 1 - _TRIMMED))
-    used = common & (total >= low) & (total <= high)
+    inner = common & (total >= low) & (total <= high)
+    used = inner if inner.any() else common
     # Saturated pixels rank brightest: without them the median would be that of dim pixels.
     usual = median(np.where(common, total, np.inf))
     scale = usual / total[used].mean() if np.isfinite(usual) else 1.0

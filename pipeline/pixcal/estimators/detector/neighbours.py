@@ -195,7 +195,7 @@ def pair_sums(
     ):
         product = (residual[here] * residual[there]).ravel()
         both = (variance[here] * variance[there]).ravel()
-        weight = np.where(product != 0, 1 / both, np.float32(0))
+        weight = np.divide(1, both, where=product != 0, out=np.zeros_like(both))
         product += np.einsum("ix,ix->x", one, covariance @ other)
         own = (charge[here] + charge[there], first[here], second[here])
         terms = np.stack([np.ones_like(product), *(term.ravel() for term in own)])

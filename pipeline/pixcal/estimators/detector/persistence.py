@@ -17,7 +17,6 @@ _SHORTEST = 0.1
 _OF_MODEL = 2e-3  # least relative error: frames between series are not all known
 _ROUNDS = 3  # of the fit, each with the light that the last one gives
 _STEP = 0.01  # relative, for derivatives by the decay
-_REACH = 30  # most frames of one series whose samples are in the other half of the frames
 
 
 @dataclass(frozen=True)
@@ -36,16 +35,18 @@ class _Sequence:
     """All frames without gaps, in order of time."""
 
     charge: F64  # (t,) mean that light and dark signal give, e-
-    passed: F64  # (t,) from the start of the frame to that of the next one, s
+    period: F64  # (t,) from the start of the frame until it is read, s
+    pause: F64  # (t,) from then until the next frame starts, s
     places: tuple[tuple[Stack, Indices, F64], ...]  # measured frames of each series, and means, e-
 
     def released(self, decay: float, in_seconds: bool) -> F64:
         """Charge (t,) that comes out in each frame, for a share of one."""
-        spans = self.passed / decay if in_seconds else np.full(len(self.passed), 1 / decay)
+        spans = self.period / decay if in_seconds else np.full(len(self.period), 1 / decay)
+        after = np.exp(-self.pause / decay) if in_seconds else np.ones(len(spans))
         found, held = np.empty(len(spans)), 0.0
         for n, kept in enumerate(np.exp(-spans)):
             found[n] = (1 - kept) * held
-            held = kept * held + self.charge[n]
+            held = (kept * held + self.charge[n]) * after[n]
         return found
 
     def of_light(self, lag: Persistence) -> "_Sequence":
@@ -95,33 +96,30 @@ def _sequence(evidence: Evidence) -> _Sequence | None:
 
     None where time stamps are unknown, or series alternate.
     """
-    stacks = sorted(evidence.stacks, key=lambda s: s.start_s + s.time_s[0])
+    stacks = sorted(evidence.stacks, key=lambda s: (s.start_s + s.time_s[0], s.frame[-1]))
     begin = [float(s.start_s + s.time_s[0]) for s in stacks]
     end = [float(s.start_s + s.time_s[-1]) for s in stacks]
     if not stacks or not np.isfinite([*begin, *end]).all():
         return None
-    if any(last >= first for last, first in zip(end, begin[1:], strict=False)):
+    if any(last > first for last, first in zip(end, begin[1:], strict=False)):
         return None
-    times: list[float] = []
     charge: list[float] = []
+    period: list[float] = []
+    pause: list[float] = []
     places = []
-    for stack, following in zip(stacks, [*begin[1:], np.inf], strict=True):
+    for stack, first, last, following in zip(stacks, begin, end, [*begin[1:], 0], strict=True):
         number = stack.frame - stack.frame[0]
-        start = stack.start_s + stack.time_s
-        span = (start[-1] - start[0]) / number[-1] if number[-1] else stack.exptime_s
-        span = float(span) if np.isfinite(span) and span > 0 else 1.0
-        last = int(number[-1])
-        if np.isfinite(following):
-            last += min(max(int((following - start[-1]) / span - 0.5), 0), _REACH)
-        own = np.arange(last + 1)
+        # Time stamps may be whole seconds: the period is that of the whole series.
+        span = (last - first) / number[-1] if number[-1] else stack.exptime_s
+        span = float(span) if np.isfinite(span) and span > 0 else _SHORTEST
+        count = int(max(stack.last, stack.frame[-1]) - stack.frame[0]) + 1
         means = frame_means(stack.adu, evidence.good) - evidence.bias[evidence.good].mean()
         means = means * evidence.gain
-        places.append((stack, len(times) + number, means))
-        known = np.interp(own, number, start) + span * np.maximum(own - number[-1], 0)
-        times += known.tolist()
-        charge += [max(float(means.mean()), 0.0)] * len(own)
-    passed = np.append(np.diff(times), span)
-    return _Sequence(np.array(charge), passed, tuple(places))
+        places.append((stack, len(charge) + number, means))
+        charge += [max(float(means.mean()), 0.0)] * count
+        period += [span] * count
+        pause += [0.0] * (count - 1) + [max(following - first - count * span, 0.0)]
+    return _Sequence(np.array(charge), np.array(period), np.array(pause), tuple(places))
 
 
 def _fit(
@@ -136,9 +134,8 @@ def _fit(
         rest = levels - size * model
         return size, float(rest @ rest), model
 
-    unit = float(np.median(sequence.passed)) if in_seconds else 1.0
-    if in_seconds:
-        unit = float(np.median([p for at, _, _ in series for p in sequence.passed[at]]))
+    dark = np.concatenate([at for at, _, _ in series])
+    unit = float(np.median(sequence.period[dark])) if in_seconds else 1.0
     bounds = tuple(float(np.log(unit * d)) for d in (_SHORTEST, LONGEST))
     found = minimize_scalar(lambda x: share(float(np.exp(x)))[1], bounds=bounds, method="bounded")
     decay = float(np.exp(found.x))

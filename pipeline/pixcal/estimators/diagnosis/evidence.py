@@ -126,6 +126,7 @@ class Stack:
     # time of the first of its kind after the first frame of the acquisition; nan when unknown
     start_s: float = np.nan
     step: int = 0  # of the lamp, among flats of one exposure time; 0 is the dimmest
+    last: int = -1  # number of the last frame of its series, if not among these
 
     @property
     def level(self) -> Level:

@@ -15,14 +15,25 @@ FEWEST = 4  # least frames of a series, else it is not divided: both halves need
 def in_series(tables: Mapping[str, Table]) -> dict[str, Table]:
     """Tables with the number of each bias and dark frame's series (``step``), and ``after_light``.
 
-    Light divides the frames of one exposure time if the next ones begin soon after it.
+    Light divides the frames of one exposure time if the next ones begin soon after it. ``last`` is
+    the number of the last frame of its series.
     """
     dark = {name: table for name, table in tables.items() if name in ("bias", "dark")}
     every = [frame_days(table) for name, table in tables.items() if name not in dark]
     light = np.sort(np.concatenate([*every, []]))
-    if not light.size or not np.isfinite(light).all():
-        return dict(tables)
-    return dict(tables) | {name: _numbered(table, light) for name, table in dark.items()}
+    found = dict(tables)
+    if light.size and np.isfinite(light).all():
+        found |= {name: _numbered(table, light) for name, table in dark.items()}
+    kinds = {name: found[name] for name in ("bias", "dark", "flat") if name in found}
+    return found | {name: _with_ends(table) for name, table in kinds.items()}
+
+
+def _with_ends(table: Table) -> Table:
+    """Table of calibration frames with the number of the last frame of each one's series."""
+    last = np.zeros(len(table["time_s"]), int)
+    for own in groups(table):
+        last[own] = own[-1]
+    return {**table, "last": last.tolist()}
 
 
 def _numbered(table: Table, light: F64) -> Table:

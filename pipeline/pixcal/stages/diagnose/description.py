@@ -174,7 +174,7 @@ def _light(
     # Both halves use the same dark signal, which charge left by light makes larger in one of them,
     # and flats of the same mean, since the medians of colours jump.
     black = [
-        one.gain * one.bias[one.good].mean() + exposure * one.dark_rate[one.good].mean()
+        one.bias[one.good].mean() + exposure * one.dark_rate[one.good].mean() / one.gain
         for one in evidence
     ]
     good = np.all([one.good for one in evidence], axis=0)
@@ -185,7 +185,7 @@ def _light(
             known = np.isfinite(stack.exptime_s)
             same = np.isclose(stack.exptime_s, exposure) if known else exposure == 0
             if same and stack.step == step and len(stack.adu) == len(own):
-                above = light_of(one, stack) + own_black - np.mean(black)
+                above = light_of(one, stack) + one.gain * (own_black - np.mean(black))
                 relative = one.flat[one.good].mean() / own_usual
                 light[own] = above / (relative * np.mean(usual))
     return light

@@ -21,11 +21,11 @@ RANDOM = "fringes with random phases"
 MORE = "more frames of the same kind"
 # frames that show more of an unexplained difference, by its domain
 CLOSER_LOOK = {
-    "space": "flats with the detector turned or shifted, which separate its patterns from the "
-    "light's",
+    "space": "flats with the detector rotated or shifted, to separate its patterns from those of "
+    "the light",
     "time": "a long series of frames of one kind under steady conditions, with DATE-OBS and "
     "CCD-TEMP in the headers",
-    "intensity": "flats of ten levels up to saturation, in rising and in falling order",
+    "intensity": "flats of ten levels up to saturation, in ascending and in descending order",
     "noise": "fifty bias frames and fifty flats of one level",
 }
 FRINGES = "fringes"  # for effects that other frames do not show

@@ -34,6 +34,7 @@ from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, RunFrames
 
 _GAIN, _NOISE, _DARK = 101, 102, 103  # keys of random numbers
 _WHITE = 1e-3  # least share of the variance of the read noise that effects leave
+_ROWS = 8  # in the middle, on which the mean charge left by earlier frames is computed
 HOT = 40.0  # robust standard deviations of the dark current above which a pixel is hot
 # pixels around a hot one that may have received some of its charge: at most a share of `SHARED`
 HOT_REACH = 2
@@ -141,15 +142,14 @@ class NominalBench:
             for name, frames in half.items()
         }
         levels = measured.lamp.levels(self.recordings, undone)
-        taken: dict[tuple[int, int], Recording] = {}
-        for r in sorted(self.recordings, key=lambda r: r.start_s):
-            taken[r.key] = replace(
-                r,
-                bench=bench,
-                window=window,
-                before=None if r.before is None else taken.get(r.before.key),
-                electrons=levels.get(r.number, r.electrons) if r.kind == "flat" else r.electrons,
-            )
+        own_key = {r.key: r for r in self.recordings}
+
+        def with_earlier(r: Recording) -> Recording:
+            before = None if r.before is None else with_earlier(own_key[r.before.key])
+            lit = levels.get(r.number, r.electrons) if r.kind == "flat" else r.electrons
+            return replace(r, bench=bench, window=window, before=before, electrons=lit)
+
+        taken = {r.key: with_earlier(r) for r in self.recordings}
         measured = _without_late_charge(measured, effects, bench, list(taken.values()))
         camera = Camera(bench, rows, [measured, *effects], maps=measured.maps)
         for recording, (name, numbers) in zip(self.recordings, self.places, strict=True):
@@ -263,10 +263,11 @@ def _without_late_charge(
     dark = [r for r in recordings if r.kind == "dark" and r.before is not None and r.exptime_s > 0]
     if not dark or not any(effect.frames_back for effect in effects):
         return measured
-    rows, total, seconds = (0, bench.detector.shape[0]), 0.0, 0.0
+    middle, total, seconds = bench.detector.shape[0] // 2, 0.0, 0.0
+    rows = max(middle - _ROWS // 2, 0), min(middle + _ROWS // 2, bench.detector.shape[0])
     with_effects, without = (
         Camera(bench, rows, [measured, *acting], maps=measured.maps, noise=False)
-        for acting in (effects, ())
+        for acting in (effects, [e for e in effects if not e.frames_back])
     )
     for recording in dark:
         frames = list(range(recording.count))

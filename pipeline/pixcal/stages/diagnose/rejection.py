@@ -129,7 +129,7 @@ def unhelpful(
         least = min(gains, key=lambda n: gains[n], default=None)
     if least is None or gains[least] > 0:
         return None
-    return least, "the differences are no smaller with it; it may be a proxy for an unknown cause"
+    return least, "it does not reduce the differences; it may be a proxy for an unknown cause"
 
 
 def doubtful(

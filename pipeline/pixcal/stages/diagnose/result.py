@@ -206,8 +206,10 @@ class _Description:
 
     def _more_would_tell(self, where: Sequence[Json], verdict: str) -> list[str]:
         """Frames to record where a gap remains."""
-        if verdict not in ("unexplained", "partly explained") or not where:
+        if verdict not in ("unexplained", "partly explained"):
             return []
+        if not where:
+            return recommend_frames(self.facts.missing_frames)
         largest = max(where, key=lambda entry: abs(entry["z_after"]))
         return recommend_closer_look(self.facts.missing_frames, largest["domain"])
 

@@ -44,8 +44,9 @@ class CutOff:
     def of(cls, frames: Reader, step: float) -> "CutOff | None":
         """Cut-off of the first frames, whose samples are multiples of a step; None if none."""
         samples = middle_rows(frames, 0, _FRAMES)
-        samples = samples[np.isfinite(samples).all(axis=(1, 2))]
-        if not len(samples):
+        samples = samples[np.isfinite(samples).any(axis=(1, 2))]
+        samples = samples[:, np.isfinite(samples).all(axis=0)]
+        if not samples.size:
             return None
         lower, upper = np.quantile(samples, ndtr([1.0, 2.0]))
         noise, code = float(upper - lower), 0

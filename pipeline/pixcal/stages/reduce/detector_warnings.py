@@ -113,9 +113,10 @@ def lamp_warnings(series: Sequence[tuple[float, F64]]) -> list[str]:
     for seconds, levels in series:
         if len(levels) < _FEWEST or levels.mean() <= 0:
             continue
-        light, time = levels / levels.mean(), np.arange(len(levels))
+        # The first one may lack the charge of lag.
+        light, time = levels[1:] / levels[1:].mean(), np.arange(1, len(levels))
         line = np.polyfit(time, light, 1)
-        drift, scatter = abs(line[0]) * time[-1], float(np.std(np.diff(light)) / np.sqrt(2))
+        drift, scatter = abs(line[0]) * (len(time) - 1), float(np.std(np.diff(light)) / np.sqrt(2))
         if drift > _DRIFT and drift > _SURE * scatter:
             found["drifts"] = max(found["drifts"], (drift, seconds))
         elif scatter > _SCATTER:
@@ -123,7 +124,7 @@ def lamp_warnings(series: Sequence[tuple[float, F64]]) -> list[str]:
     how = {"drifts": "over their series", "scatters": "rms from frame to frame"}
     return [
         f"the light of the flats {what} by up to {100 * size:.2g} % {how[what]} (exposures of "
-        f"{seconds:g} s): gain and noise allow for it; linearity needs a steady lamp"
+        f"{seconds:g} s): gain and noise allow for it; for linearity use a steady, warm lamp"
         for what, (size, seconds) in found.items()
         if size
     ]
@@ -139,10 +140,10 @@ def _exposure_warnings(summary: Summary) -> list[str]:
     if abs(late) < _SURE * error or share < max(_LATE, _CURVED * straight.max_deviation):
         return []
     return [
-        f"the levels of the flats are on a line that is zero at {with_error(-late, error)} s: the "
-        f"shortest flats have {100 * share:.2g} % {'more' if late > 0 else 'less'} light than "
-        "their exposure times say, as with a slow shutter or a delayed lamp; the linearity error "
-        "is the distance from this line"
+        f"the flats have the light of exposures {with_error(abs(late), error)} s "
+        f"{'longer' if late > 0 else 'shorter'} than stated ({100 * share:.2g} % of the shortest): "
+        "a slow shutter or a delayed lamp, or the level without light is wrong; the linearity "
+        "error allows for it"
     ]
 
 

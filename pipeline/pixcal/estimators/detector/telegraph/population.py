@@ -11,10 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq, minimize
-from scipy.special import expit, gammaln, logsumexp, softmax, xlogy
+from scipy.special import expit, gammaln, xlogy
 
-from pixcal.estimators.detector.telegraph import classes
-from pixcal.estimators.detector.telegraph.classes import AmplitudeClasses, Mixture, Stays
+from pixcal.estimators.detector.telegraph.classes import (
+    AMPLITUDES,
+    AmplitudeClasses,
+    Mixture,
+    Stays,
+    joined,
+    of_own_noise,
+    own_noises,
+)
 from pixcal.estimators.detector.telegraph.moments import Moments
 from pixcal.model.arrays import F64, Indices
 
@@ -24,7 +31,7 @@ _MOVE = 1e-4  # step of parameters for derivatives of the classes' shares
 # of the logits of shares, of logarithms of amplitudes over the noise, and of shapes
 _RANGES = (
     (-16.0, 16.0),
-    (np.log(classes.AMPLITUDES[0]), np.log(classes.AMPLITUDES[-1])),
+    (np.log(AMPLITUDES[0]), np.log(AMPLITUDES[-1])),
     (-_MAX_LOG_SHAPE, _MAX_LOG_SHAPE),
 )
 _CLEAR = 8.0  # log-likelihood by which a shape other than exponential must be better
@@ -58,14 +65,14 @@ def find_population(parts: Sequence[Moments], stays: Stays) -> Population:
     stands_for = np.ones(len(pixels))
     for m in parts:
         stands_for[np.searchsorted(pixels, m.pixel)] = m.stands_for
-    mixture = Mixture.of(classes.joined(pixels, parts, unit, stays))
+    mixture = Mixture.of(joined(pixels, parts, unit, stays))
 
     def weights(p: F64) -> F64:
         """Share of the pixels in each class of amplitudes."""
         share, mean, shape = expit(p[0]), np.exp(p[1]), _shape(p)
-        x = classes.AMPLITUDES * shape / mean
+        x = AMPLITUDES * shape / mean
         density = np.exp(xlogy(shape - 1, x) - x - gammaln(shape)) * shape / mean
-        return np.asarray(share * density * np.gradient(classes.AMPLITUDES))
+        return np.asarray(share * density * np.gradient(AMPLITUDES))
 
     def cost(p: F64) -> float:
         far = float(np.sum(p[2:] ** 2)) / (2 * _USUAL**2)
@@ -188,18 +195,22 @@ def _expected(
     pixels: Indices, parts: Sequence[Moments], unit: float, stays: Stays, lag: int
 ) -> tuple[F64, list[F64]]:
     """Result of `joined`, and the expected products of frames (n, class) of each series."""
-    ratios, quiets = [], []
-    products: list[list[F64]] = [[] for _ in parts]
-    for noise, share in classes.own_noises(parts):
-        likely = [AmplitudeClasses.of(m, unit, stays, noise) for m in parts]
-        ratio, quiet = classes.of_own_noise(pixels, parts, likely)
-        quiets.append(quiet + share)
-        ratios.append(ratio + quiets[-1][:, None])
-        for own, one in zip(products, likely, strict=True):
-            own.append(one.expected(lag))
-    weight = softmax(ratios, axis=0)
+    totals = [np.zeros((len(m.pixel), len(AMPLITUDES))) for m in parts]
+    weight, largest = np.zeros((2, len(pixels), len(AMPLITUDES)))
+    largest -= np.inf
+    every = np.full(len(pixels), -np.inf)
+    for noise, share in own_noises(parts):
+        classes = [AmplitudeClasses.of(m, unit, stays, noise) for m in parts]
+        ratio, quiet = of_own_noise(pixels, parts, classes)
+        ratio += quiet[:, None] + share
+        np.logaddexp(every, quiet + share, out=every)
+        before, largest = largest, np.maximum(largest, ratio)
+        kept, now = np.exp(before - largest), np.exp(ratio - largest)
+        weight = weight * kept + now
+        for m, one, total in zip(parts, classes, totals, strict=True):
+            at = np.searchsorted(pixels, m.pixel)
+            total *= kept[at]
+            total += now[at] * one.expected(lag)
     ats = (np.searchsorted(pixels, m.pixel) for m in parts)
-    expected = [
-        np.einsum("snk,snk->nk", weight[:, at], own) for at, own in zip(ats, products, strict=True)
-    ]
-    return logsumexp(ratios, axis=0) - logsumexp(quiets, axis=0)[:, None], expected
+    expected = [total / weight[at] for total, at in zip(totals, ats, strict=True)]
+    return largest + np.log(weight) - every[:, None], expected
