@@ -37,8 +37,8 @@ _TELL_LAMP = 3  # fewest flats per level to distinguish a warming lamp from lag
 class Lag(Effect):
     """Part of the charge of a frame appears in later frames.
 
-    Before the first frame of a recording the pixels were empty, or held what the last frame of the
-    recording before left (`carried`). A barrier may hold back another share of each band of the
+    Before the first frame of a recording the pixels were empty, or held what earlier recordings
+    left (`carried`). A barrier may hold back another share of each band of the
     level; traps take charge as long as they have room (`capacity_e`). Maps show nothing of it: the
     frame before is a sum of the same maps. `restored` undoes one share, without traps, on frames.
     """
@@ -259,7 +259,7 @@ class Lag(Effect):
 
         What stays lowers the contrast by ``share (1 - cos step)``. Pixels with another share than
         the rest leave the frame before in their residuals; the frame after is the control. Without
-        fringes the first frame of each flat tells.
+        fringes the level of darks after light tells, or else the first flat of each level.
         """
         if not evidence.fringes:
             if (slow := persistence(evidence)) is not None:
