@@ -14,7 +14,7 @@ _SURE = 5.0  # standard errors of the share
 _PARAMETERS = 2  # share and decay
 LONGEST = 15.0  # longest decay, in frames or median periods
 _SHORTEST = 0.1
-_OF_MODEL = 2e-3  # least relative error: frames between series are not all known
+_OF_MODEL = 2e-3  # least relative error: the light of a series is not quite steady
 _ROUNDS = 3  # of the fit, each with the light that the last one gives
 _STEP = 0.01  # relative, for derivatives by the decay
 

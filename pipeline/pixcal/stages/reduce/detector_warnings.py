@@ -46,7 +46,8 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
         warnings.append(
             "the levels of the flats deviate by up to "
             f"{100 * summary.linearity.max_deviation:.2g} % from a straight line over exposure "
-            "time: the response of all pixels, or the lamp, is not linear; no pixels are flagged "
+            "time: the response of all pixels is not linear, the lamp is not steady, or exposure "
+            "times are rounded or wrong; no pixels are flagged "
             "NONLINEAR for it"
         )
     warnings += _exposure_warnings(summary)
