@@ -1,11 +1,14 @@
-"""Frames of real numbers may lack samples (NaN): their pixels are measured on the other frames."""
+"""Frames of real numbers may lack samples (NaN): these pixels are measured on other frames.
+
+Of flats, on other levels: a pixel that is missing in one flat of the only level has no response.
+"""
 
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from test_cut_frames import frames, ingested
+from test_cut_frames import LEVELS, frames, ingested
 
 from pixcal.engine.run import Runtime
 from pixcal.stages import reduce
@@ -23,11 +26,18 @@ def test_a_frame_that_lacks_samples_costs_no_more_than_these(
     for name in ("whole", "lacking"):
         run, _ = ingested(tmp_path / name, taken)
         reduce.run(run, reduce.Config(), Runtime(cluster="sync", quiet=True))
-        gain = json.loads((run / "reduce/reduce.json").read_text())["gain_e_per_adu"]
-        level = ArrayReader(run / "reduce/calibration.zarr/bias").read()
-        found[name] = gain["used"], level
+        flags = json.loads((run / "reduce/reduce.json").read_text())["flags"]
+        maps = [ArrayReader(run / f"reduce/calibration.zarr/{m}").read() for m in ("bias", "flat")]
+        found[name] = flags, maps, ArrayReader(run / "reduce/calibration.zarr/mask").read()
         taken[kind][which][where] = np.nan
-    (gain, bias), (other, level) = found["whole"], found["lacking"]
-    assert other == pytest.approx(gain, rel=0.1)
-    assert np.isfinite(level).all()
-    np.testing.assert_allclose(level, bias, atol=40)
+    (flags, maps, _), (fewer, changed, mask) = found["whole"], found["lacking"]
+    # A flat without any sample is left out, like one without light.
+    lost = 25 * 37 if kind == "flat" and where[0].start else 0
+    assert fewer["no_data"] == lost
+    assert abs(fewer["good"] + lost - flags["good"]) < 0.01 * 41 * 53
+    # The mean of nine frames with noise of 12 ADU moves by 12 / sqrt(72) ADU without one of them,
+    # and by a ninth of 5 sigma if another sample is clipped.
+    most = 6 * 12 / 72**0.5 + 5 * 12 / 9
+    light = LEVELS["flat"] - LEVELS["bias"]
+    for before, after, unit in zip(maps, changed, (1.0, light), strict=True):
+        np.testing.assert_allclose(after[mask == 0], before[mask == 0], rtol=0, atol=most / unit)

@@ -40,7 +40,8 @@ class Lag(Effect):
     Before the first frame of a recording the pixels were empty, or held what earlier recordings
     left (`carried`). A barrier may hold back another share of each band of the
     level; traps take charge as long as they have room (`capacity_e`). Maps show nothing of it: the
-    frame before is a sum of the same maps. `restored` undoes one share, without traps, on frames.
+    frame before is a sum of the same maps. `restored` undoes one share, without traps, on frames;
+    it and `lost` take the release by frames (`decay_frames`, `later`), not by `decay_s`.
     """
 
     name = "lag"
@@ -145,9 +146,12 @@ class Lag(Effect):
         return float(np.exp(-1 / self.decay_frames)) if self.decay_frames else 0.0
 
     def check(self, bench: Bench) -> None:
-        """As in `ForwardModel.check`: traps are emptied frame by frame."""
+        """As in `ForwardModel.check`; traps of limited capacity release by frames."""
         if self.capacity_e and self.decay_s:
-            raise InputError("lag.decay_s: not with capacity_e, give decay_frames; or remove one")
+            raise InputError(
+                "lag.decay_s: with capacity_e, the release follows frames; give decay_frames "
+                "instead, or remove capacity_e"
+            )
 
     def charge(self, charge: F32, shot: Shot) -> F32:
         if self.capacity_e:

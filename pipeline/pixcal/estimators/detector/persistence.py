@@ -1,4 +1,4 @@
-"""Charge of earlier frames in frames without light that follow light: how much, how long."""
+"""Charge of earlier exposures that dark frames after light release: its share and decay."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -61,9 +61,9 @@ class _Sequence:
 
 
 def persistence(evidence: Evidence) -> Persistence | None:
-    """Fit of the level of frames without light soon after light; None without significant one.
+    """Fit to the level of dark frames soon after light; None if nothing significant is released.
 
-    Whether it decays over time or over frames is decided by the flats.
+    The flats decide whether the release follows time or the number of frames.
     """
     sequence = _sequence(evidence)
     if sequence is None:

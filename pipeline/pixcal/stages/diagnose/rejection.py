@@ -110,9 +110,9 @@ def unhelpful(
     without: Mapping[str, Trial],
     candidates: Mapping[str, Candidate],
 ) -> Rejection | None:
-    """A cause with which the differences are no smaller, beside the others or, if unknown, alone.
+    """A cause that does not reduce the differences left by the other causes.
 
-    Where an unknown cause is left, causes that close nothing alone only compensate others.
+    Where much of the gap stays open, also one that reduces none alone: it compensates others.
     """
     where = comparison.gap_of(current)
     left = comparison.residual_size(current, where)

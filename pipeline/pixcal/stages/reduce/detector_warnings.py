@@ -114,7 +114,7 @@ def lamp_warnings(series: Sequence[tuple[float, F64]]) -> list[str]:
     for seconds, levels in series:
         if len(levels) < _FEWEST or levels.mean() <= 0:
             continue
-        # The first one may lack the charge of lag.
+        # Lag may make the first flat fainter.
         light, time = levels[1:] / levels[1:].mean(), np.arange(1, len(levels))
         line = np.polyfit(time, light, 1)
         drift, scatter = abs(line[0]) * (len(time) - 1), float(np.std(np.diff(light)) / np.sqrt(2))
@@ -125,7 +125,8 @@ def lamp_warnings(series: Sequence[tuple[float, F64]]) -> list[str]:
     how = {"drifts": "over their series", "scatters": "rms from frame to frame"}
     return [
         f"the light of the flats {what} by up to {100 * size:.2g} % {how[what]} (exposures of "
-        f"{seconds:g} s): gain and noise allow for it; for linearity use a steady, warm lamp"
+        f"{seconds:g} s): gain and noise allow for it; for linearity, let the lamp warm up and "
+        "keep it steady"
         for what, (size, seconds) in found.items()
         if size
     ]
