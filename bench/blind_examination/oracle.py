@@ -55,7 +55,7 @@ def ask_oracle(
         ingest.run(acquisition, scratch / "run", ingest.Config(), runtime)
         reduce.run(scratch / "run", reduce.Config(), runtime)
         signatures = _signatures(diagnosed)
-        inputs = prepare_input(scratch / "run", runtime, lambda *_: signatures)
+        inputs = prepare_input(scratch / "run", runtime, signatures=signatures)
         trials = Trials(inputs.windows, scratch, inputs.runtime, signatures)
         true = effects_of(truth, bench)
         (nominal,) = trials.curves([()], REFERENCES, "nominal bench")

@@ -7,8 +7,8 @@ import pytest
 
 from pixcal.engine.bounds import Bound
 from pixcal.engine.run import Runtime
-from pixcal.stages.diagnose import search_run, trial
-from pixcal.stages.diagnose.trial import estimate
+from pixcal.stages.diagnose import trial
+from pixcal.stages.diagnose.trial import each_of, estimate
 
 EVIDENCE = cast(Any, object())
 
@@ -44,10 +44,9 @@ def test_it_is_not_decided_and_says_why() -> None:
 
 @pytest.mark.parametrize("cluster", ["sync", "threads"])
 def test_the_others_go_on(cluster: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(search_run, "OF_ESTIMATE", Bound(0.2))
+    monkeypatch.setattr(trial, "OF_ESTIMATE", Bound(0.2))
     kinds = cast(Any, {kind.name: kind for kind in (Endless, Missing)})
     runtime = Runtime(cluster=cluster, workers=2, memory=1 << 50)
-    found = search_run._each_of(kinds, partial(estimate, EVIDENCE), runtime, "estimate effects")
+    found = each_of(kinds, partial(estimate, EVIDENCE), runtime, "estimate effects")
     assert found["missing"] is None
     assert str(found["endless"]).startswith("not decided")
-    assert trial.OF_ESTIMATE.seconds > 1

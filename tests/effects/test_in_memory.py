@@ -56,7 +56,7 @@ def test_frames_in_memory_are_reduced_and_fitted_as_those_in_files(
     raw: RawFrames, sweep: Sweep, tmp_path: Path
 ) -> None:
     expected = evidence_on_disk(raw, tmp_path)
-    run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction, sweep)
+    run = run_in_memory(raw, sweep)
     found = evidence_of(run)
     for name in ("bias", "dark_rate", "flat", "good"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
@@ -78,7 +78,7 @@ def test_frames_in_memory_are_reduced_and_fitted_as_those_in_files(
 
 
 def test_halves_that_come_with_an_evidence_are_those_of_its_samples(raw: RawFrames) -> None:
-    run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction)
+    run = run_in_memory(raw)
     for one in evidence_of(run, within=((7, 5), (150, 80))).fringes.values():
         assert (one.origin, one.window) == ((7, 5), (150, 80))
         # Samples that are cut are no longer those the halves came from.
@@ -94,7 +94,7 @@ def test_nothing_is_written(
 ) -> None:
     """Nor are the frames copied: those that are read are those that were given."""
     monkeypatch.chdir(tmp_path)
-    run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction)
+    run = run_in_memory(raw)
     assert list(tmp_path.iterdir()) == []
     assert (run / "ingest" / "raw.zarr" / "bias").array.values is raw.arrays["bias"]
 

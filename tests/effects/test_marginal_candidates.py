@@ -7,8 +7,8 @@ from pixcal.effects.ipc import Ipc
 from pixcal.effects.row_noise import RowNoise
 from pixcal.estimators.test_statistics.gap import Difference
 from pixcal.simulation.effect import Again, Effect, Estimate
-from pixcal.stages.diagnose.candidates import Candidate
-from pixcal.stages.diagnose.search_run import marginal_candidates, needs_slow
+from pixcal.stages.diagnose.candidates import Candidate, marginal_candidates
+from pixcal.stages.diagnose.search_run import needs_slow
 
 KINDS: dict[str, type[Effect]] = {"ipc": Ipc, "row_noise": RowNoise}
 

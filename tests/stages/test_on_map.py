@@ -9,11 +9,12 @@ from pixcal.effects.lag import Lag
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.estimators.detector.lag_by_level import FittedLoss
 from pixcal.simulation.effect import FringeMaps
-from pixcal.stages.advice import limit, moved_by, size_of, unexplained
+from pixcal.stages.advice import NOTHING, limit, moved_by, size_of, unexplained
 from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.stage import on_map
 
 K = (0.03, 2 * np.pi / 9)
+UNFITTED = "auto", {}
 
 
 def fitted(effect=None, shape=(48, 52)):
@@ -26,33 +27,33 @@ def fitted(effect=None, shape=(48, 52)):
     return FittedSet(maps.theta, np.zeros(shape), np.full(shape, 1e-4), K, (0, 0))
 
 
-def test_crosstalk_that_repeats_moves_rows_by_its_share(tmp_path):
+def test_crosstalk_that_repeats_moves_rows_by_its_share():
     """A share k from the row above turns the phase by k sin K in one row of two."""
     share = 0.02
     effect = Ipc.of_rows([np.array([[0, 0, 0], [0, 0, 0], [0, share, 0]]), np.zeros((3, 3))])
-    found = on_map(effect, [fitted(effect)], tmp_path)
+    found = on_map(effect, [fitted(effect)], UNFITTED)
     expected = share * np.sin(K[1]) / np.hypot(*K) / 2
     assert found["action"] == "corrected"
     assert found["rms_px"] == pytest.approx(expected, rel=0.1)
     assert found["max_px"] >= found["rms_px"]
 
 
-def test_the_same_crosstalk_everywhere_is_a_shift_that_no_map_holds(tmp_path):
+def test_the_same_crosstalk_everywhere_is_a_shift_that_no_map_holds():
     effect = Ipc.nearest(0.01)
     inside = fitted(effect)
     inside.theta[:, [0, -1]] = inside.theta[:, :, [0, -1]] = np.nan
     # What the first row does not get reaches the second, with the square of the share.
-    assert on_map(effect, [inside], tmp_path)["rms_px"] < 0.01 * 0.01
+    assert on_map(effect, [inside], UNFITTED)["rms_px"] < 0.01 * 0.01
 
 
-def test_what_the_fit_takes_up_moves_nothing(tmp_path):
-    found = on_map(Lag(), [fitted()], tmp_path)
+def test_what_the_fit_takes_up_moves_nothing():
+    found = on_map(Lag(), [fitted()], UNFITTED)
     assert found == {"rms_px": 0.0, "max_px": 0.0, "action": "unaffected"}
 
 
 @pytest.mark.parametrize("effect", [Nonlinearity(), BrighterFatter()])
-def test_what_acts_on_samples_moves_offsets_in_proportion(effect, tmp_path):
-    one, double = (on_map(effect.scaled(f), [fitted()], tmp_path)["rms_px"] for f in (1, 2))
+def test_what_acts_on_samples_moves_offsets_in_proportion(effect):
+    one, double = (on_map(effect.scaled(f), [fitted()], UNFITTED)["rms_px"] for f in (1, 2))
     assert one > 0
     assert double == pytest.approx(2 * one, rel=0.15)
 
@@ -94,7 +95,7 @@ def test_what_no_cause_explains_has_a_size():
     assert action.endswith("recommended frames: darks")
     found["gap"]["where"] = where[1:2]
     assert unexplained(found)[0][1] == "level, all: 5.020 e⁻ (simulated: 5.010)"
-    assert unexplained(found | {"verdict": "explained"}) == unexplained(None) == ()
+    assert unexplained(found | {"verdict": "explained"}) == unexplained(NOTHING) == ()
 
 
 def test_what_nothing_is_known_of_is_not_said_to_do_nothing():
@@ -109,7 +110,7 @@ def test_what_nothing_is_known_of_is_not_said_to_do_nothing():
         moved = {"rms_px": rms, "max_px": 2 * rms, "action": action}
         cause = {"effect": "glow", "on_map": moved}
         assert moved_by(cause, sigma) == said
-        limited = limit(sigma, {"causes": [cause], "verdict": "explained"}, None)
+        limited = limit(sigma, {"causes": [cause], "verdict": "explained"}, NOTHING)
         assert ("glow may bias" in limited) == (said == "not known")
 
 

@@ -17,7 +17,10 @@ from pixcal.storage.stage import require, without_fringes
 
 Json = Mapping[str, Any]
 
+# in place of an artefact that is not there
+NOTHING: Json = {"outputs": (), "sets": {}, "effects": (), "causes": (), "verdict": None}
 NEGLIGIBLE = 1e-3  # change of the offsets over their errors below which it is not given
+WITH_GAP = ("unexplained", "partly explained")  # verdicts that leave part of the gap open
 # share of SIGMA from which an error that SIGMA does not hold limits a map
 MIN_BIAS_OVER_SIGMA = 0.3
 
@@ -33,13 +36,10 @@ class Advice:
 
 def advice(run_dir: Path) -> Advice:
     """What fit, diagnosis and correction of a run say together, as far as they were made."""
-    fit = _artefact(run_dir, "fit", "fit.json") or {"outputs": [], "sets": {}}
+    fit, correction = _artefact(run_dir, "fit", "fit.json"), _correction(run_dir)
     diagnosis = _artefact(run_dir, "diagnose", "diagnosis.json")
-    correction = _correction(run_dir)
-    sigma = _sigma(fit, correction)
-    causes = diagnosis["causes"] if diagnosis else ()
-    shapes = fitted_shapes(run_dir)
-    fringes = not without_fringes(run_dir)
+    sigma, causes = _sigma(fit, correction), diagnosis["causes"]
+    shapes, fringes = fitted_shapes(run_dir), not without_fringes(run_dir)
 
     def action(cause: Json) -> str:
         to_do = str(cause.get("remedy", ""))
@@ -70,82 +70,79 @@ def advice(run_dir: Path) -> Advice:
 def maps_to_use(run_dir: Path) -> dict[str, Path]:
     """The products to use, by the names of their maps: corrected ones where there are any."""
     require(run_dir, "fit")
-    source: Json = read_json(run_dir / "fit" / "fit.json")
-    correction, suffix = _correction(run_dir), ""
-    if correction is not None and correction["outputs"]:
-        source, suffix = correction, SUFFIX
+    source, suffix = _correction(run_dir), SUFFIX
+    if not source["outputs"]:
+        source, suffix = read_json(run_dir / "fit" / "fit.json"), ""
     return {name: run_dir / "products" / f"{name}{suffix}.fits" for name in source["outputs"]}
 
 
-def _artefact(run_dir: Path, stage: str, file: str) -> Json | None:
-    """Contents of the file of a stage that was run."""
+def _artefact(run_dir: Path, stage: str, file: str) -> Json:
+    """Contents of the file of a stage, or `NOTHING`."""
     if not (run_dir / stage / MANIFEST).exists():
-        return None
+        return NOTHING
     require(run_dir, stage)
     contents: Json = read_json(run_dir / stage / file)
     return contents
 
 
-def _correction(run_dir: Path) -> Json | None:
-    """The correction of the present fit and diagnosis, if there is one."""
+def _correction(run_dir: Path) -> Json:
+    """The correction, unless it is of another fit or diagnosis."""
     correction = _artefact(run_dir, "corrected", "correction.json")
-    if correction is not None:
-        for stage, key in require(run_dir, "corrected").inputs.items():
-            if read_json(run_dir / stage / MANIFEST)["key"] != key:
-                return None
-    return correction
+    if correction is NOTHING:
+        return correction
+    made_from = require(run_dir, "corrected").inputs
+    present = {stage: read_json(run_dir / stage / MANIFEST)["key"] for stage in made_from}
+    return correction if present == made_from else NOTHING
 
 
-def _sigma(fit: Json, correction: Json | None) -> dict[str, float]:
+def _sigma(fit: Json, correction: Json) -> dict[str, float]:
     """Error of the median pixel of each set, px, in the maps to use."""
     each = {name: s["sigma_median_px"] for name, s in fit["sets"].items()}
-    if correction is not None and correction["outputs"]:
+    if correction["outputs"]:
         each = {name: s["sigma_median_px"]["after"] for name, s in correction["sets"].items()}
     return {name: sigma for name, sigma in each.items() if sigma and math.isfinite(sigma)}
 
 
-def _correction_clause(diagnosis: Json | None, correction: Json | None, it_needs: str) -> str:
-    if diagnosis is None:
+def _correction_clause(diagnosis: Json, correction: Json, it_needs: str) -> str:
+    if diagnosis is NOTHING:
         return " as fitted. No diagnosis was made, so biases are unknown"
-    if correction is not None and correction["outputs"]:
+    if correction["outputs"]:
         freed = [e["effect"] for e in correction["effects"] if e["treatment"] in CORRECTED]
         return f", corrected for {' and '.join(freed)}"
     if any(c["on_map"]["action"] == "corrected" for c in diagnosis["causes"]):
         return " as fitted, NOT corrected for the effects below"
-    if unknown := _unknown(diagnosis):
+    if unknown := _unknown(diagnosis["causes"]):
         return f" as fitted. The effect of {' and '.join(unknown)} on the offsets is unknown"
     return f" as fitted. {it_needs} no correction"
 
 
-def _unknown(diagnosis: Json | None) -> list[str]:
+def _unknown(causes: Sequence[Json]) -> list[str]:
     """Causes that are neither absorbed nor corrected: their change of the maps is unknown."""
-    causes = (diagnosis or {}).get("causes", ())
     left = [c for c in causes if c["on_map"]["action"] == "fix the bench"]
     return [c["effect"] for c in left if not c["on_map"]["rms_px"]]
 
 
-def limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json | None) -> str:
+def limit(sigma: Mapping[str, float], diagnosis: Json, correction: Json) -> str:
     """What limits the maps: the largest bias, or noise."""
-    made = correction if correction is not None and correction["outputs"] else None
     least = min(sigma.values(), default=math.nan)
     noise = ", ".join(f"{number(s, 2)} px ({name})" for name, s in sigma.items())
     biases = {
         cause["effect"]: cause["on_map"]["rms_px"]
-        for cause in (diagnosis or {}).get("causes", ())
-        if not (made and cause["on_map"]["action"] == "corrected")
+        for cause in diagnosis["causes"]
+        if not (correction["outputs"] and cause["on_map"]["action"] == "corrected")
     }
     largest = max(biases, key=lambda name: biases[name], default="")
     if biases.get(largest, 0.0) > MIN_BIAS_OVER_SIGMA * least:
         moved = f"{number(biases[largest], 2)} px rms"
         return f"Limited by {largest}, which moves offsets by {moved}; the noise is {noise}."
-    if diagnosis is not None and diagnosis["verdict"] in ("unexplained", "partly explained"):
+    if diagnosis["verdict"] in WITH_GAP:
         return (
             f"The noise is {noise}. Part of the gap has no known cause, so the maps may be biased."
         )
-    if unknown := _unknown(diagnosis):
+    if unknown := _unknown(diagnosis["causes"]):
         return f"The noise is {noise}. {' and '.join(unknown)} may bias the maps."
-    sets = made["sets"].values() if made else ()
-    kept = max((e for s in sets for e in s["parameter_error_px"].values() if e), default=0.0)
+    errors = [e for s in correction["sets"].values() for e in s["parameter_error_px"].values()]
+    kept = max(filter(None, errors), default=0.0)
     if kept > MIN_BIAS_OVER_SIGMA * least:
         return (
             f"Limited by noise: {noise}, including up to {number(kept, 2)} px rms from the "
@@ -158,28 +155,26 @@ def moved_by(cause: Json, sigma: Mapping[str, float]) -> str:
     """Change of the offsets, against the error of the best set's median pixel."""
     rms, most = cause["on_map"]["rms_px"], cause["on_map"]["max_px"]
     if not rms or not sigma:
-        return "not known" if _unknown({"causes": [cause]}) else "none"
+        return "not known" if _unknown([cause]) else "none"
     in_sigma = rms / min(sigma.values())
     if in_sigma < NEGLIGIBLE:
         return f"below {NEGLIGIBLE:g} σ"
     return f"{number(rms, 2)} px rms ({number(in_sigma, 2)} σ), {number(most, 2)} px maximum"
 
 
-def _treated(cause: Json, correction: Json | None) -> Json | None:
+def _treated(cause: Json, correction: Json) -> Json | None:
     """Entry of an effect in the correction, where there is one."""
-    entries = (correction or {}).get("effects", ())
-    return next((e for e in entries if e["effect"] == cause["effect"]), None)
+    return next((e for e in correction["effects"] if e["effect"] == cause["effect"]), None)
 
 
-def _nothing_to_do(cause: Json, correction: Json | None, with_maps: bool) -> bool:
-    """Whether nothing remains to be done about an effect."""
+def _nothing_to_do(cause: Json, correction: Json, with_maps: bool) -> bool:
     action, treated = cause["on_map"]["action"], _treated(cause, correction)
     done = not with_maps or (treated is not None and treated["treatment"] in CORRECTED)
     return bool(action == "unaffected" or (action == "corrected" and done))
 
 
 def _action(
-    cause: Json, correction: Json | None, shapes: tuple[str, Mapping[str, str]], with_maps: bool
+    cause: Json, correction: Json, shapes: tuple[str, Mapping[str, str]], with_maps: bool
 ) -> str:
     """How an effect was treated, or what to do about it."""
     action, treated = cause["on_map"]["action"], _treated(cause, correction)
@@ -209,18 +204,18 @@ def _to_distinguish(cause: Json) -> str:
     return f"; to distinguish it from {others}, also record {', '.join(cause['would_decide'])}"
 
 
-def unexplained(diagnosis: Json | None) -> tuple[tuple[str, ...], ...]:
+def unexplained(diagnosis: Json) -> tuple[tuple[str, ...], ...]:
     """A row on the largest departure that no cause explains, where there is one."""
-    verdict, gap = (diagnosis or {}).get("verdict"), (diagnosis or {}).get("gap", {})
-    if not diagnosis or verdict not in ("unexplained", "partly explained") or not gap["where"]:
+    if diagnosis["verdict"] not in WITH_GAP or not diagnosis["gap"]["where"]:
         return ()
-    ranked = sorted(gap["where"], key=lambda e: -abs(e["z_after"]))
+    ranked = sorted(diagnosis["gap"]["where"], key=lambda e: -abs(e["z_after"]))
     first, sized = ranked[0], [e for e in ranked if e["unit"] != "σ"]
     # The size of what only has a significance shows best in another statistic.
     shown = ranked[:1] + (sized[:1] if first["unit"] == "σ" else [])
     size = "; ".join(map(_departure, shown))
-    frames = "; recommended frames: ".join(["", ", ".join(diagnosis["more_would_tell"])])
-    action = f"find the cause on the bench{frames if diagnosis['more_would_tell'] else ''}"
+    frames = ", ".join(diagnosis["more_would_tell"])
+    more = f"; recommended frames: {frames}" if frames else ""
+    action = f"find the cause on the bench{more}"
     return (("unexplained", size, sigmas(abs(first["z_after"])), "not known", action),)
 
 

@@ -89,8 +89,8 @@ def evidence_of(
 
 def _photon_transfer(gain: dict[str, Any]) -> tuple[float, float, float]:
     """Gain measured, its error and reduced chi-square; nan where there is none."""
-    found = (gain.get(key) for key in ("measured", "error", "chi2_reduced"))
-    value, error, chi2 = (np.nan if v is None else float(v) for v in found)
+    keys = ("measured", "error", "chi2_reduced")
+    value, error, chi2 = np.array([gain.get(key) for key in keys], float).tolist()
     return value, error, chi2
 
 
@@ -170,7 +170,7 @@ def _stacks(ingested: Ingested, part: Part) -> tuple[Stack, ...]:
         if kind not in ingested.tables:
             continue
         table: dict[str, list[Any]] = ingested.tables[kind]
-        exposures = np.array([np.nan if t is None else t for t in table["exptime_s"]], float)
+        exposures = np.array(table["exptime_s"], float)
         frames = ingested.arrays[kind].read((0, len(exposures)), *part)
         times = np.asarray(table["time_s"], float)
         for own in groups(table):

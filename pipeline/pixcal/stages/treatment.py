@@ -33,14 +33,9 @@ class Treatment:
     covariance: F64 | None = None  # (n, n) of the parameters, where they were measured together
 
     @property
-    def corrects(self) -> bool:
-        """Whether corrected maps are made without it."""
-        return self.how in CORRECTED
-
-    @property
     def action(self) -> str:
         """What to do about the map, as in ``diagnosis.json``."""
-        if self.corrects:
+        if self.how in CORRECTED:
             return "corrected"
         absorbed = self.how in ("in the fit", "absorbed by the fit")
         return "unaffected" if absorbed or self.effect.left_because else "fix the bench"

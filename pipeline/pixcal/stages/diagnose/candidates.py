@@ -1,13 +1,26 @@
-"""Candidates of a search for causes, and its result."""
+"""Candidates of a search for causes: effects estimated on the fitted frames; and its result."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
+import numpy as np
+
+from pixcal.engine.run import Runtime
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.kernels.significance import SIGNIFICANT
+from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.comparison import Trial
-from pixcal.stages.diagnose.trial import Effects
+from pixcal.stages.diagnose.frames_used import FRINGES, MORE, FramesUsed
+from pixcal.stages.diagnose.trial import Effects, Signature, each_of, estimate
 
 NEARLY_ALL = 0.9  # share of its significance above which a candidate is not scaled down
+# significance of a slow estimate up to which it is a test statistic, and without fringes from which
+MAX_SLOW_SIGNIFICANCE, MIN_DARK_SIGNIFICANCE = 20.0, 10.0
+# significance over that of the strongest candidate below which a score test, which takes a fifth of
+# a simulation, is none: the strongest effect is likely to produce it
+MIN_RELATIVE_SIGNIFICANCE = 0.05
 
 
 @dataclass
@@ -67,6 +80,83 @@ class Candidate:
         if effect == self.replay:
             return self.estimate.effect
         return self.estimate.by_law
+
+
+def estimated(
+    evidence: Evidence,
+    unseen: Evidence,
+    kinds: Mapping[str, type[Effect]],
+    base: Effects,
+    runtime: Runtime,
+) -> dict[str, Candidate]:
+    """Every effect beyond the ``base``, measured on the evidence; replays are of the unseen one."""
+    there = {effect.name for effect in base}
+    tried = {name: kind for name, kind in kinds.items() if name not in there}
+    found = each_of(tried, partial(estimate, evidence), runtime, "estimate effects")
+    candidates = {}
+    for name, one in found.items():
+        if isinstance(one, Estimate):
+            candidates[name] = Candidate(name, one, one.refused, replay=_replayed(one, unseen))
+        else:
+            candidates[name] = Candidate(name, None, one or "")
+    return candidates
+
+
+def _replayed(found: Estimate, unseen: Evidence) -> Effect | None:
+    """The effect as measured, in full or frame by frame; None if its law is complete."""
+    if found.refused or found.significance < SIGNIFICANT:
+        return None
+    if found.in_full is not None:
+        return found.in_full
+    try:
+        replay = found.effect.replayed(unseen)
+    except (InputError, np.linalg.LinAlgError, ValueError, ArithmeticError):
+        return None
+    return None if replay is None or replay.is_null else replay
+
+
+def note_missing(
+    candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]], facts: FramesUsed
+) -> None:
+    """Give candidates without an estimate the frames that they need, and the reason."""
+    for name, candidate in candidates.items():
+        if candidate.estimate is None and not candidate.reason:
+            candidate.needs = _needs(kinds[name], facts)
+            candidate.reason = (
+                f"cannot be estimated from these frames; record {' or '.join(candidate.needs)}"
+            )
+
+
+def _needs(kind: type[Effect], facts: FramesUsed) -> tuple[str, ...]:
+    """Frames needed to estimate an effect."""
+    if not facts.sets and not kind.remedy:
+        return (FRINGES,)
+    missing = facts.missing_frames
+    frames = tuple(words for name, words in missing.items() if name in kind.frames_needed)
+    # Without fringes, any missing frames of a sensor may show the effect.
+    return frames or (() if facts.sets else tuple(missing.values())) or (MORE,)
+
+
+def marginal_candidates(
+    candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]], *, fringes: bool = True
+) -> tuple[Signature, ...]:
+    """Candidates significant in the fitted frames; a slow one only if it is the strongest.
+
+    With fringes only if it is weak, as a strong one shows in other statistics; without them only if
+    it is strong, as a weak one is slow to confirm.
+    A score test that is faint beside the strongest candidate is left out.
+    """
+    seen = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
+    most = max((e.significance for e in seen.values()), default=0.0)
+    strongest = most < MAX_SLOW_SIGNIFICANCE if fringes else most > MIN_DARK_SIGNIFICANCE
+    # Sorted by name, since the order of candidates must not affect the curves.
+    return tuple(
+        one.again or kinds[name]
+        for name, one in sorted(seen.items())
+        if one.significance >= SIGNIFICANT
+        and (one.again is None or one.significance >= MIN_RELATIVE_SIGNIFICANCE * most)
+        and (kinds[name].quick or (strongest and one.significance == most))
+    )
 
 
 @dataclass(frozen=True, eq=False)

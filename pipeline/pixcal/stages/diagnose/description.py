@@ -93,13 +93,12 @@ def recordings_of(
     listed = {f"fringes/{s.name}": n for n, s in enumerate(acquisition.frames.fringes)}
     recordings, places, light = [], [], {}
     for name, table in tables.items():
-        exposures = np.array([np.nan if t is None else t for t in table["exptime_s"]], float)
+        exposures = np.nan_to_num(np.array(table["exptime_s"], float))
         times = np.array(table["time_s"], float)
         kind = name.split("/")[0]
         own = [np.arange(len(times))] if name in listed else groups(table)
         for n, numbers in enumerate(own):
             exposure = float(exposures[numbers[0]])
-            exposure = 0.0 if np.isnan(exposure) else exposure
             period = float(np.median(np.diff(times[numbers]))) if len(numbers) > 1 else exposure
             electrons = 1.0 if name in listed else 0.0
             if kind == "flat":

@@ -1,23 +1,37 @@
 """Input of a diagnosis: windows of a reduced run, their nominal bench, their statistics."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from pixcal.engine.plan import Plan, make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect
 from pixcal.stages import reduce
-from pixcal.stages.diagnose.dark_series import in_series
+from pixcal.stages.diagnose.candidates import (
+    Candidate,
+    estimated,
+    marginal_candidates,
+    note_missing,
+)
 from pixcal.stages.diagnose.frames_used import FramesUsed, frames_of, missing_frames
+from pixcal.stages.diagnose.halves import Split, frames_of_half, in_series, split
 from pixcal.stages.diagnose.measure_nominal import nominal_bench
 from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, RunFrames, evidence_of, take
-from pixcal.stages.diagnose.trial import Curves, Signature, Window, averaged, measured_curves
-from pixcal.stages.diagnose.windows import Split, chosen_windows, frames_of_half, split
+from pixcal.stages.diagnose.trial import (
+    Curves,
+    Effects,
+    Signature,
+    Window,
+    averaged,
+    measured_curves,
+)
+from pixcal.stages.diagnose.windows import chosen_windows
 from pixcal.stages.evidence import Part
 from pixcal.stages.reduce.black_cut_off import Black
 from pixcal.stages.reduce.ingested import Ingested
@@ -40,40 +54,46 @@ class DiagnosisInput:
     first: Window  # window to which effects are fitted
     windows: tuple[Window, ...]  # windows on which they are tested
     each: tuple[Curves, ...]  # curves of the test frames of each window
-    measured: Curves  # their mean
     facts: FramesUsed
     # runtime, few: with as many workers as fit in memory, for simulations and for estimates
     runtime: Runtime
     few: Runtime
     # whether memory suffices to run estimates in this process in parallel with simulations
     room: bool = False
+    candidates: dict[str, Candidate] = field(default_factory=dict)  # by name of the effect
+    signatures: tuple[Signature, ...] = ()  # effects whose estimates are statistics too
+
+    @cached_property
+    def measured(self) -> Curves:
+        """Mean curves of the windows."""
+        return averaged(self.each)
 
 
 def prepare_input(
     run_dir: Path,
     runtime: Runtime,
-    on_evidence: Callable[[Evidence, Evidence, Runtime], Sequence[Signature]] = lambda *_: (),
+    kinds: Mapping[str, type[Effect]] | None = None,
+    base: Effects = (),
+    signatures: Sequence[Signature] = (),
 ) -> DiagnosisInput:
-    """Select the parts of a reduced run to analyse, and measure their nominal bench.
+    """Select the parts of a reduced run to analyse; measure nominal bench, statistics and effects.
 
-    ``on_evidence``: called with the evidence to fit, the evidence to test, and the runtime of
-    estimates; returns the estimates to use as statistics. Raises InputError: too few frames, or a
-    part cannot be fitted.
+    ``kinds``: effects that may be causes; ``base``: those that the nominal bench includes;
+    ``signatures``: those whose estimates are statistics in any case. Raises InputError: too few
+    frames, or a part cannot be fitted.
     """
-    ingested = Ingested(run_dir / "ingest")
-    frames, shape = _run_frames(run_dir, ingested), ingested.shape
-    tables = frames.tables
-    fringes = frames.acquisition.frames.fringes
+    ingested, reduced = Ingested(run_dir / "ingest"), read_json(run_dir / "reduce" / "reduce.json")
+    frames, shape, kinds = _run_frames(run_dir, ingested, reduced), ingested.shape, kinds or {}
+    tables, fringes = frames.tables, bool(frames.acquisition.frames.fringes)
     first, parts = chosen_windows(shape, 0 if fringes else frames_of_half(tables))
     pixels = (first[0][1] - first[0][0]) * (first[1][1] - first[1][0])
-    saturation = read_json(run_dir / "reduce" / "reduce.json")["saturation_adu"]
-    own = split(tables, pixels, saturation.get("full_frames", ()))
+    own = split(tables, pixels, reduced["saturation_adu"].get("full_frames", ()))
     _enough(own.test)
     runtime, few, room = _memory(own.test, pixels, runtime)
+    candidates: dict[str, Candidate] = {}
     windows: list[Window] = []
     left_out: list[dict[str, Any]] = []
     measured: list[Curves] = []
-    signatures: tuple[Signature, ...] = ()
     for part in dict.fromkeys((first, *parts)):
         raws = [take(ingested, frames, half, part) for half in (own.learn, own.test)]
         seed = windows[0].seed if windows else raws[0].checksum
@@ -92,26 +112,38 @@ def prepare_input(
         full = halves[0].saturated | halves[1].saturated
         halves = [replace(half, full=full) for half in halves]
         if not windows:
-            signatures = tuple(on_evidence(halves[0], halves[1], few))
+            candidates = estimated(halves[0], halves[1], kinds, base, few)
+            marginal = marginal_candidates(candidates, kinds, fringes=fringes)
+            signatures = (*signatures, *marginal)
         bench = nominal_bench(frames, halves, (own.learn, own.test), shape)
         windows.append(Window(part, bench, own.learn, own.test, shape, seed, full))
         if part in parts:
             measured.append(measured_curves(halves[1], signatures))
     tried = tuple(w for w in windows if w.part in parts)
     facts = _frames_used(frames, own, windows[0], tried, left_out)
+    note_missing(candidates, kinds, facts)
+    each, signatures = tuple(measured), tuple(signatures)
     return DiagnosisInput(
-        windows[0], tried, tuple(measured), averaged(measured), facts, runtime, few, room
+        windows[0], tried, each, facts, runtime, few, room, candidates, signatures
     )
 
 
-def _run_frames(run_dir: Path, ingested: Ingested) -> RunFrames:
-    found = read_json(run_dir / "reduce" / "reduce.json")
-    gain, subtracted = found["gain_e_per_adu"], float(found.get("subtracted_dark_e_s") or 0.0)
+def _run_frames(run_dir: Path, ingested: Ingested, reduced: Mapping[str, Any]) -> RunFrames:
+    """All frames of a run; every window uses the saturation level of the whole detector."""
+    gain, subtracted = reduced["gain_e_per_adu"], float(reduced.get("subtracted_dark_e_s") or 0.0)
+    acquisition = read_acquisition(run_dir)
+    detector = replace(
+        acquisition.detector,
+        saturation_adu=acquisition.detector.saturation_adu or ingested.saturation_found,
+        gain_e_per_adu=acquisition.detector.gain_e_per_adu or float(gain["used"]),
+    )
+    options = reduce.Config.__dataclass_fields__
+    known = {k: v for k, v in require(run_dir, "reduce").config.items() if k in options}
     return RunFrames(
-        _acquisition(run_dir, ingested),
+        replace(acquisition, detector=detector),
         in_series(ingested.tables),
         {name: array.dtype for name, array in ingested.arrays.items()},
-        _reduction(run_dir),
+        parse(reduce.Config, known, str(run_dir / "reduce" / "manifest.json")),
         Black(ingested.cut_off, gain.get("without_dark"), subtracted / float(gain["used"])),
     )
 
@@ -133,18 +165,6 @@ def _frames_used(
         tuple(kind for kind in ("bias", "dark", "flat") if kind in frames.tables),
         {s.name: s.baseline_mm for s in frames.acquisition.frames.fringes},
         missing_frames(frames.acquisition, frames.tables, steps),
-    )
-
-
-def _acquisition(run_dir: Path, ingested: Ingested) -> Acquisition:
-    """The acquisition; every window uses the saturation level of the whole detector."""
-    acquisition = read_acquisition(run_dir)
-    saturation = acquisition.detector.saturation_adu or ingested.saturation_found
-    used = read_json(run_dir / "reduce" / "reduce.json")["gain_e_per_adu"]["used"]
-    gain = acquisition.detector.gain_e_per_adu or float(used)
-    return replace(
-        acquisition,
-        detector=replace(acquisition.detector, saturation_adu=saturation, gain_e_per_adu=gain),
     )
 
 
@@ -200,9 +220,3 @@ def _enough(half: FrameSubset) -> None:
                 f"{name}: only {len(frames)} frames in one half; diagnose needs {FEWEST_FRAMES} in "
                 "each: it fits effects on one and tests them on the other"
             )
-
-
-def _reduction(run_dir: Path) -> reduce.Config:
-    plain = dict(require(run_dir, "reduce").config)
-    known = {k: v for k, v in plain.items() if k in reduce.Config.__dataclass_fields__}
-    return parse(reduce.Config, known, str(run_dir / "reduce" / "manifest.json"))

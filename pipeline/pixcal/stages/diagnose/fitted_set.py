@@ -19,7 +19,6 @@ from pixcal.estimators.maps.two_beams import contrast_surface, light_surface
 from pixcal.kernels.beams import LightMaps, with_margin
 from pixcal.kernels.crosstalk import filled
 from pixcal.model.arrays import F32, F64
-from pixcal.model.bench import SimulatedDetector
 from pixcal.simulation.effect import Effect, FittedFrames, FringeMaps
 
 ACROSS = 9  # side (pixels) of the uniform frames on which effects are undone
@@ -29,23 +28,14 @@ _EVEN = np.stack([np.ones(MAP_PHASES), np.cos(_PHASES), np.sin(_PHASES)], axis=1
 TURNS = 5  # iterations of the fits of pixels and frames: each gains a factor of three or more
 
 
-@dataclass(frozen=True)
-class IntensityBeforeEffects:
-    """Levels of uniform light before the effects that are undone on samples."""
-
-    effects: Sequence[Effect]
-    detector: SimulatedDetector
-
-    def levels(self, levels: F64) -> F64:
-        """Levels (e-) of uniform frames without the effects."""
-        frames = np.broadcast_to(levels[:, None, None], (len(levels), ACROSS, ACROSS))
-        found = start = np.asarray(frames, np.float32)
-        for effect in sorted(self.effects, key=lambda e: e.sort_key, reverse=True):
-            corrected = effect.undo_samples(found)
-            found = found if corrected is None else corrected
-        if found is start:
-            return levels
-        return np.asarray(found[:, ACROSS // 2, ACROSS // 2], float)
+def levels_before(levels: F64, effects: Sequence[Effect]) -> F64:
+    """Levels (e-) of uniform frames without the effects that are undone on samples."""
+    frames = np.broadcast_to(levels[:, None, None], (len(levels), ACROSS, ACROSS))
+    found = start = np.asarray(frames, np.float32)
+    for effect in sorted(effects, key=lambda e: e.sort_key, reverse=True):
+        corrected = effect.undo_samples(found)
+        found = found if corrected is None else corrected
+    return levels if found is start else np.asarray(found[:, ACROSS // 2, ACROSS // 2], float)
 
 
 def corrected_on_samples(

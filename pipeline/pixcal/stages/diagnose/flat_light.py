@@ -9,8 +9,10 @@ import numpy as np
 from pixcal.estimators.detector.flat_ladder import LAMP, flicker, ladder, rise_of, straight_line
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.arrays import F64
+from pixcal.model.bench import SimulatedDetector
+from pixcal.simulation.effect import Effect
 from pixcal.simulation.recording import Recording
-from pixcal.stages.diagnose.fitted_set import IntensityBeforeEffects
+from pixcal.stages.diagnose.fitted_set import levels_before
 
 SERIES = 8  # least frames of a series to use the measured light of each; otherwise it is drawn
 
@@ -91,16 +93,15 @@ class FlatLight:
         return self.flicker / math.sqrt(square)
 
     def levels(
-        self, recordings: Sequence[Recording], before: IntensityBeforeEffects
+        self, recordings: Sequence[Recording], effects: Sequence[Effect], d: SimulatedDetector
     ) -> dict[int, float]:
         """Electrons of each flat, by number, before effects; linear in time if of one lamp."""
         flats = [r for r in recordings if r.kind == "flat" and r.electrons > 0]
         if not flats:
             return {}
         times = np.array([r.exptime_s for r in flats])
-        levels = before.levels(np.array([r.electrons for r in flats]))
+        levels = levels_before(np.array([r.electrons for r in flats]), effects)
         if self.one_lamp:
-            d = before.detector
             below = levels < (d.top_adu - d.bias_adu) * d.gain_e_per_adu
             own = np.isin(times, list(self.off), invert=True)
             below = below & own if (below & own).any() else own

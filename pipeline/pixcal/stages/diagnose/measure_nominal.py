@@ -262,7 +262,8 @@ def _phases(found: Sequence[FringeEvidence], frames: Sequence[Indices], count: i
 def _gain(evidence: Sequence[Evidence], flat: F64, good: Mask, with_flats: bool) -> MeasuredGain:
     """Gain from flats and declared value, and of each amplifier if flats show steps."""
     amplifiers = np.ones(good.shape)
-    noise = [n for e in evidence for n in _noise_ratios(e)]
+    # mean squared residual over shot and read variance
+    noise = [FringeSetData(one, e).moments[0] for e in evidence for one in e.fringes.values()]
     if with_flats and noise:
         amplifiers = relative_gain(flat, np.mean(noise, axis=0), good)
     found = [(one.gain, *one.photon_transfer) for one in evidence]
@@ -275,8 +276,3 @@ def _gain(evidence: Sequence[Evidence], flat: F64, good: Mask, with_flats: bool)
         ),
         tuple(sorted({lag for e in evidence for lag in e.neighbours})),
     )
-
-
-def _noise_ratios(one: Evidence) -> list[F64]:
-    """Mean squared residual (y, x) over shot and read variance, of each fringe set."""
-    return [FringeSetData(fringes, one).moments[0] for fringes in one.fringes.values()]

@@ -27,7 +27,7 @@ from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import SEEDS_APART, Recording
 from pixcal.simulation.replica import TOP_ADU, OfAcquisition
 from pixcal.simulation.shot import Shot
-from pixcal.stages.diagnose.fitted_set import FittedSet, IntensityBeforeEffects
+from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_change
 from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, RunFrames
@@ -119,7 +119,6 @@ class NominalBench:
         everything random. ``window``: number of the window, for independent pixel noise.
         """
         own_seed = seed + SEEDS_APART * window
-        undone = IntensityBeforeEffects(effects, self.bench.detector)
         detector = replace(
             self.bench.detector,
             seed=own_seed,
@@ -141,7 +140,7 @@ class NominalBench:
             name: np.empty((len(frames), *bench.detector.shape), self.frames.dtypes[name])
             for name, frames in half.items()
         }
-        levels = measured.lamp.levels(self.recordings, undone)
+        levels = measured.lamp.levels(self.recordings, effects, self.bench.detector)
         own_key = {r.key: r for r in self.recordings}
 
         def with_earlier(r: Recording) -> Recording:

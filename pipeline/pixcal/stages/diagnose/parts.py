@@ -99,30 +99,21 @@ def select(tables: Mapping[str, Table], half: FrameSubset) -> dict[str, Table]:
 
 def evidence_of(raw: RawFrames, part: Part, window: tuple[int, int]) -> Evidence:
     """Reduce and fit a part of a window, with straight fringes."""
-    run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction, black=raw.black)
-    return evidence.evidence_of(run, black=raw.black, within=((part[0][0], part[1][0]), window))
+    return evidence.evidence_of(
+        run_in_memory(raw), black=raw.black, within=((part[0][0], part[1][0]), window)
+    )
 
 
-def run_in_memory(
-    acquisition: Acquisition,
-    frames: Mapping[str, NDArray[Any]],
-    tables: Mapping[str, Mapping[str, list[Any]]],
-    reduction: reduce.Config,
-    sweep: Sweep = NO_BATCHES,
-    black: Black | None = None,
-) -> MemoryPath:
-    """A run of frames (t, y, x), ADU, by name of the array, as a run directory; straight fringes.
-
-    ``tables``: properties of the frames, as in ``frames.json``. By default no batches are fitted.
-    """
-    run = MemoryPath()
-    for name, samples in frames.items():
+def run_in_memory(raw: RawFrames, sweep: Sweep = NO_BATCHES) -> MemoryPath:
+    """A run directory of some frames, with straight fringes and by default without batches."""
+    run, acquisition = MemoryPath(), raw.acquisition
+    for name, samples in raw.arrays.items():
         (run / "ingest" / "raw.zarr" / name).keep(MemoryArray(samples, CHUNK, 0, {}))
     write_json(run / "ingest" / "acquisition.json", to_plain(acquisition))
-    write_json(run / "ingest" / "frames.json", tables)
-    reduced = MemoryBuild(run / "reduce")
-    found = reduce_frames(reduced, Ingested(run / "ingest", black), reduction, SERIAL_RUNTIME)
-    write_json(run / "reduce" / "reduce.json", found.noise(reduction))
+    write_json(run / "ingest" / "frames.json", raw.tables)
+    ingested = Ingested(run / "ingest", raw.black)
+    found = reduce_frames(MemoryBuild(run / "reduce"), ingested, raw.reduction, SERIAL_RUNTIME)
+    write_json(run / "reduce" / "reduce.json", found.noise(raw.reduction))
     if acquisition.frames.fringes:
         cubes = run / "reduce" / "reduced.zarr"
         facts = sweep_sets(MemoryBuild(run / "sweep"), cubes, acquisition, sweep, SERIAL_RUNTIME)

@@ -44,23 +44,6 @@ SHOWN = 3  # statistics listed that identified a cause
 FACTS = ("title", "domain", "quantity", "unit", "x_label", "kind")
 
 
-def describe(
-    found: SearchResult,
-    data: Mapping[Key, F64],
-    measured: Mapping[Key, Curve],
-    reference: Reference,
-    facts: FramesUsed,
-    places: Sequence[Mapping[str, Any]] = (),
-) -> tuple[Json, list[Json]]:
-    """The product, and every curve: measured, nominal and with the effects found.
-
-    ``data``: held-out curves on the reference's scales; ``measured``: in their own units;
-    ``places``: deviations of the windows, `by_domain`.
-    """
-    described = _Description(found, data, measured, reference, facts)
-    return described.diagnosis(places), list(described.curves.values())
-
-
 def by_domain(
     before: Mapping[Key, Difference], after: Mapping[Key, Difference]
 ) -> dict[str, list[float]]:
@@ -89,12 +72,12 @@ def not_compared(measured: Mapping[Key, Curve], data: Mapping[Key, F64]) -> list
 
 
 @dataclass(frozen=True)
-class _Description:
-    """Arguments of `describe`, and results from them."""
+class Description:
+    """What a search found, as `diagnosis.json` and its curves say it."""
 
     found: SearchResult
-    data: Mapping[Key, F64]
-    measured: Mapping[Key, Curve]
+    data: Mapping[Key, F64]  # held-out curves on the reference's scales
+    measured: Mapping[Key, Curve]  # the same in their own units
     reference: Reference
     facts: FramesUsed
 
@@ -112,7 +95,7 @@ class _Description:
         return shrinkage(self.data, self.found.nominal, trial, self.where)
 
     def diagnosis(self, places: Sequence[Mapping[str, Any]]) -> Json:
-        """Contents of ``diagnosis.json``."""
+        """Contents of ``diagnosis.json``; ``places``: deviations of the windows, `by_domain`."""
         found, final, verdict = self.found, self.final, self._verdict()
         causes = [self._cause(name) for name in found.accepted]
         where = self._where()

@@ -15,6 +15,7 @@ from pixcal.estimators.test_statistics.expectation import Reference, signature_k
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 from pixcal.simulation.effect import Effect
+from pixcal.stages.diagnose import rejection
 from pixcal.stages.diagnose.candidates import (
     Accepted,
     Addition,
@@ -24,18 +25,6 @@ from pixcal.stages.diagnose.candidates import (
     likeliest,
 )
 from pixcal.stages.diagnose.comparison import Comparison, Trial
-from pixcal.stages.diagnose.rejection import (
-    all_close_little,
-    doubtful,
-    exchanges,
-    explained_by_other_law,
-    gain_too_small,
-    needed_gain,
-    possible_proxy,
-    redundant,
-    similar_to,
-    unhelpful,
-)
 from pixcal.stages.diagnose.thresholds import (
     MIN_JOINT_GAP_CLOSED,
     MIN_LOGLIK_GAIN,
@@ -105,6 +94,11 @@ class Search:
                 candidate.reason = f"not tested: the search stops after {MAX_CAUSES} causes"
         return self._prune_causes()
 
+    @property
+    def _left(self) -> int:
+        """Simulations that the search may still use."""
+        return self._most - sum(self._made.values())
+
     def _accept_all(self) -> None:
         while len(self._causes.effects) < MAX_CAUSES and self._accept_one():
             pass
@@ -144,12 +138,12 @@ class Search:
         alone += [
             (name, one) for name in sorted(once) if (one := self._remaining[name].alone) is not None
         ]
-        closed = all_close_little(self.comparison, alone)
+        closed = rejection.all_close_little(self.comparison, alone)
         if not closed or self._close_much_together(tuple(one.effect for one in laws.values())):
             return False
         for name, share in closed.items():
             candidate = self._candidates[name]
-            candidate.reason = candidate.reason or possible_proxy(share, 1 - share)
+            candidate.reason = candidate.reason or rejection.possible_proxy(share, 1 - share)
         return True
 
     def _close_much_together(self, effects: Effects) -> bool:
@@ -167,19 +161,15 @@ class Search:
         """Leave out candidates whose significance comes mostly from the causes."""
         shares = self._causes.shares = self._unexplained()
         for name in [n for n, share in shares.items() if share < 1 - SIMILAR]:
-            self._candidates[name].reason = similar_to(cause)
+            self._candidates[name].reason = rejection.similar_to(cause)
             del self._remaining[name], shares[name]
 
     def _exchange(self) -> bool:
         """If the data still differ, replace a cause by two other candidates."""
         causes, remaining, candidates = self._causes, self._remaining, self._candidates
-        options = exchanges(causes.effects, candidates)
+        options = rejection.exchanges(causes.effects, candidates)
         count = len(causes.effects) + 1
-        left = (
-            self._most
-            - sum(self._made.values())
-            - CONFIRM_SIMULATIONS * (1 + count * (count + 1) // 2)
-        )
+        left = self._left - CONFIRM_SIMULATIONS * (1 + count * (count + 1) // 2)
         if not options or len(options) + 1 > left or not self.comparison.differs(causes.current):
             return False
         benches = [tuple(one.effects.values()) for one in options]
@@ -220,14 +210,14 @@ class Search:
         candidates = self._candidates
         # A replay replaces the law if it fits better.
         gains = {name: law.gain for name, law in laws.items()}
-        enough = {n: g for n, g in gains.items() if g >= needed_gain(candidates[n])}
+        enough = {n: g for n, g in gains.items() if g >= rejection.needed_gain(candidates[n])}
         if gains and not enough:
             # No law of any effect suffices, but an effect may have acted by another law.
             enough = {n: r.gain for n, r in replays.items() if r.gain >= MIN_LOGLIK_GAIN_WEAK}
             gains |= enough
             laws |= {name: replays[name] for name in enough}
         for name in gains.keys() - enough.keys():
-            candidates[name].reason = gain_too_small(gains[name], candidates[name])
+            candidates[name].reason = rejection.gain_too_small(gains[name], candidates[name])
         if not enough:
             return gains, None, ""
         best = self._best(enough)
@@ -279,7 +269,7 @@ class Search:
             count * (2 * CONFIRM_SIMULATIONS + SCREEN_SIMULATIONS)
             + count * (count - 1) // 2 * CONFIRM_SIMULATIONS
         )
-        left = self._most - sum(self._made.values()) - CONFIRM_SIMULATIONS - weighed
+        left = self._left - CONFIRM_SIMULATIONS - weighed
         for name in sorted(sizes, key=lambda n: -sizes[n]):
             candidate = remaining[name]
             left -= SCREEN_SIMULATIONS * (len(candidate.variants(causes.shares.get(name, 1.0))) + 1)
@@ -325,7 +315,7 @@ class Search:
         tried = self._added(
             [(o.name, o.effect) for o in promising], SCREEN_SIMULATIONS, "candidates"
         )
-        if all(one.gain < needed_gain(remaining[one.name]) for one in tried):
+        if all(one.gain < rejection.needed_gain(remaining[one.name]) for one in tried):
             # Some may have been refused in the meantime, with other seeds.
             rest = [one for one in once if one not in promising and one.name in remaining]
             others = [(one.name, one.effect) for one in rest if one.gain > 0]
@@ -404,9 +394,9 @@ class Search:
         while True:
             without = self._each_left_out(effects)
             rejected = (
-                redundant(self.comparison, current, without)
-                or unhelpful(self.comparison, current, without, candidates)
-                or doubtful(self.comparison, current, without, candidates)
+                rejection.redundant(self.comparison, current, without)
+                or rejection.unhelpful(self.comparison, current, without, candidates)
+                or rejection.doubtful(self.comparison, current, without, candidates)
             )
             if rejected is None:
                 break
@@ -419,7 +409,7 @@ class Search:
             current = fewer
         while (replayed := self._replaceable_by_replay(effects, current)) is not None:
             name, by, current = replayed
-            _reject(name, explained_by_other_law(by), effects, candidates)
+            _reject(name, rejection.explained_by_other_law(by), effects, candidates)
             effects |= {one: e for one in effects for e in current.effects if e.name == one}
             without = self._each_left_out(effects)
         self._weigh_alone(effects)
@@ -455,7 +445,7 @@ class Search:
                 if n != name and e.acts_at == own.acts_at and set(e.domains) >= set(own.domains)
                 if (replay := candidates[n].replay) is not None and replay != e
             }
-            if not replays or sum(self._made.values()) + CONFIRM_SIMULATIONS > self._most:
+            if not replays or self._left < CONFIRM_SIMULATIONS:
                 continue
             rest = tuple(replays.get(n, e) for n, e in effects.items() if n != name)
             trial = self._confirmed(rest)
@@ -494,6 +484,6 @@ def _reject(
     """Reject a cause, and the candidates that were rejected as similar to it."""
     candidates[name].reason = reason
     for candidate in candidates.values():
-        if candidate.reason == similar_to(name):
+        if candidate.reason == rejection.similar_to(name):
             candidate.reason = f"similar to {name}, which was rejected: {reason}"
     del effects[name]

@@ -20,11 +20,12 @@ from pixcal.estimators.maps.corrected import phase_change, straight_modes
 from pixcal.model.arrays import F64
 from pixcal.model.bench import load_bench
 from pixcal.model.config import to_plain
-from pixcal.model.errors import InputError
+from pixcal.model.errors import InputError, naming
 from pixcal.model.options import Diagnose as Config
 from pixcal.simulation.effect import Effect
+from pixcal.stages.diagnose.diagnosis_input import prepare_input
 from pixcal.stages.diagnose.fitted_set import FittedSet
-from pixcal.stages.diagnose.result import describe, rounded
+from pixcal.stages.diagnose.result import Description, rounded
 from pixcal.stages.diagnose.search_run import places, run_search
 from pixcal.stages.diagnose.trial import Effects
 from pixcal.stages.treatment import Treatment, fitted_shapes, treatment_of_kind
@@ -53,26 +54,26 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 def _diagnose(
     run_dir: Path, kinds: Mapping[str, type[Effect]], base: Effects, runtime: Runtime, made: Build
 ) -> None:
-    """Write ``diagnosis.json`` and ``curves.json``."""
     made.scratch.mkdir(exist_ok=True)
     keep_arrays()
-    own = run_search(run_dir, kinds, base, made.scratch, runtime)
-    diagnosis, curves = describe(
-        own.found, own.data, own.inputs.measured, own.reference, own.inputs.facts, places(own)
-    )
+    inputs = prepare_input(run_dir, runtime, kinds, base)
+    with naming("--nominal" if base else f"{run_dir}: the nominal simulation failed"):
+        own = run_search(inputs, kinds, base, made.scratch)
+    found = Description(own.found, own.data, inputs.measured, own.reference, inputs.facts)
+    diagnosis = found.diagnosis(places(own))
     named = {effect.name: effect for effect in own.found.final.effects}
-    fits = [fit for window in own.inputs.windows for fit in window.bench.fits]
+    fits = [fit for window in inputs.windows for fit in window.bench.fits]
+    shapes = fitted_shapes(run_dir)
     for cause in diagnosis["causes"]:
-        cause["on_map"] = on_map(named[cause["effect"]], fits, run_dir)
+        cause["on_map"] = on_map(named[cause["effect"]], fits, shapes)
     write_json(made.folder / "diagnosis.json", diagnosis)
-    write_json(made.folder / "curves.json", curves)
+    write_json(made.folder / "curves.json", list(found.curves.values()))
     made.summary.update(
         verdict=diagnosis["verdict"], causes=[cause["effect"] for cause in diagnosis["causes"]]
     )
 
 
 def _kinds(config: Config, known: Mapping[str, type[Effect]]) -> dict[str, type[Effect]]:
-    """The candidates by name."""
     for name in (*config.only, *config.without):
         if name not in known:
             raise InputError(
@@ -103,12 +104,15 @@ def _base(nominal: Path | None, known: Mapping[str, type[Effect]]) -> Effects:
 # Change of the offset map by a cause
 
 
-def on_map(effect: Effect, fits: Iterable[FittedSet], run_dir: Path) -> dict[str, Any]:
+def on_map(
+    effect: Effect, fits: Iterable[FittedSet], shapes: tuple[str, Mapping[str, str]]
+) -> dict[str, Any]:
     """Rms and maximum (px) change of the offsets by undoing an effect, and the treatment.
 
-    On maps of every set and window, modes removed; zero if free parameters absorb it.
+    On maps of every set and window, modes removed; zero if free parameters absorb it. ``shapes``:
+    of the fringes (`fitted_shapes`).
     """
-    treated = treatment_of_kind(type(effect), *fitted_shapes(run_dir))
+    treated = treatment_of_kind(type(effect), *shapes)
     action = Treatment(effect, "diagnosis", {}, *treated).action
     square, count, most = 0.0, 0, 0.0
     for fit in fits if action != "unaffected" else ():

@@ -30,6 +30,7 @@ OF_ESTIMATE = Bound(seconds=45.0)
 
 _SLOW = threading.Lock()
 
+K = TypeVar("K")
 T = TypeVar("T")
 Curves = dict[Key, Curve]
 # an effect whose estimate is a statistic; or the score test of one effect by its forward model
@@ -237,6 +238,16 @@ def detect(evidence: Evidence, kind: Signature, bound: Bound = OF_ESTIMATE) -> f
     with nullcontext() if kind.quick else _SLOW:
         found = _kept_within(bound, kind.detect, evidence)
     return found if isinstance(found, float) and np.isfinite(found) else None
+
+
+def each_of(
+    kinds: Mapping[str, K], ask: Callable[..., T], runtime: Runtime, label: str
+) -> dict[str, T]:
+    """Result of ``ask`` for each effect, by its name."""
+    bound = replace(OF_ESTIMATE, memory=runtime.memory, excluded_bytes=runtime.excluded_bytes)
+    asked = partial(ask, bound=bound)
+    results = run_tasks(asked, list(kinds.values()), runtime.here, label=label)
+    return dict(zip(kinds, results, strict=True))
 
 
 def _kept_within(bound: Bound, ask: Callable[[Evidence], T], evidence: Evidence) -> T | str:

@@ -1,0 +1,154 @@
+"""Frames to analyse: their series, and the halves to fit effects to and to test them on.
+
+Light between bias or dark frames may leave charge in the frames after it: it divides series.
+"""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pixcal.estimators.diagnosis.evidence import SOON_S
+from pixcal.model.arrays import F64, Indices
+from pixcal.stages.diagnose.parts import FrameSubset, Table
+from pixcal.stages.evidence import DAY_S, frame_days, groups
+
+# samples of a fringe set to analyse, in each half of the frames and each window
+SAMPLES = 6_000_000
+# least calibration frames of a series or an exposure time to split; fewer serve both halves
+FEWEST = 4
+# most fringe frames in a half: the computing time of their series grows with the square
+MOST_FRAMES = 1500
+# number of blocks, and least number of frames for it: with long blocks, few frames lack the
+# preceding one; with short ones, both halves have the same drifts
+BLOCKS = ((16, 384), (8, 192), (4, 32), (2, FEWEST))
+TURN = (False, True, True, False)  # which blocks are held out: a steady drift is alike in both
+
+
+def in_series(tables: Mapping[str, Table]) -> dict[str, Table]:
+    """Tables with the number of each bias and dark frame's series (``step``), and ``after_light``.
+
+    Light divides the frames of one exposure time if the next ones begin soon after it. ``last`` is
+    the number of the last frame of its series.
+    """
+    dark = {name: table for name, table in tables.items() if name in ("bias", "dark")}
+    every = [frame_days(table) for name, table in tables.items() if name not in dark]
+    light = np.sort(np.concatenate([*every, []]))
+    found = dict(tables)
+    if light.size and np.isfinite(light).all():
+        found |= {name: _numbered(table, light) for name, table in dark.items()}
+    kinds = {name: found[name] for name in ("bias", "dark", "flat") if name in found}
+    return found | {name: _with_ends(table) for name, table in kinds.items()}
+
+
+def _with_ends(table: Table) -> Table:
+    """Table of calibration frames with the number of the last frame of each one's series."""
+    last = np.zeros(len(table["time_s"]), int)
+    for own in groups(table):
+        last[own] = own[-1]
+    return {**table, "last": last.tolist()}
+
+
+def _numbered(table: Table, light: F64) -> Table:
+    """Table of bias or dark frames, in series; ``light``: times of lit frames, days, ascending."""
+    days = frame_days(table)
+    if not np.isfinite(days).all():
+        return table
+    before = np.searchsorted(light, days)
+    since = days - np.append(-np.inf, light)[before]
+    soon = since * DAY_S < SOON_S
+    step, after = np.zeros(len(days), int), np.zeros(len(days), np.bool_)
+    for own in groups(table):
+        begins = own[np.flatnonzero(np.diff(before[own], prepend=-1))]
+        begins = begins[(begins == own[0]) | soon[begins]]
+        series = np.searchsorted(begins, own, side="right") - 1
+        if np.bincount(series).min() < FEWEST:
+            series, begins = np.zeros_like(series), begins[:1]
+        step[own], after[own] = series, soon[begins][series]
+    return {**table, "step": step.tolist(), "after_light": after.tolist()}
+
+
+@dataclass(frozen=True)
+class Split:
+    """Frames to which effects are fitted (``learn``), and held-out frames (``test``)."""
+
+    learn: FrameSubset
+    test: FrameSubset
+    shared: tuple[str, ...]  # arrays with exposure times that have too few frames to split
+
+
+def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = ()) -> Split:
+    """Assign blocks of every array and exposure time to the halves (`TURN`).
+
+    A long fringe set contributes `SAMPLES` to each half; without fringes, all frames together do.
+    Flats with full pixels are left out unless all have them. Without fringes, the first flat of an
+    exposure time and the first dark after light are in both halves: they show lag most.
+    """
+    learn, test = {}, {}
+    every = {name: _groups(name, table, full_flats) for name, table in tables.items()}
+    most = SAMPLES // pixels
+    fringes = any("/" in name for name in tables)
+    if fringes:
+        most = min(most, MOST_FRAMES)
+    else:
+        most = _equal_share([len(own) for of_name in every.values() for own in of_name], most)
+    after_light = {n: table["after_light"] for n, table in tables.items() if "after_light" in table}
+    for name, of_name in every.items():
+        fitted, held_out = [], []
+        for own in of_name:
+            one, other = _halves(own, most)
+            fitted.append(one)
+            lags = name == "flat" or (name in after_light and after_light[name][own[0]])
+            held_out.append(np.union1d(other, own[:1]) if lags and not fringes else other)
+        learn[name] = np.sort(np.concatenate(fitted))
+        test[name] = np.sort(np.concatenate(held_out))
+    short = (name for name, of_name in every.items() if min(map(len, of_name)) < FEWEST)
+    return Split(learn, test, tuple(short))
+
+
+def _groups(name: str, table: Table, full_flats: Sequence[int]) -> list[Indices]:
+    """Groups of frames of an array that are split together."""
+    if "/" in name:
+        return [np.arange(len(table["exptime_s"]))]
+    every = groups(table)
+    kept = [own for own in every if name != "flat" or not np.isin(own, full_flats).any()]
+    return kept or every
+
+
+def _of_half(count: int) -> int:
+    return count if count < FEWEST else count // 2
+
+
+def frames_of_half(tables: Mapping[str, Table]) -> int:
+    """Calibration frames in each half."""
+    return sum(
+        _of_half(len(own))
+        for name, table in tables.items()
+        if "/" not in name
+        for own in groups(table)
+    )
+
+
+def _equal_share(counts: Sequence[int], total: int) -> int:
+    """Largest number of frames per group in a half that keeps the sum within a total."""
+    left, share = total, total
+    ordered = sorted(map(_of_half, counts))
+    for n, count in enumerate(ordered):
+        share = left // (len(ordered) - n)
+        if count > share:
+            return max(share, FEWEST // 2)
+        left -= count
+    return total
+
+
+def _halves(frames: Indices, most: int) -> tuple[Indices, Indices]:
+    if len(frames) < FEWEST:
+        return frames, frames
+    count = next(blocks for blocks, fewest in BLOCKS if len(frames) >= fewest)
+    edges = [n * len(frames) // count for n in range(count + 1)]
+    halves: tuple[list[Indices], list[Indices]] = ([], [])
+    for n, (first, last) in enumerate(itertools.pairwise(edges)):
+        size = min(last - first, 2 * most // count)
+        halves[TURN[n % len(TURN)]].append(frames[first : first + size])
+    return np.concatenate(halves[0]), np.concatenate(halves[1])
