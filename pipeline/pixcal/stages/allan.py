@@ -25,6 +25,7 @@ from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Allan as Config
 from pixcal.model.options import Region
 from pixcal.stages.steps import run_steps
+from pixcal.stages.tiles import spans
 from pixcal.storage import cube
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import ArrayReader, ArrayWriter
@@ -70,7 +71,7 @@ class Batches:
     def tiles(self, area: Region, times: int = 1) -> list[Tile]:
         """Tiles of ``times`` vertically stacked chunks, cut to an area."""
         (y0, y1, x0, x1), (cy, cx) = area, self.chunks
-        return list(product(_spans(y0, y1, times * cy), _spans(x0, x1, cx)))
+        return list(product(spans(y1, times * cy, y0), spans(x1, cx, x0)))
 
     def read(self, name: str, tile: Tile) -> F32:
         """``batch_delta`` or ``batch_sigma`` (batch, y, x) of a tile, px."""
@@ -247,11 +248,6 @@ def _as_json(
 # The batch maps of a fringe set, and the changes common to their pixels
 
 
-def _spans(start: int, stop: int, size: int) -> Iterator[Range]:
-    for edge in range(start // size * size, stop, size):
-        yield max(edge, start), min(edge + size, stop)
-
-
 def region_name(region: Region) -> str:
     """Name in the format of the option: y0:y1,x0:x1."""
     y0, y1, x0, x1 = region
@@ -312,7 +308,7 @@ def _positive(path: Path, lengths: Range | None, region: Region) -> Iterator[F32
     """Finite positive values of a map over a region, a few rows at a time."""
     reader = ArrayReader(path)
     y0, y1, x0, x1 = region
-    for rows in _spans(y0, y1, reader.chunks[-2]):
+    for rows in spans(y1, reader.chunks[-2], y0):
         values = reader.read(*([lengths] if lengths else []), rows, (x0, x1))
         # Zero means no noise.
         yield values[(values > 0) & (values < np.inf)]

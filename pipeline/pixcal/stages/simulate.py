@@ -34,6 +34,7 @@ from pixcal.model.yaml_file import to_yaml
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import Camera, states_of
 from pixcal.simulation.recording import Recording, recordings
+from pixcal.stages.tiles import spans
 from pixcal.storage.artefact import artefact_key
 from pixcal.storage.fits_out import COMPRESSED, FrameWriter
 from pixcal.storage.formats import STAGES, ArtefactKind
@@ -227,8 +228,7 @@ def _write_description(bench: Bench, folder: Path) -> None:
 
 def row_blocks(bench: Bench) -> list[Rows]:
     """The window's rows, in blocks that are simulated separately."""
-    ny, step = bench.detector.shape[0], synthesis.BLOCK_ROWS
-    return [(row, min(row + step, ny)) for row in range(0, ny, step)]
+    return list(spans(bench.detector.shape[0], synthesis.BLOCK_ROWS))
 
 
 def write_truth(

@@ -3,7 +3,7 @@
 The unit of work. Maps lie in chunks of `STRIP` tiles.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,12 @@ Index = tuple[int, int]
 Strip = tuple[Index, ...]
 
 STRIP = 4  # tiles side by side whose maps are in one chunk: a file costs more than what is in it
+
+
+def spans(stop: int, size: int, start: int = 0) -> Iterator[tuple[int, int]]:
+    """Ranges from ``start`` to ``stop`` that end at multiples of a size."""
+    for edge in range(start // size * size, stop, size):
+        yield max(edge, start), min(edge + size, stop)
 
 
 def grid(shape: tuple[int, ...]) -> tuple[int, int]:

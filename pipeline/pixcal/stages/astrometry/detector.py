@@ -22,6 +22,7 @@ from pixcal.estimators.fringe_fit.shapes.paraxial import Paraxial
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
+from pixcal.stages.tiles import spans
 from pixcal.storage.products import FitsMap
 
 Range = tuple[int, int]
@@ -193,7 +194,7 @@ def free_from_modes(
     ny, nx = modes.shape
     # Odd step, so that bands are not in phase with fringes.
     step = (ny * nx // ENOUGH) | 1
-    bands = [(y, min(y + BAND, ny)) for y in range(0, ny, BAND * step)]
+    bands = list(spans(ny, BAND))[::step]
     task = partial(_mode_sums, tuple(components), modes)
     parts = run_tasks(task, bands, runtime, label="modes of the truth")
     groups = {"smooth": slice(modes.n_smooth), "fringe": slice(modes.n_smooth, None)}

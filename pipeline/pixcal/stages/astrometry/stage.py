@@ -93,7 +93,6 @@ def _measure(
     config: Config,
     runtime: Runtime,
 ) -> None:
-    """Run all measurements and write the artefact's files."""
     shape = components[0].delta.shape
     observed = _star(telescope, config, acquisition, shape)
     need = planned(shape, modes.number if modes else 0, observed.side, config)

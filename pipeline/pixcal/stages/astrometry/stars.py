@@ -16,7 +16,8 @@ from pixcal.model.acquisition import Detector as Declared
 from pixcal.model.arrays import C128, F64
 from pixcal.model.errors import InputError
 from pixcal.model.options import Astrometry as Config
-from pixcal.stages.astrometry.detector import PixelPositions
+from pixcal.stages.astrometry.detector import PixelPositions, Range
+from pixcal.stages.tiles import spans
 from pixcal.storage.cube import ArrayWriter, create_group, create_map
 
 FULL_WELL_E = 50_000.0  # if the acquisition declares none (paper, table 1)
@@ -187,8 +188,8 @@ def error_maps(folder: Path, detector: PixelPositions, star: Star, runtime: Runt
     chunks = min(side, ny), min(side, nx)
     names = [f"{grid}_{component.name}" for grid in GRIDS for component in detector.components]
     writers = [create_map(folder / name, (ny, nx), chunks, units="pixel") for name in names]
-    corners = list(product(range(0, ny, side), range(0, nx, side)))
-    parts = run_tasks(partial(_tile, detector, star, writers), corners, runtime, label="error maps")
+    tiles = list(product(spans(ny, side), spans(nx, side)))
+    parts = run_tasks(partial(_tile, detector, star, writers), tiles, runtime, label="error maps")
     for writer in writers:
         writer.finish()
     columns = -(-nx // side)
@@ -198,24 +199,21 @@ def error_maps(folder: Path, detector: PixelPositions, star: Star, runtime: Runt
 
 
 def _tile(
-    detector: PixelPositions, star: Star, writers: list[ArrayWriter], corner: tuple[int, int]
+    detector: PixelPositions, star: Star, writers: list[ArrayWriter], tile: tuple[Range, Range]
 ) -> F64:
     """Write a part of the maps; sums over its blocks (map + 1, y, x): squares, valid pixels."""
-    side, block = tile_side(detector.shape)
-    y, x = ((a, min(a + side, n)) for a, n in zip(corner, detector.shape, strict=True))
-    errors = place_errors(detector, star, y, x)
+    _, block = tile_side(detector.shape)
+    errors = place_errors(detector, star, *tile)
     maps = errors.reshape(-1, *errors.shape[2:])
     for writer, values in zip(writers, maps, strict=True):
-        writer.write(corner, values.astype(np.float32))
+        writer.write((tile[0][0], tile[1][0]), values.astype(np.float32))
     good = np.isfinite(maps[:1])
     sums = np.concatenate([np.where(good, maps, 0.0) ** 2, good.astype(float)])
     rows = np.add.reduceat(sums, range(0, sums.shape[1], block), axis=1)
     return np.asarray(np.add.reduceat(rows, range(0, sums.shape[2], block), axis=2))
 
 
-def place_errors(
-    detector: PixelPositions, star: Star, y: tuple[int, int], x: tuple[int, int]
-) -> F64:
+def place_errors(detector: PixelPositions, star: Star, y: Range, x: Range) -> F64:
     """Errors (grid, component, y, x), px, of stars at the centres of given pixels."""
     half, (ny, nx) = star.half, detector.shape
     patch = detector.patch((y[0] - half, y[1] + half), (x[0] - half, x[1] + half))

@@ -14,6 +14,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.arrays import F64, I64
 from pixcal.stages.compare.agreement import Grouping, Part, Projection, double, halve
 from pixcal.stages.compare.sides import Side, Tile, Vector
+from pixcal.stages.tiles import spans
 
 COARSE = 256  # most blocks along the longer side that are kept in memory
 SHOWN_BLOCKS = 16  # blocks along the longer side of the map of differences, or up to twice as many
@@ -63,10 +64,7 @@ class Pair:
 
     def tiles(self) -> list[Tile]:
         """The window in tiles, row by row."""
-        rows, columns = (
-            [(start, min(start + step, length)) for start in range(0, length, step)]
-            for length, step in zip(self.window, self.tile_side, strict=True)
-        )
+        rows, columns = map(spans, self.window, self.tile_side)
         return list(product(rows, columns))
 
     def together(self, pieces: Sequence[F64]) -> F64:
