@@ -123,7 +123,6 @@ def _option(field: Field[Any], hint: Any) -> Callable[[Command], Command]:
 
 
 def _type(hint: Any, meta: Mapping[str, Any]) -> Any:
-    """How click reads a value of some type."""
     low, high, above = meta["low"], meta["high"], meta["above"]
     if choices := get_args(hint) if get_origin(hint) is Literal else meta["choices"]:
         return click.Choice(choices)

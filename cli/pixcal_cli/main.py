@@ -17,7 +17,6 @@ from pixcal.model.errors import ClusterError, PixcalError
 from pixcal_cli import steps
 from pixcal_cli.blind import blind
 from pixcal_cli.budget import budget
-from pixcal_cli.centroids import centroids, wcs
 from pixcal_cli.click_options import examples
 from pixcal_cli.compare import compare
 
@@ -44,8 +43,8 @@ class InOrder(click.Group):
         steps.crests,
         steps.diagnose,
         steps.astrometry,
-        centroids,
-        wcs,
+        steps.centroids,
+        steps.wcs,
         steps.report,
         compare,
         steps.simulate,

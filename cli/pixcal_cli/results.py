@@ -125,18 +125,15 @@ def show_correction(run: Path) -> None:
         "residual px": lambda s: _quadratic_sum(s["parameter_error_px"]),
         "sigma px": lambda s: _before_after(s["sigma_median_px"]),
         "chi2": lambda s: _before_after(s["chi2_reduced"], 4),
-        "4-row period px": lambda s: _before_after(
-            s["rows"] and {"before": s["rows"]["before_px"], "after": s["rows"]["after_px"]}
-        ),
+        "4-row period px": lambda s: _before_after(s["rows"], unit="_px"),
     }
     show_records("set", correction["sets"], columns)
     show_notes(
         ["residual px: error of the offsets from the uncertainty of the effects' parameters"]
     )
     for pair in correction["pairs"]:
-        expected = number(pair["after_expected_px"], 3)
-        apart = _before_after({"before": pair["before_px"], "after": pair["after_px"]})
-        sets = " and ".join(pair["sets"])
+        expected, sets = number(pair["after_expected_px"], 3), " and ".join(pair["sets"])
+        apart = _before_after(pair, unit="_px")
         click.echo(f"  difference between {sets}: {apart} px ({expected} px expected from noise)")
     if not correction["pairs"]:
         show_notes(["one set along each axis: a second baseline would verify the correction"])
@@ -156,10 +153,9 @@ def _quadratic_sum(errors: Mapping[str, float | None]) -> str:
     return number(math.hypot(*known) if known else None, 3)
 
 
-def _before_after(change: Mapping[str, float | None] | None, digits: int = 3) -> str:
-    if change is None:
-        return "-"
-    return f"{number(change['before'], digits)} → {number(change['after'], digits)}"
+def _before_after(facts: Mapping[str, Any] | None, digits: int = 3, unit: str = "") -> str:
+    ends = [number(facts[f"{when}{unit}"], digits) for when in ("before", "after")] if facts else []
+    return " → ".join(ends) or "-"
 
 
 def show_allan(run: Path) -> None:

@@ -197,7 +197,6 @@ def _describe(
 
 
 def _write(described: Acquisition, stacks: Stacks, folder: Path) -> None:
-    """Write an acquisition, a frame at a time."""
     for file, (stack, exposure) in stacks.items():
         path = folder / f"{file}.fits"
         path.parent.mkdir(exist_ok=True)

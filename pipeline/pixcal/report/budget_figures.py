@@ -118,7 +118,6 @@ def _precision(axes: Axes, result: Mapping[str, Any], period: float) -> None:
 
 
 def _clock(axes: Axes, period: float) -> None:
-    """Time on top."""
     top = second_axis(axes, "top", period)
     low, high = (period * f for f in axes.get_xlim())
     top.xaxis.set_major_locator(FixedLocator([p for p in CLOCK if low <= p <= high]))

@@ -119,7 +119,6 @@ def _panel(
 def _with_bar(
     panel: Panel, label: str, low: float, high: float, beyond: str, *, log: bool = False
 ) -> Panel:
-    """The same with a colour bar."""
     colours = ticks(low, high, panel.height, upwards=True, log=log)
     return replace(panel, bar=_BAR, label=label, colours=colours, beyond=beyond)
 

@@ -58,7 +58,6 @@ def temporal(sets: Sequence[SetContents]) -> Figure:
 
 
 def _parameters(fringes: SetContents, moving: bool) -> list[tuple[str, F64]]:
-    """Label and values of each row."""
     series = fringes.series
     mean, amplitude = series["B"], series["A"]
     level = float(np.nanmean(mean)) or 1.0
@@ -89,7 +88,6 @@ def _phases(axes: Axes, phi: F64) -> None:
 
 
 def _clock(time: F64) -> tuple[F64, str]:
-    """Times in a suitable unit."""
     span = float(np.ptp(time)) if len(time) else 0.0
     for unit, length in (("h", 3600.0), ("min", 60.0)):
         if span > 3 * length:

@@ -97,7 +97,6 @@ def cards(contents: Contents) -> Iterator[Card]:
 
 
 def _detector_cards(facts: dict[str, Any]) -> Iterator[Card]:
-    """Key numbers of a data sheet."""
     figures = facts.get("figures_of_merit") or {}
     for key in (
         "conversion_gain",

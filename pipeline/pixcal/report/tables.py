@@ -281,7 +281,6 @@ def _flat(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _flat_rows(data: Any) -> list[list[str]]:
-    """Rows of dotted key and value."""
     return [[key, _plain(value)] for key, value in _flat(data)]
 
 

@@ -140,7 +140,6 @@ def _limited_by(shares: Mapping[str, float]) -> str:
 
 
 def _cost(bench: Bench, variance: float, precision: float | None) -> dict[str, Any] | None:
-    """Frames for a precision, their time and their bytes."""
     if precision is None:
         return None
     n, (ny, nx) = expected.frames_needed(variance, precision), bench.detector.shape
