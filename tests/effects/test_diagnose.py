@@ -25,9 +25,9 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.stages import correct, diagnose, fit, ingest, reduce, simulate
-from pixcal.stages.diagnose import halves, search_run, stage, trial, windows
+from pixcal.stages.diagnose import frames, search_run, stage, trial, windows
 from pixcal.stages.diagnose.diagnosis_input import prepare_input
-from pixcal.stages.diagnose.halves import frames_of_half, split
+from pixcal.stages.diagnose.frames import frames_of_half, split
 from pixcal.stages.diagnose.windows import chosen_windows, whole_of
 from pixcal_cli.main import invoke
 
@@ -240,7 +240,7 @@ def test_a_part_of_a_large_detector_is_enough_without_fringes(
 ) -> None:
     monkeypatch.setattr(windows, "LARGEST", 60)
     monkeypatch.setattr(windows, "SIDE", 40)
-    for module in (windows, halves):
+    for module in (windows, frames):
         monkeypatch.setattr(module, "SAMPLES", 400_000)
     run = reduced(None, {"detector.shape": [131, 127], "frames.fringes": []})
     inputs = prepare_input(run, SYNC)

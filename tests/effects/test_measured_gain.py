@@ -16,7 +16,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.recording import recordings
-from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_change
+from pixcal.stages.diagnose.flats import MeasuredGain, photon_transfer_change
 
 SHARE = 0.02
 SIDES = tuple(Coupling(dy, dx, SHARE) for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)))

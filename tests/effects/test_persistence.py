@@ -13,7 +13,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.recording import recordings
-from pixcal.stages.diagnose.halves import in_series
+from pixcal.stages.diagnose.frames import in_series
 
 BIAS, READ_NOISE, SHAPE = 300.0, 6.0, (37, 41)
 DEAD_S = 1.5  # between frames

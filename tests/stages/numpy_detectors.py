@@ -16,7 +16,7 @@ from pixcal.estimators.test_statistics.gap import Difference, compare
 from pixcal.model.acquisition import SCHEMA, Acquisition
 from pixcal.model.config import parse
 from pixcal.stages import reduce
-from pixcal.stages.diagnose.halves import Split, split
+from pixcal.stages.diagnose.frames import Split, split
 from pixcal.stages.diagnose.measure_nominal import nominal_bench
 from pixcal.stages.diagnose.nominal import NominalBench
 from pixcal.stages.diagnose.parts import RawFrames, RunFrames, evidence_of

@@ -18,7 +18,7 @@ from pixcal.estimators.test_statistics import DETECTOR, measure
 from pixcal.estimators.test_statistics.fringe_set_data import STEPS
 from pixcal.model.arrays import F64
 from pixcal.stages import reduce
-from pixcal.stages.diagnose.halves import split
+from pixcal.stages.diagnose.frames import split
 from pixcal.stages.diagnose.parts import RawFrames, evidence_of
 from pixcal.stages.diagnose.windows import whole_of
 from pixcal.stages.reduce.flat_survey import FlatSurvey

@@ -9,7 +9,7 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.forward import DOMAINS
-from pixcal.stages.diagnose.frames_used import (
+from pixcal.stages.diagnose.frames import (
     CLOSER_LOOK,
     MORE,
     RANDOM,

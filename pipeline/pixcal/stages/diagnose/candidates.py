@@ -12,7 +12,7 @@ from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.comparison import Trial
-from pixcal.stages.diagnose.frames_used import FRINGES, MORE, FramesUsed
+from pixcal.stages.diagnose.frames import FRINGES, MORE, FramesUsed
 from pixcal.stages.diagnose.trial import Effects, Signature, each_of, estimate
 
 NEARLY_ALL = 0.9  # share of its significance above which a candidate is not scaled down

@@ -19,8 +19,15 @@ from pixcal.stages.diagnose.candidates import (
     marginal_candidates,
     note_missing,
 )
-from pixcal.stages.diagnose.frames_used import FramesUsed, frames_of, missing_frames
-from pixcal.stages.diagnose.halves import Split, frames_of_half, in_series, split
+from pixcal.stages.diagnose.frames import (
+    FramesUsed,
+    Split,
+    frames_of,
+    frames_of_half,
+    in_series,
+    missing_frames,
+    split,
+)
 from pixcal.stages.diagnose.measure_nominal import nominal_bench
 from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, RunFrames, evidence_of, take
 from pixcal.stages.diagnose.trial import (

@@ -21,8 +21,7 @@ from pixcal.model.arrays import F32, F64, Indices, Mask
 from pixcal.simulation.effect import FittedFrames
 from pixcal.stages.diagnose.description import bench_of, pedestal_of, recordings_of
 from pixcal.stages.diagnose.fitted_set import FittedSet
-from pixcal.stages.diagnose.flat_light import FlatLight
-from pixcal.stages.diagnose.measured_gain import MeasuredGain
+from pixcal.stages.diagnose.flats import FlatLight, MeasuredGain
 from pixcal.stages.diagnose.nominal import Measured, NominalBench, SetTruth, uncoupled
 from pixcal.stages.diagnose.parts import FrameSubset, RunFrames
 from pixcal.stages.reduce.calibration import FLAT_FLOOR

@@ -28,8 +28,7 @@ from pixcal.simulation.recording import SEEDS_APART, Recording
 from pixcal.simulation.replica import TOP_ADU, OfAcquisition
 from pixcal.simulation.shot import Shot
 from pixcal.stages.diagnose.fitted_set import FittedSet
-from pixcal.stages.diagnose.flat_light import FlatLight
-from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_change
+from pixcal.stages.diagnose.flats import FlatLight, MeasuredGain, photon_transfer_change
 from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, RunFrames
 
 _GAIN, _NOISE, _DARK = 101, 102, 103  # keys of random numbers

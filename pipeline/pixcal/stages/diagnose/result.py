@@ -25,7 +25,7 @@ from pixcal.report.diagnosis_words import place
 from pixcal.simulation.effect import DOMAINS
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
 from pixcal.stages.diagnose.comparison import Shrinkage, Trial, differing, gap_interval, shrinkage
-from pixcal.stages.diagnose.frames_used import (
+from pixcal.stages.diagnose.frames import (
     FRINGES,
     FramesUsed,
     recommend_closer_look,

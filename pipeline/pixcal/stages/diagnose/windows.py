@@ -2,7 +2,7 @@
 
 import math
 
-from pixcal.stages.diagnose.halves import SAMPLES
+from pixcal.stages.diagnose.frames import SAMPLES
 from pixcal.stages.evidence import Part
 
 SIDE = 128  # side (pixels) of a window on a large detector: the width of a chunk of the cube
