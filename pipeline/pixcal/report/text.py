@@ -141,10 +141,7 @@ def digits_apart(one: float, other: float) -> int:
 
 
 def not_tested(diagnosis: Mapping[str, Any]) -> str:
-    """Effects that the frames cannot show, with the frames that would, and statistics left out.
-
-    Empty without any.
-    """
+    """Effects that the frames cannot show, with those that would, and statistics left out."""
     groups = diagnosis.get("not_tested", {})
     parts = [f"{', '.join(names)} (needs {frames})" for frames, names in groups.items()]
     if statistics := diagnosis.get("not_compared"):

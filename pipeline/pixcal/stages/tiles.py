@@ -1,7 +1,4 @@
-"""Tiles, columns of chunks of 128 by 128 pixels of all frames, and strips of neighbours in a row.
-
-The unit of work. Maps lie in chunks of `STRIP` tiles.
-"""
+"""Tiles, columns of chunks of 128 × 128 pixels of all frames, and strips of neighbours in a row."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any

@@ -51,11 +51,7 @@ _BYTES_PER_WINDOW_PIXEL = 200
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
-    """Compare centroids on a perfect grid with centroids on the measured maps.
-
-    Reads the maps in ``RUN/products``; makes ``RUN/astrometry`` and the products
-    ``astrometry.json`` and ``astrometry.png``.
-    """
+    """Compare centroids on a perfect grid with centroids on the maps in ``RUN/products``."""
     with working(run_dir, "fit") as inputs:
         acquisition = read_acquisition(run_dir)
         telescope = Telescope(
@@ -142,10 +138,7 @@ def _measure(
 
 
 def _photon_noise(observed: Star, share: float, acquisition: Acquisition) -> list[float]:
-    """Photon noise (px, the mean of both axes) of stars as bright as `CURVE`.
-
-    ``share``: background over the light of the star.
-    """
+    """Photon noise (px, mean of both axes) of `CURVE`; ``share``: background over the star."""
     others = (
         stars.star(observed.psf, observed.half, n, share * n, acquisition.detector) for n in CURVE
     )

@@ -87,10 +87,7 @@ def star(psf: Psf, half: int, electrons: float, background: float, detector: Dec
 
 
 def observe(detector: PixelPositions, star: Star, config: Config, runtime: Runtime) -> F64:
-    """Observe and fit stars all over the detector: errors (star, position, kind, component), px.
-
-    NaN at unused places and for failed fits.
-    """
+    """Errors (star, position, kind, component), px, of stars; NaN if unused or if a fit fails."""
     batches = [range(n, min(n + BATCH, config.stars)) for n in range(0, config.stars, BATCH)]
     core = core_weights(star, detector.axes)
     task = partial(_batch, detector, star, config, core)

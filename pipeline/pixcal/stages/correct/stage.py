@@ -54,12 +54,7 @@ SAMPLES = 5_000_000  # samples of each fringe set in memory at a time
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
-    """Fit a run, and again with the effects of its diagnosis corrected.
-
-    Makes ``RUN/fit`` where it is not up to date, ``RUN/corrected``, and the products
-    ``delta_x_corrected.fits``, ``delta_y_corrected.fits`` (or ``delta_fringe_corrected.fits``) and
-    ``correction.json``.
-    """
+    """Fit a run, and again with the effects of its diagnosis corrected: ``RUN/corrected``."""
     diagnosed = require(run_dir, "diagnose")
     if diagnosed.inputs["reduce"] != require(run_dir, "reduce").key:
         raise InputError(

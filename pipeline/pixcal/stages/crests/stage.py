@@ -44,11 +44,7 @@ Range = tuple[int, int]
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
-    """Locate the fibres from crests and valleys, and compare them with the fit.
-
-    Reads ``RUN/reduce`` and, where it is there, ``RUN/fit``; makes ``RUN/crests`` and the products
-    ``crests.json`` and ``crests-<set>.png``.
-    """
+    """Locate the fibres from crests and valleys, and compare them with the fit if there is one."""
     acquisition = load_run(run_dir, "crests")
     with working(run_dir, "reduce") as inputs:
         facts: dict[str, Any] = {}

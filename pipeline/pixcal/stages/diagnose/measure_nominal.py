@@ -37,11 +37,7 @@ def nominal_bench(
     halves: Sequence[FrameSubset],
     whole: tuple[int, int],
 ) -> NominalBench:
-    """The nominal bench measured from one or more parts of an acquisition.
-
-    ``evidence``: of the same pixels, of each of the ``halves``. ``whole``: detector's window (y,
-    x).
-    """
+    """The nominal bench, from ``evidence`` of the same pixels of a ``whole`` window (y, x)."""
     one, tables, dtypes = evidence[0], frames.tables, frames.dtypes
     good = np.all([e.good for e in evidence], axis=0)
     names = list(one.fringes)

@@ -40,7 +40,8 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     require(run_dir, "reduce")
     known = known_effects(config.own)
     kinds = _kinds(config, known)
-    base = _base(config.nominal, known)
+    nominal = config.nominal
+    base = parse_effects(load_bench(nominal).effects, str(nominal), known) if nominal else ()
     plain = {
         "effects": sorted(kinds),
         "own": [hashlib.sha256(path.read_bytes()).hexdigest() for path in config.own],
@@ -94,13 +95,6 @@ def _kinds(config: Config, known: Mapping[str, type[Effect]]) -> dict[str, type[
     return kinds
 
 
-def _base(nominal: Path | None, known: Mapping[str, type[Effect]]) -> Effects:
-    """Effects that the nominal bench includes."""
-    if nominal is None:
-        return ()
-    return parse_effects(load_bench(nominal).effects, str(nominal), known)
-
-
 # Change of the offset map by a cause
 
 
@@ -109,8 +103,7 @@ def on_map(
 ) -> dict[str, Any]:
     """Rms and maximum (px) change of the offsets by undoing an effect, and the treatment.
 
-    On maps of every set and window, modes removed; zero if free parameters absorb it. ``shapes``:
-    of the fringes (`fitted_shapes`).
+    On maps of every set and window, modes removed; zero if free parameters absorb it.
     """
     treated = treatment_of_kind(type(effect), *shapes)
     action = Treatment(effect, "diagnosis", {}, *treated).action

@@ -24,12 +24,7 @@ from pixcal.storage.stage import make, require, working
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
-    """Fit every fringe set of a run and write the offset maps.
-
-    Reads ``RUN/reduce``; makes ``RUN/sweep`` (when it is not up to date) and ``RUN/fit``, and
-    writes the products ``delta_x.fits``, ``delta_y.fits`` (with one fringe axis:
-    ``delta_fringe.fits``) and ``fit.json``.
-    """
+    """Sweep every fringe set of a run if needed, fit it, and write the maps of the offsets."""
     with working(run_dir, "reduce"):
         swept = sweep.run(run_dir, config, runtime)
         body = partial(_fit_all, run_dir, swept, config, runtime)
