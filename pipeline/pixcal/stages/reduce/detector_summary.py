@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.estimators.detector.calibration import Linearity, linearity
 from pixcal.estimators.detector.emva import Measure, full_level, saturation, transfer_points
 from pixcal.estimators.detector.missing_codes import missing_codes, step_noise
+from pixcal.estimators.detector.straightness import Level, Straightness, straightness
 from pixcal.kernels.gain_fit import LADDER, GainFit, fit_gain
 from pixcal.kernels.photon_transfer import add_neighbours
 from pixcal.kernels.rounding import SHEPPARD, UNDETERMINED_BELOW
@@ -18,6 +18,7 @@ from pixcal.model.errors import InputError
 from pixcal.stages.reduce import read_noise
 from pixcal.stages.reduce.calibration import Usual, usual
 from pixcal.stages.reduce.frame_statistics import Measuring
+from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.tiles import grid
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.place import Place
@@ -34,8 +35,6 @@ _GAIN_ERROR = 0.2
 _GUESS_ERROR = 0.1  # relative error of gain and read noise in `Measuring`
 # variance of a sample, in square codes, above which rounding adds the same at every level
 _SMOOTH = 0.25 + SHEPPARD
-_BENT = 0.02  # largest deviation from a line with an offset in exposure time that one lamp gives
-_LAMP = 0.3  # relative change of light per second that shows that flats are not of one lamp
 _LIT = 5.0  # least response of the median pixel over its error: below it the flat would be noise
 
 
@@ -58,7 +57,7 @@ class Summary:
     full: Mask
     transfer: F64  # (point, 3) photon-transfer curve: see `emva.transfer_points`
     well: Measure | None  # level of its maximum (ADU above bias), if the flats go beyond
-    linearity: Linearity | None  # of the usable steps
+    linearity: Straightness | None  # of the usable steps
 
     def gain_to_use(self, choice: str) -> float:
         """Gain (e-/ADU), ``declared`` or ``measured``; InputError if there is no measured one."""
@@ -99,7 +98,7 @@ class Summary:
         return min(self.declared.read_noise_e, gain * UNDETERMINED_BELOW * self.step)
 
 
-def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
+def summarise(job: Measuring, folder: Place, source: Ingested) -> Summary:
     """Combine the statistics of all columns; InputError if the flats hold no light."""
     tables = ArrayReader(folder / "levels").read()
     levels, usable, nearly = _exposure_steps(tables, job)
@@ -126,11 +125,6 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
         )
     ends = full_level(points), math.inf if well is None else well[0]
     top = float(np.fmin(job.saturation - medians.bias, ends[0] if ends[0] < math.inf else ends[1]))
-    straight = None
-    if job.flats_timed and job.flat and len(set(times[usable])) == usable.sum():
-        straight = linearity(times, levels, usable)
-        if not _one_lamp(times[usable], levels[usable], straight):
-            straight = None
     charge = 0.0 if job.read_series is None else rate * job.read_series.exptime
     gain, wander, lost = None, read_noise.bias_wander(job), read_noise.lost_in_blocks(job)
     # Shot noise of the dark signal is not read noise; its size depends on the gain.
@@ -143,8 +137,10 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
         noise, own = read_noise.of_variance(gain.read_variance, job.quantum)
     elif gain is not None and gain.without_dark:
         noise, own = (n and (n[0], max(n[1], _OFF_CURVE * n[0])) for n in (noise, own))
+    known = math.nan if gain is None else gain.read_variance[0]
+    straight = straightness(_steps_of(source, levels, usable, rate), points, known)
     return Summary(
-        declared,
+        source.detector,
         job.quantum or 1.0,
         medians,
         light,
@@ -264,25 +260,39 @@ def _light(tables: F64, levels: F64, usable: Mask, job: Measuring) -> F64:
     return share
 
 
-def _one_lamp(times: F64, levels: F64, straight: Linearity | None) -> bool:
-    """Whether flats (s, ADU) can be of one lamp, perhaps with exposures longer than stated."""
-    rates = levels / times
-    if not len(rates) or rates.max() < (1 + _LAMP) * rates.min():
-        return len(rates) > 0
-    return (
-        straight is not None and math.isfinite(straight.late[1]) and straight.max_deviation < _BENT
-    )
+def _steps_of(source: Ingested, levels: F64, usable: Mask, rate: float) -> list[Level]:
+    """Levels (ADU) of timed flats with the light of each frame; ``rate``: of dark signal, ADU/s."""
+    if source.survey is None or not source.exposures.known:
+        return []
+    table = source.tables["flat"]
+    stamped = np.equal(table["time_source"], "header")
+    seconds = np.where(stamped, np.array(table["time_s"], float), np.nan)
+    steps = zip(source.exposures.flat, levels, usable, strict=True)
+    return [
+        Level(
+            group.exptime,
+            float(level),
+            bool(used),
+            source.survey.levels[list(group.frames)] - rate * group.exptime,
+            seconds[list(group.frames)],
+        )
+        for group, level, used in steps
+    ]
 
 
 def linearity_report(summary: Summary, job: Measuring, gain: float) -> dict[str, Any] | None:
     """Entry of ``reduce.json`` on the exposure-time steps of flats; None without them."""
     if summary.linearity is None:
         return None
-    rows = zip(job.flat, summary.levels, summary.linearity.deviation, strict=True)
+    found, line = summary.linearity, summary.linearity.line
+    rows = zip(job.flat, summary.levels, line.deviation, strict=True)
     return {
-        "max_deviation_percent": 100 * summary.linearity.max_deviation,
-        "intercept_adu": summary.linearity.intercept,
-        "exposure_offset_s": summary.linearity.late[0],
+        "max_deviation_percent": 100 * found.largest,
+        "error_percent": None if found.error is None else 100 * found.error,
+        "intercept_adu": line.intercept,
+        "exposure_offset_s": line.late[0],
+        "exposure_step_s": found.rounded or None,
+        "lamp_drift_percent": 100 * found.drift,
         "levels": [
             {
                 "exptime_s": group.exptime,

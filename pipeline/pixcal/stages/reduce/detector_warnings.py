@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pixcal.estimators.detector.calibration import Linearity
 from pixcal.kernels.gain_fit import GainFit
 from pixcal.kernels.photon_transfer import SHARED
 from pixcal.model.arrays import F64
@@ -42,15 +43,7 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
             f"{len(summary.levels)} levels of flats are at or near full well and are excluded from "
             "gain and linearity"
         )
-    if summary.linearity is not None and summary.linearity.max_deviation > _LINEARITY:
-        warnings.append(
-            "the levels of the flats deviate by up to "
-            f"{100 * summary.linearity.max_deviation:.2g} % from a straight line over exposure "
-            "time: the response of all pixels is not linear, the lamp is not steady, or exposure "
-            "times are rounded or wrong; no pixels are flagged "
-            "NONLINEAR for it"
-        )
-    warnings += _exposure_warnings(summary)
+    warnings += _linearity_warnings(summary)
     noise = summary.declared.read_noise_e
     measured = summary.noise_measured_e(summary.before_rounding, gain)
     if measured is not None and summary.before_rounding is not None:
@@ -132,10 +125,50 @@ def lamp_warnings(series: Sequence[tuple[float, F64]]) -> list[str]:
     ]
 
 
-def _exposure_warnings(summary: Summary) -> list[str]:
+def _linearity_warnings(summary: Summary) -> list[str]:
+    """Why the levels of the flats are not straight over exposure time."""
+    found = summary.linearity
+    if found is None:
+        return []
+    off, said = f"{100 * found.line.max_deviation:.2g} %", []
+    unflagged = "; no pixels are flagged NONLINEAR for it"
+    if found.drift > _LATE:
+        said.append(
+            f"the light of the flats changes by {100 * found.drift:.2g} % from the first to the "
+            "last, as the frames of each exposure time show: the linearity error allows for it"
+        )
+    if found.rounded:
+        said.append(
+            f"the exposure times of the flats are rounded to {found.rounded:g} s: the levels "
+            f"deviate by up to {off} from a straight line over them, by less than half of that "
+            "step, and their noise does not follow; the linearity error allows for it. Write the "
+            "true times into the headers, or expose for whole multiples of the step" + unflagged
+        )
+    elif found.scatter:
+        said.append(
+            f"the levels of the flats scatter by {100 * found.scatter:.2g} % about a smooth curve "
+            "over exposure time, and their noise does not follow: exposure times or the lamp "
+            "differ from level to level, or the response has a step; the linearity error allows "
+            "for it" + unflagged
+        )
+    elif found.lamp:
+        said.append(
+            f"the levels of the flats deviate by up to {off} from a straight line over exposure "
+            "time: they do not tell a response that is not linear from a lamp that drifts; repeat "
+            "the first level at the end, with several flats of each level" + unflagged
+        )
+    elif found.line.max_deviation > _LINEARITY:
+        said.append(
+            f"the levels of the flats deviate by up to {off} from a straight line over exposure "
+            "time: the response of all pixels is not linear, the lamp is not steady, or exposure "
+            "times are wrong" + unflagged
+        )
+    return said + _exposure_warnings(summary, found.line)
+
+
+def _exposure_warnings(summary: Summary, straight: Linearity) -> list[str]:
     """That exposures are longer or shorter than stated, if levels are straight but for that."""
-    straight = summary.linearity
-    if straight is None or summary.read_noise is None:  # else the level without light is unknown
+    if summary.read_noise is None:  # else the level without light is unknown
         return []
     late, error = straight.late
     share = abs(straight.intercept) / summary.levels[summary.usable].min()

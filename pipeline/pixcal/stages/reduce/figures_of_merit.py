@@ -57,8 +57,8 @@ def characterise(
     if top is not None:
         _full_well(found, gain, top, reached, noise)
     if facts["linearity"] is not None:
-        departure = facts["linearity"]["max_deviation_percent"], _lamp_error(source)
-        found["linearity_error"] = _figure("linearity error, largest", "%", departure)
+        departure = (facts["linearity"][key] for key in ("max_deviation_percent", "error_percent"))
+        found["linearity_error"] = _figure("linearity error, largest", "%", (*departure,))
     curves: Json = {"photon_transfer": _listed(summary.transfer.T, ("level", "variance", "error"))}
     curves["photon_transfer"] |= {"gain": gain[0], "read_variance": (noise or (0.0,))[0] ** 2}
     if halves.dark is not None:
@@ -119,14 +119,6 @@ def _line_noise(found: Json, dark: F64, gain: float, shape: tuple[int, int]) -> 
             found[f"{name}_noise"] = _figure(
                 title, "e-", (gain * noise, gain * error / (2 * noise)), note
             )
-
-
-def _lamp_error(source: Ingested) -> float | None:
-    """Error of the level of a flat (%), from the scatter at one exposure time."""
-    levels = None if source.survey is None else source.survey.levels
-    groups = [] if levels is None else [levels[list(g.frames)] for g in source.exposures.flat]
-    ratios = [own.var(ddof=1) / own.mean() ** 2 / len(own) for own in groups if len(own) > 1]
-    return 100 * math.sqrt(float(np.mean(ratios))) if ratios else None
 
 
 def _top(summary: Summary, job: Measuring, clipped: bool) -> tuple[Measure | None, bool]:

@@ -143,7 +143,7 @@ def reduce_frames(made: Workspace, source: Ingested, config: Config, runtime: Ru
     run_noted(made, partial(measure, job), indices(source.shape), width, runtime, "statistics")
     for writer in job.writers.values():
         writer.finish()
-    summary = summarise(job, made.scratch / "statistics", source.detector)
+    summary = summarise(job, made.scratch / "statistics", source)
     gain = summary.gain_to_use(config.gain)
     bounds = _calibrate(made, source, summary, gain, config, runtime)
     sets = {}

@@ -1,0 +1,277 @@
+"""Levels of flats off a straight line: the response, the lamp, or the exposure times.
+
+A lamp that drifts is seen within the frames of each exposure time, whatever the response. The noise
+of flats follows the slope of the response; levels that it contradicts are off for another reason.
+Exposure times that are stamped rounded are off by a time that does not grow with the exposure.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from pixcal.estimators.detector.calibration import MIN_STEPS, Linearity, linearity
+from pixcal.kernels.significance import sigmas_of_chi2
+from pixcal.model.arrays import F64, Mask
+
+LAMP = 1e-3  # least relative error of the light of a flat, exposure time included
+CHANGED = 0.3  # relative change of light per second that shows that flats are not of one lamp
+_BENT = 0.02  # largest deviation from a line with an offset in exposure time that one lamp gives
+SURE = 5.0  # errors from which a lamp or a response is told
+_DEGREE = 6  # highest of the polynomial of the lamp's light in time
+_DETERMINED = 1e10  # condition of its normal equations
+# least width of the residuals of rounded times, over that of their distribution, and least share of
+# it that no curve in level explains
+_FILLED, _ROUGH = 0.2, 0.3
+_NOISE = 5e-3  # least relative error of the noise of a level
+_ORDERED = 0.9  # correlation of exposure time and time of recording that a drift can mimic
+
+
+@dataclass(frozen=True)
+class Level:
+    """The flats of an exposure time and a lamp."""
+
+    exptime: float  # s
+    level: float  # mean (ADU), without bias and dark signal
+    usable: bool  # without saturation
+    light: F64  # (t,) of each frame (ADU), from some of the pixels
+    time: F64  # (t,) when each was recorded, s; NaN if unknown
+
+
+@dataclass(frozen=True)
+class Straightness:
+    """How straight the levels of flats are, and why they are not."""
+
+    line: Linearity  # of the levels at a steady lamp
+    # largest, error: relative deviation of the response from a line; the error is None if there is
+    # one flat at each level
+    largest: float
+    error: float | None
+    drift: float = 0.0  # relative change of the lamp over the flats, which ``line`` allows for
+    rounded: float = 0.0  # s, to which exposure times are rounded, if levels show it
+    scatter: float = 0.0  # relative, of levels about a curve, if their noise excludes the response
+    lamp: bool = False  # whether a lamp that drifts may have bent the levels
+
+
+def straightness(
+    levels: Sequence[Level], transfer: F64, read_variance: float
+) -> Straightness | None:
+    """Judge levels of flats; None with too few, or where the lamp was changed between them.
+
+    transfer : (point, 3) level, variance and its error, of `emva.transfer_points`
+    read_variance : of a sample without light, ADU²; NaN without a measured gain
+    """
+    if len(levels) < MIN_STEPS:
+        return None
+    times = np.array([one.exptime for one in levels])
+    means = np.array([one.level for one in levels])
+    used = np.array([one.usable for one in levels], np.bool_)
+    light = [one.light for one in levels]
+    line, drift, of_drift = _at_a_steady_lamp(levels, times, means, used)
+    if line is None or not _one_lamp((means / times)[used], line):
+        return None
+    if drift is not None:
+        means = means / np.array([one.mean() for one in drift])
+        light = [one / own for one, own in zip(light, drift, strict=True)]
+    ratios = [o.var(ddof=1) / o.mean() ** 2 / len(o) for o in light if len(o) > 1 and o.mean() > 0]
+    error = float(np.hypot(np.sqrt(np.mean(ratios)), of_drift)) if ratios else None
+    change = 0.0 if drift is None else float(np.ptp(np.concatenate(drift)))
+    found = Straightness(line, line.max_deviation, error, change)
+    if line.max_deviation < LAMP or (not of_drift and line.max_deviation < SURE * (error or 0.0)):
+        return found
+    # Levels that do not vanish at no exposure are late by a constant time, or bent.
+    favour = max(
+        _noise_favours_levels(charge[used], means[used], transfer, read_variance)
+        for charge in (times, times + line.late[0])
+    )
+    if favour < -(SURE**2):
+        found = _without_times(found, times[used], means[used])
+    if not found.rounded and not found.scatter and drift is None and favour < SURE**2:
+        return replace(found, lamp=_may_drift(levels))
+    return found
+
+
+def _one_lamp(rates: F64, line: Linearity) -> bool:
+    """Whether light per second can be of one lamp, perhaps with exposures longer than stated."""
+    alike = bool(rates.max() < (1 + CHANGED) * rates.min())
+    return alike or (np.isfinite(line.late[1]) and line.max_deviation < _BENT)
+
+
+def _at_a_steady_lamp(
+    levels: Sequence[Level], times: F64, means: F64, used: Mask
+) -> tuple[Linearity | None, list[F64] | None, float]:
+    """The line, and the light (t,) of the lamp in each level with the error that it adds.
+
+    Without a lamp whose drift is told by the frames of each level and straightens the levels, its
+    light is None.
+    """
+    once = len(set(times[used])) == used.sum()
+    line = linearity(times, means, used) if once else None
+    found = _drift(levels)
+    if found is None:
+        return line, None, 0.0
+    steady, *shifted = (
+        linearity(times, means / [one.mean() for one in light], used) for light in found
+    )
+    if steady is None:
+        return line, None, 0.0
+    if line is not None and steady.max_deviation > line.max_deviation:
+        # The lamp may start anew at each level.
+        return line, None, steady.max_deviation - line.max_deviation
+    if not once and _apart(times[used], steady.deviation[used]) > LAMP:
+        return None, None, 0.0
+    changes = [one.deviation - steady.deviation for one in shifted if one is not None]
+    worst = np.nanargmax(np.abs(steady.deviation))
+    return steady, found[0], float(np.linalg.norm([one[worst] for one in changes]))
+
+
+def _apart(times: F64, deviation: F64) -> float:
+    """Largest difference of levels of the same exposure time."""
+    return max(float(np.ptp(deviation[times == t])) for t in set(times))
+
+
+def _drift(levels: Sequence[Level]) -> list[list[F64]] | None:
+    """Light (t,) of the lamp in each level, and with each independent error added; None if steady.
+
+    From frames of the same exposure time, without the first of each level, which lag may dim.
+    """
+    every = np.concatenate([one.time for one in levels])
+    if not np.ptp(every) > 0:
+        return None
+    middle, half = (every.max() + every.min()) / 2, np.ptp(every) / 2
+    powers = [((one.time - middle) / half)[:, None] ** np.arange(1, _DEGREE + 1) for one in levels]
+    design, value = [np.zeros((0, _DEGREE))], [np.zeros(0)]
+    for t in {one.exptime for one in levels if one.usable}:
+        own = [n for n, one in enumerate(levels) if one.exptime == t and one.usable]
+        light = np.concatenate([levels[n].light[1:] for n in own])
+        if len(light) < 2 or light.mean() <= 0:
+            continue
+        terms = np.concatenate([powers[n][1:] for n in own])
+        # Photon noise falls with the root of the light.
+        weight = np.sqrt(light.mean())
+        design.append(weight * (terms - terms.mean(axis=0)))
+        value.append(weight * (light / light.mean() - 1))
+    freedom = sum(max(len(one) - 1, 0) for one in value)
+    fitted = _polynomial(np.concatenate(design), np.concatenate(value), freedom)
+    if fitted is None:
+        return None
+    sizes, steps = fitted
+    return [
+        [np.exp(terms[:, : len(own)] @ own) for terms in powers]
+        for own in (sizes, *(sizes + step for step in steps))
+    ]
+
+
+def _polynomial(design: F64, value: F64, freedom: int) -> tuple[F64, F64] | None:
+    """Coefficients (n,) of the degree with most evidence, and shifts (n, n) by each error.
+
+    None without a significant one. The degree has the least Bayesian information criterion.
+    """
+    best: float = np.inf
+    found: tuple[F64, F64] | None = None
+    whole = float(value @ value)
+    for degree in range(1, min(_DEGREE, freedom // 2) + 1):
+        terms = design[:, :degree]
+        normal = terms.T @ terms
+        if not np.linalg.cond(normal) < _DETERMINED:
+            break
+        sizes = np.linalg.solve(normal, terms.T @ value)
+        rest = float(((value - terms @ sizes) ** 2).sum())
+        criterion = freedom * np.log(max(rest, 1e-300)) + degree * np.log(freedom)
+        scatter = rest / (freedom - degree)
+        explained = (whole - rest) / max(scatter, 1e-300)
+        if criterion < best and sigmas_of_chi2(explained, degree) > SURE:
+            errors = np.linalg.cholesky(scatter * np.linalg.inv(normal))
+            best, found = criterion, (np.asarray(sizes), np.asarray(errors.T))
+    return found
+
+
+def _noise_favours_levels(charge: F64, levels: F64, transfer: F64, read_variance: float) -> float:
+    """Chi-square by which noise fits a response through the levels better than a straight one.
+
+    A response of slope s has s² times the shot noise of a straight one of the same charge (in any
+    unit). Zero where there is no noise to tell.
+    """
+    order = np.argsort(levels)
+    charge = charge[order] * np.mean(levels / charge)
+    charge, signal = np.append(0.0, charge), np.append(0.0, levels[order])
+    known = (transfer[:, 0] > signal[1] / 2) & (transfer[:, 0] <= 1.05 * signal[-1])
+    if not np.isfinite(read_variance) or known.sum() < MIN_STEPS or np.diff(charge).min() <= 0:
+        return 0.0
+    level, variance, error = transfer[known].T
+    share = (variance - read_variance) / level
+    error = np.hypot(error / level, _NOISE * share)
+    response = PchipInterpolator(charge, signal)
+    inner = np.interp(level, signal, charge)
+    bent = response(inner, 1) ** 2 * inner / level
+
+    def misfit(expected: F64) -> float:
+        weighted, value = expected / error, share / error
+        rest = value - weighted * (weighted @ value) / (weighted @ weighted)
+        return float(rest @ rest)
+
+    return misfit(np.ones_like(level)) - misfit(bent)
+
+
+def _without_times(found: Straightness, times: F64, levels: F64) -> Straightness:
+    """What levels tell of the response where exposure times, or the lamp, scatter among them."""
+    step = _rounded_to(times, levels)
+    u = levels / levels.max()
+    own = step / np.sqrt(12) / times if step else np.ones_like(times)
+    # Over the straight line; where times are not rounded an offset of theirs counts as straight.
+    terms = [np.ones_like(u), u, *([] if step else [1 / u])]
+    design, value = np.stack(terms, axis=1) / own[:, None], levels / times / own
+    freedom = len(times) - len(terms)
+    if freedom < 2:
+        return found
+    normal = design.T @ design
+    sizes = np.linalg.solve(normal, design.T @ value)
+    rest = value - design @ sizes
+    scatter = np.sqrt(rest @ rest / freedom) / sizes[0]
+    if not step and scatter < _ROUGH * found.line.max_deviation:
+        return found
+    bent = linearity(times, times * (1 + 1e-3 * u), np.ones(len(u), np.bool_))
+    assert bent is not None
+    unit = bent.max_deviation / 1e-3
+    largest = unit * abs(float(sizes[1] / sizes[0]))
+    error = unit * max(scatter, 1.0 if step else 0.0) * np.sqrt(np.linalg.inv(normal)[1, 1])
+    return replace(
+        found,
+        largest=largest,
+        error=float(np.hypot(error, found.error or 0.0)),
+        rounded=step,
+        scatter=0.0 if step else float(scatter),
+    )
+
+
+def _rounded_to(times: F64, levels: F64) -> float:
+    """Step (s) to which times were rounded, if levels are straight but for that; else zero."""
+    steps = 10.0 ** np.arange(2, -10, -1)
+    whole = [np.abs(times / s - np.rint(times / s)) <= 1e-6 * times / s for s in steps]
+    step = float(next((s for s, own in zip(steps, whole, strict=True) if own.all()), 0.0))
+    if len(set(levels)) <= MIN_STEPS or not step:
+        return 0.0
+
+    # A cut-off of digits is rounding of times that are longer by half a step. Of three points the
+    # middle one is twice as far from the line of the others as all from the nearest line.
+    order = np.argsort(levels)
+    low, middle, high = order[np.array(list(combinations(range(len(times)), 3))).T]
+    share = (levels[middle] - levels[low]) / (levels[high] - levels[low])
+    furthest = np.abs(times[middle] - times[low] - share * (times[high] - times[low])).max() / 2
+
+    def scatter(degree: int) -> float:
+        rest = times - np.polyval(np.polyfit(levels, times, degree), levels)
+        return float(np.sqrt(rest @ rest / (len(times) - degree - 1)))
+
+    width = scatter(1)
+    even = width > _FILLED * step / np.sqrt(12) and scatter(2) > _ROUGH * width
+    return step if even and furthest <= step / 2 else 0.0
+
+
+def _may_drift(levels: Sequence[Level]) -> bool:
+    """Whether levels were recorded in the order of exposure times, or at unknown times."""
+    times = np.array([one.time.mean() for one in levels])
+    order = np.corrcoef(np.argsort(np.argsort(times)), np.arange(len(times)))[0, 1]
+    return not np.isfinite(times).all() or abs(order) > _ORDERED

@@ -1,0 +1,135 @@
+"""Why levels of flats are off a line over exposure time: response, lamp, or rounded times."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from pixcal.estimators.detector.straightness import Level, Straightness, straightness
+from pixcal.model.arrays import F64
+
+STAMPS = np.array([0.04, 0.08, 0.17, 0.33, 0.5, 0.71])
+RATE, READ, SAMPLES, FRAMES = 6e4, 25.0, 200_000, 8
+
+
+def straight(charge: F64) -> F64:
+    return charge
+
+
+def judged(
+    stamps: Sequence[float] | F64,
+    times: Sequence[float] | F64,
+    *,
+    lamp: Callable[[F64], F64] = np.ones_like,
+    response: Callable[[F64], F64] = straight,
+    order: Sequence[int] | None = None,
+    frames: int = FRAMES,
+    seed: int = 1,
+) -> Straightness:
+    """What is said of flats (one electron per ADU) of stamped and true exposure times (s).
+
+    ``lamp``: light at the time of recording, one frame per second; ``order``: of the levels.
+    """
+    rng = np.random.default_rng(seed)
+    at = np.empty((len(times), frames))
+    at[list(range(len(times)) if order is None else order)] = np.arange(at.size).reshape(at.shape)
+    levels, points = [], []
+    for t, stamp, seconds in zip(times, stamps, at, strict=True):
+        charge = RATE * t * lamp(seconds)
+        slope = (response(1.001 * charge) - response(0.999 * charge)) / (0.002 * charge)
+        variance = float((slope**2 * charge).mean()) + READ
+        light = response(charge) + np.sqrt(variance / SAMPLES) * rng.standard_normal(frames)
+        error = variance * np.sqrt(2 / SAMPLES / frames)
+        points.append((light.mean(), variance + error * rng.standard_normal(), error))
+        levels.append(Level(float(stamp), float(light.mean()), True, light, seconds))
+    found = straightness(levels, np.array(points), READ)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("cut", [False, True], ids=["rounded", "cut off"])
+@pytest.mark.parametrize("seed", range(6))
+def test_times_that_are_stamped_rounded_are_told_from_the_response(seed: int, cut: bool) -> None:
+    off = np.random.default_rng(seed).uniform(0, 1, len(STAMPS)) - (0 if cut else 0.5)
+    found = judged(STAMPS, STAMPS + 0.01 * off, seed=seed)
+    assert found.error is not None
+    assert found.line.max_deviation > 0.005
+    assert found.rounded in ((0.01,) if not cut else (0.0, 0.01))
+    if found.rounded:
+        assert found.largest < 4 * found.error
+
+
+RESPONSES = {
+    "curved": lambda e: e * (1 - 0.04 * e / 4e4),
+    "knee": lambda e: e - 0.3 * np.maximum(e - 3e4, 0),
+    "rises at low light": lambda e: e * (1 - 0.03 * np.exp(-e / 6e3)),
+}
+
+
+@pytest.mark.parametrize("name", RESPONSES)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_response_is_no_error_of_coarse_stamps(name: str, seed: int) -> None:
+    found = judged(STAMPS, STAMPS, response=RESPONSES[name], seed=seed)
+    assert not found.rounded
+    assert not found.scatter
+    assert not found.drift
+    assert found.largest == found.line.max_deviation > 0.002
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_levels_that_scatter_beside_their_noise_are_not_of_the_response(seed: int) -> None:
+    fine = STAMPS + 1.234567e-3
+    off = 1 + 0.02 * np.random.default_rng(seed).standard_normal(len(STAMPS))
+    found = judged(fine, fine * off, seed=seed)
+    assert not found.rounded
+    assert found.error is not None
+    if found.scatter:
+        assert found.largest < 4 * found.error
+        assert found.scatter == pytest.approx(0.02, rel=0.8)
+
+
+LAMPS = {"warms up": lambda s: 1 - 0.03 * np.exp(-s / 20), "ages": lambda s: 1 - 0.04 * s / 48}
+
+
+@pytest.mark.parametrize("name", LAMPS)
+@pytest.mark.parametrize("response", [straight, RESPONSES["curved"]], ids=["straight", "curved"])
+def test_a_lamp_that_drifts_within_levels_does_not_bend_them(
+    name: str, response: Callable[[F64], F64]
+) -> None:
+    alone = judged(STAMPS, STAMPS, response=response)
+    found = judged(STAMPS, STAMPS, response=response, lamp=LAMPS[name])
+    assert found.error is not None
+    assert alone.error is not None
+    if found.drift:
+        assert found.drift == pytest.approx(np.ptp(LAMPS[name](np.arange(48.0))), rel=0.1)
+        # A curved response changes the drift that is seen, too: by the product of both.
+        product = 0.04 * alone.largest
+        error = 4 * np.hypot(found.error, alone.error) + product
+        assert found.largest == pytest.approx(alone.largest, abs=error)
+    else:
+        # A lamp whose drift makes up for the curve in part: the error includes it.
+        assert response is not straight
+        assert abs(found.largest - alone.largest) < 2 * found.error
+
+
+def test_a_lamp_that_starts_anew_at_each_level_is_not_taken_to_drift() -> None:
+    found = judged(STAMPS, STAMPS, lamp=lambda s: 1 + 0.01 * (s % FRAMES) / FRAMES)
+    assert not found.drift
+    assert found.largest < 1e-3
+
+
+def test_the_first_level_again_at_the_end_tells_a_drift() -> None:
+    """Two flats of each level tell none: the first level again does."""
+    stamps = np.append(STAMPS, STAMPS[0])
+    few = judged(STAMPS, STAMPS, lamp=lambda s: 1 + 0.03 * (s / 12) ** 2, frames=2)
+    again = judged(stamps, stamps, lamp=lambda s: 1 + 0.03 * (s / 12) ** 2, frames=4)
+    assert few.lamp
+    assert again.error is not None
+    assert again.drift > 0.02
+    assert again.largest < 4 * again.error < 2e-3
+
+
+def test_levels_out_of_order_are_not_bent_by_a_drift() -> None:
+    response = lambda e: e * (1 + 0.006 * e / 4e4)  # noqa: E731
+    assert judged(STAMPS, STAMPS, response=response).lamp
+    assert not judged(STAMPS, STAMPS, response=response, order=(4, 0, 2, 5, 1, 3)).lamp
