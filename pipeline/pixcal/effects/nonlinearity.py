@@ -150,7 +150,8 @@ class Nonlinearity(Effect):
         effect = cls(quadratic, cubic, found.level_e)
         more, refused = None, ""
         evidence_for = found.significance, found.why
-        bent = None if evidence.fringes else ladder_curve(evidence)
+        sure = effect.linearised if found.significance > SIGNIFICANT else None
+        bent = None if evidence.fringes else ladder_curve(evidence, sure)
         if bent is not None:
             points = np.pad(bent.charge, (1, 0)).tolist(), np.pad(bent.change, (1, 0)).tolist()
             named = {f"bends[{n}].change_e": float(e) for n, e in enumerate(bent.error, 1)}

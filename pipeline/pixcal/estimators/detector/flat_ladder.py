@@ -148,7 +148,14 @@ def straight_line(times: F64, levels: F64, at: F64) -> F64:
 
 @cached_on_evidence
 def ladder(evidence: Evidence) -> Ladder | None:
-    """The ladder of an acquisition; None with too few levels, or a lamp that was changed."""
+    """The ladder of an acquisition; None where its noise contradicts the curve of its levels."""
+    found, curve = unproven_ladder(evidence), transfer_curve(evidence)
+    return found if found is None or curve is None or _agree(found, curve) else None
+
+
+@cached_on_evidence
+def unproven_ladder(evidence: Evidence) -> Ladder | None:
+    """The ladder by its levels; None with too few of them, or a lamp that was changed."""
     stacks = [s for s in evidence.ladder if s.exptime_s > 0]
     light = [light_of(evidence, s) for s in stacks]
     times = np.array([s.exptime_s for s in stacks])
@@ -165,10 +172,7 @@ def ladder(evidence: Evidence) -> Ladder | None:
     flat = evidence.flat[evidence.good] / evidence.flat[evidence.good].mean()
     moments = float((flat**2).mean()), float((flat**3).mean())
     found = _of_one_lamp(times, levels, error, moments)
-    if found is None or found.wander > STEADY:
-        return None
-    curve = transfer_curve(evidence)
-    return found if curve is None or _agree(found, curve) else None
+    return None if found is None or found.wander > STEADY else found
 
 
 def _of_one_lamp(

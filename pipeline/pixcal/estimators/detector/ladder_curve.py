@@ -5,17 +5,18 @@ lamp and its exposure times are steady. Together they give the charge of each le
 departure, which a natural spline interpolates between levels.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from pixcal.estimators.detector.flat_ladder import LAMP, ladder
+from pixcal.estimators.detector.flat_ladder import LAMP, Ladder, straight_line, unproven_ladder
 from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
-from pixcal.model.arrays import F64
+from pixcal.model.arrays import F32, F64
 
 MIN_LEVELS = 6  # fewest levels for more than a polynomial
 LOOSE = 0.05  # prior 1-sigma of the departure over the signal
@@ -37,12 +38,20 @@ class LadderCurve:
         return np.asarray(np.hypot.reduce(self.steps, axis=1))
 
 
-def ladder_curve(evidence: Evidence) -> LadderCurve | None:
-    """The response; None without a ladder, or where a polynomial describes its noise."""
-    curve, found = transfer_curve(evidence), ladder(evidence)
+def ladder_curve(
+    evidence: Evidence, linearised: Callable[[F32], F32] | None = None
+) -> LadderCurve | None:
+    """The response; None without a ladder, or where a polynomial describes noise and levels.
+
+    ``linearised``: charge (e-) of levels by a significant polynomial of the response.
+    """
+    curve, found = transfer_curve(evidence), unproven_ladder(evidence)
     if curve is None or found is None or len(found.times) != len(curve.levels):
         return None
-    if len(curve.levels) < MIN_LEVELS or not _bends_by_noise(curve):
+    if len(curve.levels) < MIN_LEVELS:
+        return None
+    off_levels = linearised is not None and _bends_by_levels(found, linearised)
+    if not off_levels and not _bends_by_noise(curve):
         return None
     return fit_levels(curve, found.times, evidence.flat[evidence.good])
 
@@ -53,6 +62,13 @@ def _bends_by_noise(curve: TransferCurve) -> bool:
     value = curve.shares / curve.errors
     rest = value - np.linalg.lstsq(design.T, value)[0] @ design
     return sigmas_of_chi2(float(rest @ rest), len(value) - 3) > SIGNIFICANT
+
+
+def _bends_by_levels(found: Ladder, linearised: Callable[[F32], F32]) -> bool:
+    """Whether levels depart from a polynomial by more than a lamp does."""
+    charge = linearised(found.levels.astype(np.float32)).astype(float)
+    rest = (charge / straight_line(found.times, charge, found.times) - 1) / LAMP
+    return sigmas_of_chi2(float(rest @ rest), len(rest) - 2) > SIGNIFICANT
 
 
 def fit_levels(curve: TransferCurve, times: F64, flat: F64) -> LadderCurve | None:
@@ -66,11 +82,12 @@ def fit_levels(curve: TransferCurve, times: F64, flat: F64) -> LadderCurve | Non
     # One knot beyond the highest level: a natural spline has no curvature at its end, knees do.
     above = max(2 * curve.levels[-1] - curve.levels[-2], float(signal.max()))
     knots = np.concatenate([[0.0], curve.levels, [above]])
-    unit = LOOSE * knots[1:]
+    # Signals up to the lowest level are straight: their slope is part of the gain.
+    unit = LOOSE * knots[2:]
 
     def rest(sizes: F64) -> F64:
         gain, rate, offset = sizes[:3] * _GAIN
-        change = CubicSpline(knots, [0.0, *sizes[3:] * unit], bc_type="natural")
+        change = CubicSpline(knots, [0.0, 0.0, *sizes[3:] * unit], bc_type="natural")
         charge, slope = signal - change(signal), 1 / (1 - change(signal, 1))
         share = (1 + gain) * (slope**2 * charge).mean(axis=1) / curve.levels
         line = (1 + rate) * curve.top * times / times[-1] + offset * curve.levels[0]
@@ -79,9 +96,9 @@ def fit_levels(curve: TransferCurve, times: F64, flat: F64) -> LadderCurve | Non
             [(curve.shares - share) / curve.errors, of_lamp, sizes[:1], sizes[3:]]
         )
 
-    fit = least_squares(rest, np.zeros(n + 4))
+    fit = least_squares(rest, np.zeros(n + 3))
     if sigmas_of_chi2(float(fit.fun[: 2 * n] @ fit.fun[: 2 * n]), n) > SIGNIFICANT:
         return None
-    sizes, covariance = fit.x[3:], np.linalg.inv(fit.jac.T @ fit.jac)[3:, 3:]
-    change, steps = unit * sizes, unit[:, None] * np.linalg.cholesky(covariance)
-    return LadderCurve(knots[1:] - change, change, steps)
+    change = np.append(0.0, unit * fit.x[3:])
+    errors = np.linalg.cholesky(np.linalg.inv(fit.jac.T @ fit.jac)[3:, 3:])
+    return LadderCurve(knots[1:] - change, change, np.pad(unit[:, None] * errors, ((1, 0), (0, 0))))
