@@ -11,12 +11,15 @@ from scipy.special import chdtrc
 from pixcal.effects.gain_error import shot_share_of_flats
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.effects.quantisation import Quantisation
+from pixcal.estimators.crosstalk.dense import frames_of, within
+from pixcal.estimators.crosstalk.links import links
 from pixcal.estimators.detector.ladder_curve import ladder_curve
 from pixcal.estimators.detector.neighbours import shared_charge
 from pixcal.estimators.detector.transfer_curve import transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.estimators.test_statistics.noise import read_noise
 from pixcal.kernels.boundaries import boundary_shifts
+from pixcal.simulation.forward import numbers, with_numbers
 
 SHAPE = (93, 101)
 READ, GAIN, BIAS, DARK = 1.0, 1.5, 200.3, 0.4
@@ -121,13 +124,39 @@ def test_a_knee_is_measured_from_level_to_level(seed: int) -> None:
     found = Nonlinearity.estimate(frames)
     assert found is not None
     assert isinstance(found.effect, Nonlinearity)
-    at = np.array([bend.level_e for bend in found.effect.bends[1:]])
+    # Low signals are straight: their slope is part of the gain.
+    assert found.effect.bends[1].change_e == 0
+    at = np.array([bend.level_e for bend in found.effect.bends[2:]])
     # Its errors hang together: all changes are off by the same factor if the gain is.
-    steps = np.array([[own[key] for key in found.errors] for own in found.together])
+    steps = np.array([[own[key] for key in found.errors][1:] for own in found.together])
     off = np.linalg.solve(steps.T, found.effect.response(at) - knee(at))
     assert chdtrc(len(at), off @ off) > 1e-4
     assert np.hypot.reduce(steps, axis=0)[-1] < 0.02 * at[-1]
     assert found.significance > 10
+
+
+@pytest.mark.parametrize("seed", range(6, 8))
+@pytest.mark.parametrize(
+    ("share", "start", "count"), [(0.2, 17e3, 16), (0.4, 18e3, 16), (0.2, 17.8e3, 6)]
+)
+def test_a_response_is_straight_up_to_where_it_bends(
+    share: float, start: float, count: int, seed: int
+) -> None:
+    """No polynomial describes it: that of the noise is 6 to 8 % off at half of the level."""
+    frames = evidence(
+        seed, response=lambda e: e - share * np.maximum(e - start, 0), lamp=0.0, count=count
+    )
+    found = Nonlinearity.estimate(frames)
+    assert found is not None
+    assert isinstance(found.effect, Nonlinearity)
+    assert found.significance > 5
+    at = np.linspace(3e3, 14e3, 20)
+    values = numbers(found.effect)
+    shifts = [{key: values[key] + step for key, step in own.items()} for own in found.together]
+    moved = [with_numbers(found.effect, values | own) for own in shifts]
+    off = np.array([one.response(at) - found.effect.response(at) for one in moved])
+    assert (np.abs(found.effect.response(at) - at) < 4 * np.hypot.reduce(off)).all()
+    assert (np.hypot.reduce(off) < 0.015 * at).all()
 
 
 @pytest.mark.parametrize("lamp", [0.02, None])
@@ -243,3 +272,21 @@ def test_a_simulation_has_the_levels_of_what_it_is_held_against() -> None:
     assert len(brighter.ladder) == len(data.ladder) - 1
     assert len(replace(brighter, full=data.saturated).ladder) == len(data.ladder)
     assert len(replace(data, full=brighter.saturated).ladder) == len(brighter.ladder)
+
+
+def test_some_links_are_measured_as_among_all() -> None:
+    given = evidence(4, count=3)
+    rate = given.dark_rate * np.random.default_rng(5).exponential(1, SHAPE)
+    rate[20::30, 15::30] = 5e3
+    given = replace(given, dark_rate=rate)
+    every, near = links(SHAPE), within(SHAPE)
+    among, alone = (frames_of([given], lambda _, own=own: own) for own in (every, near))
+    assert among is not None
+    assert alone is not None
+    some = among.of_steps(near)
+    assert some.steps == alone.steps
+    for one, other in ((some.noise, alone.noise), (some.hot, alone.hot)):
+        assert one is not None
+        assert other is not None
+        for key, value in vars(other).items():
+            np.testing.assert_array_equal(vars(one)[key], value)

@@ -1,5 +1,7 @@
 """Subtract the common noise of each row and each column."""
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
@@ -17,11 +19,17 @@ def without_line_means(noise: F32, used: Mask) -> F32:
     """
     weight = used.astype(np.float32)
     found = noise * weight
-    for axis in (-1, -2):
-        count = _half_near(weight, axis)
-        taken = _half_near(found, axis) / np.maximum(count, 1)
-        found = (found - taken) * weight
+    for axis, count in zip((-1, -2), _counts(used.tobytes(), used.shape), strict=True):
+        found = (found - _half_near(found, axis) / count) * weight
     return np.asarray(found, np.float32)
+
+
+@lru_cache(maxsize=8)  # stacks of frames have the same pixels
+def _counts(used: bytes, shape: tuple[int, int]) -> tuple[F32, F32]:
+    """Pixels of the mean of each pixel's row, and of its column, at least one."""
+    weight = np.frombuffer(used, np.bool_).reshape(shape).astype(np.float32)
+    rows, columns = (np.maximum(_half_near(weight, axis), 1) for axis in (-1, -2))
+    return rows, columns
 
 
 def _half_near(values: F32, axis: int) -> F32:

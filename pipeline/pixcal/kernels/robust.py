@@ -202,15 +202,17 @@ class Combination:
             raise ValueError("no frames were added")
         seen, n, s1, s2, s3, s4 = self._sums
         with np.errstate(invalid="ignore", divide="ignore"):
-            m1, m2, m3, m4 = (s / n for s in (s1, s2, s3, s4))
+            m1 = s1 / n
             square = m1**2  # a higher power would take ten times as long
-            central2 = m2 - square
-            central4 = m4 - 4 * m1 * m3 + (6 * m2 - 3 * square) * square
+            central2 = s2 / n - square
             variance = central2 * n / (n - 1) / clipped_variance_factor(self._clip)
-            kurtosis = central4 / central2**2 - 3
+            kurtosis = np.full(n.shape, np.nan)
+            if n.max() > 3:
+                central4 = s4 / n - 4 * m1 * (s3 / n) + (6 * (s2 / n) - 3 * square) * square
+                known = (n > 3) & (central2 > 0)
+                kurtosis = np.where(known, central4 / central2**2 - 3, np.nan)
         mean = self._reference + m1
         variance = np.where(n > 1, variance, np.nan)
-        kurtosis = np.where((n > 3) & (central2 > 0), kurtosis, np.nan)
         levels = np.concatenate(self._levels).astype(float)
         common = float(np.mean(levels[np.isfinite(levels)])) if np.isfinite(levels).any() else 1.0
         if self._lamp:

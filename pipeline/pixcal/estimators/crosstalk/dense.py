@@ -70,6 +70,16 @@ class CouplingFrames:
             hot = hot.corrected(outflow(large, shape, first), per_ke)
         return MeasuredLinks(noise, hot, self.steps, shape, first)
 
+    def of_steps(self, steps: tuple[Place, ...]) -> "CouplingFrames":
+        """What they measure of some of the steps."""
+        at = [self.steps.index(step) for step in steps]
+        noise, hot = self.noise, self.hot
+        if noise is not None:
+            noise = replace(noise, right=noise.right[at], normal=noise.normal[at])
+        if hot is not None:
+            hot = replace(hot, value=hot.value[:, at], sigma=hot.sigma[:, at])
+        return replace(self, noise=noise, hot=hot, steps=steps)
+
     def kernel(
         self, classes: PixelClasses, known: Sequence[Coupling], per_ke: float = 0.0
     ) -> "Dense | None":

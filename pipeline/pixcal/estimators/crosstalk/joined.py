@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from pixcal.estimators.crosstalk.dense import CouplingFrames, Dense, frames_of, within
-from pixcal.estimators.crosstalk.links import Place, links
+from pixcal.estimators.crosstalk.links import links
 from pixcal.estimators.crosstalk.pattern import visibility_pattern
 from pixcal.estimators.crosstalk.support import Choice, choose
 from pixcal.estimators.diagnosis.evidence import Evidence, central_crop
@@ -48,16 +48,19 @@ def measure(evidence: Evidence) -> Kernel | None:
     stands_out = _standing_out(evidence)
     if stands_out is None:
         return None
-    evidence, every, found = stands_out
+    evidence, frames, found = stands_out
     none = Kernel((), np.zeros((0, 0)), found.significance, (), 0.0, np.inf)
     if not found.links:
         return none
-    near = within(evidence.good.shape, {every[n] for n in found.links})
+    near = within(evidence.good.shape, {frames.steps[n] for n in found.links})
+    own: CouplingFrames | None = frames.of_steps(near)
+    del frames, stands_out  # large
     known: tuple[Coupling, ...] = ()
     per_ke, error = 0.0, np.inf
-    for _ in range(2):
+    for again in (False, True):
         # The second pass uses the charge as collected, and all hot pixels.
-        own = frames_of([evidence], lambda _: near, known)
+        if again:
+            own = frames_of([evidence], lambda _: near, known)
         dense = None if own is None else own.kernel(found.classes, known, per_ke)
         if own is None or dense is None:
             raise InputError(
@@ -75,15 +78,15 @@ def significance(evidence: Evidence) -> float | None:
     return None if stands_out is None else stands_out[-1].significance
 
 
-def _standing_out(evidence: Evidence) -> tuple[Evidence, tuple[Place, ...], Choice] | None:
-    """The pixels examined, all their links, and which of these are significant."""
+def _standing_out(evidence: Evidence) -> tuple[Evidence, CouplingFrames, Choice] | None:
+    """The pixels examined, what frames tell of all their links, and the significant ones."""
     if not evidence.fringes:
         evidence = central_crop(evidence, MOST_PIXELS)
     every = links(evidence.good.shape)
     frames = frames_of([evidence], lambda _: every) if every else None
     if frames is None:
         return None
-    return evidence, every, choose(frames.measured(()), visibility_pattern(evidence))
+    return evidence, frames, choose(frames.measured(()), visibility_pattern(evidence))
 
 
 def _level(

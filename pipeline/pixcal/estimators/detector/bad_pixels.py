@@ -137,13 +137,18 @@ def noisy(
     ratio = variance / expected
     dofs, which = np.unique(dof, return_inverse=True)
     with np.errstate(invalid="ignore", divide="ignore"):
-        limits = chdtri(dofs, _FALSE_ALARM) / dofs
+        limits = certainly_noisy(dofs)
         significant = (dof > 0) & (ratio > limits[which].reshape(dof.shape))
         flat_top = kurtosis < -_KURTOSIS_SIGMAS * np.sqrt(24 / dof)
     loud = significant & (ratio > factor**2)
     telegraph = significant & flat_top & (dof >= _KURTOSIS_SAMPLES)
     blinking = outliers >= np.maximum(_MIN_OUTLIERS, _OUTLIER_SHARE * dof)
     return np.asarray(loud | telegraph | blinking)
+
+
+def certainly_noisy(dof: float | F64) -> F64:
+    """Variance over the usual one above which a pixel is not noisy by chance."""
+    return np.asarray(chdtri(dof, _FALSE_ALARM) / dof)
 
 
 def variance_nearby(variance: F64, dof: F64, usual: float) -> F64:

@@ -15,7 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.detector import calibration
-from pixcal.estimators.detector.bad_pixels import noisy, noisy_factor, nonlinear, variance_nearby
+from pixcal.estimators.detector.bad_pixels import (
+    certainly_noisy,
+    noisy,
+    noisy_factor,
+    nonlinear,
+    variance_nearby,
+)
 from pixcal.estimators.detector.calibration import DarkLine, ExposureLevel
 from pixcal.estimators.detector.cut_off import without_cut_off
 from pixcal.estimators.detector.pair_noise import LineNoise, dark_pair_sums, flat_pair_sums
@@ -291,6 +297,8 @@ def _loud(job: Measuring, frames: F32) -> NDArray[np.bool_]:
     dof = np.full(variance.shape, len(frames) - 1.0)
     # A level at the boundary of two codes gives either one.
     usual = max(calibration.usual_variance(variance, len(frames) - 1), job.quantum**2 / 4)
+    if not (variance > certainly_noisy(len(frames) - 1) * usual).any():
+        return np.zeros(variance.shape, np.bool_)
     unknown = np.full(variance.shape, np.nan)
     factor = noisy_factor(job.options.noisy_factor, variance, len(frames) - 1, job.quantum)
     nearby = variance_nearby(variance, dof, usual)

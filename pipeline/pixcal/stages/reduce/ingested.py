@@ -89,7 +89,7 @@ class Ingested:
         """
         listed = {k: v for k, v in self._listed.items() if k != "dark" or not self._mixed_darks}
         flat = listed.get("flat")
-        if self.survey is None or flat is None or "step" in flat:
+        if flat is None or "step" in flat or self.survey is None:
             return listed
         return listed | {"flat": flat | {"step": self.survey.steps(flat["exptime_s"])}}
 
