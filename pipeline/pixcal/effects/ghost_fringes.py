@@ -25,17 +25,17 @@ PARENTS: dict[str, tuple[Parent, ...]] = {
     "both": _EVERY_PARENT[:2],
     "crossed": _EVERY_PARENT[2:],
 }
-# laws of the amplitudes: whether the ghost of one fibre has static, forward and backward fringes
-SINGLE = {
-    "static fringes alone: a ghost crossed in polarisation with the other fibre": (1, 0, 0),
-    "ghost of the modulated fibre: static and moving fringes": (1, 1, 0),
-    "ghost of the fixed fibre: static and moving fringes": (1, 0, 1),
+# laws: static, forward and (conjugate) backward amplitude of a unit of each ghost
+LAWS = {
+    "static fringes alone: a ghost crossed in polarisation with the other fibre": ((1, 0, 0),),
+    "ghost of the modulated fibre: static and moving fringes": ((1, 1, 0),),
+    "ghost of the fixed fibre: static and moving fringes": ((1, 0, 1),),
+    "ghosts of both fibres": ((1, 1, 0), (1, 0, 1)),
 }
-BOTH = "ghosts of both fibres"
-OF_ONE, OF_BOTH = 2, 4  # number of a wave's six numbers that a law leaves free
 # least chi-square per wave for a second ghost
 TWO_GHOSTS = 25.0
-UNTIED = 0.5  # largest share of the waves' chi-square that the law of a beam may leave
+# largest misfit of the law of a beam over that of unrelated amplitudes, per degree of freedom
+UNTIED = 0.75
 # largest differences between sets, relative and in errors, of a pattern of the flat
 ALIKE, ALIKE_SIGMAS = 0.1, 5.0
 
@@ -174,7 +174,7 @@ class GhostFringes(Effect):
         middle = (evidence.origin[1] + (nx - 1) / 2, evidence.origin[0] + (ny - 1) / 2)
         waves: list[GhostWave] = []
         errors: dict[str, float] = {}
-        law, tied, left = _law(found.waves)
+        tied = _tied(found.waves)
         columns = [abs(f.k[0]) >= abs(f.k[1]) for f in evidence.fringes.values()]
         alike = max(sum(columns), len(columns) - sum(columns))
         taken = tied.shrunk(found.waves, alike)
@@ -187,9 +187,9 @@ class GhostFringes(Effect):
         return Estimate(
             cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=tuple(waves)),
             errors,
-            found.significance if _of_a_beam(found.waves, law, left, evidence) else 0.0,
+            found.significance if _of_a_beam(found.waves, tied, evidence) else 0.0,
             "fringes of a common vector in " + " and ".join(found.seen_in),
-            law=law,
+            law=tied.law,
             by_law=cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=by_law),
         )
 
@@ -199,8 +199,8 @@ class GhostFringes(Effect):
         found = find_waves(evidence, most=1)
         if found is None:
             return None
-        law, _, left = _law(found.waves)
-        return found.significance if _of_a_beam(found.waves, law, left, evidence) else 0.0
+        of_a_beam = _of_a_beam(found.waves, _tied(found.waves), evidence)
+        return found.significance if of_a_beam else 0.0
 
 
 def _wave(found: WaveFit, middle: tuple[float, float]) -> GhostWave:
@@ -226,9 +226,21 @@ def _pair(value: complex) -> tuple[float, float]:
 class TiedWaves:
     """Waves whose amplitudes follow a law, and the misfit."""
 
+    law: str
     waves: list[WaveFit]
     misfit: float  # chi-square that the law leaves
     freedom: int  # its expectation from noise
+
+    @classmethod
+    def of(cls, law: str, measured: Sequence[WaveFit]) -> "TiedWaves":
+        """Least squares of the measured amplitudes."""
+        each, waves, misfit = np.array(LAWS[law]).T, [], 0.0
+        for one in measured:
+            amplitudes, error = one.amplitudes, np.array(one.errors[:3])
+            sizes = np.linalg.lstsq(each / error[:, None], amplitudes / error)[0]
+            misfit += float((np.abs((amplitudes - each @ sizes) / error) ** 2).sum())
+            waves.append(one.with_amplitudes(each @ sizes))
+        return cls(law, waves, misfit, 2 * len(waves) * (3 - each.shape[1]))
 
     def shrunk(self, measured: Sequence[WaveFit], alike: int) -> list[WaveFit]:
         """The measured waves, shrunk to the law by the share of noise in their misfit.
@@ -240,76 +252,28 @@ class TiedWaves:
         sure = sigmas_of_chi2(max(chi2, 1e-9), max(freedom, 1)) > SIGNIFICANT
         share = 1 - freedom / chi2 if sure else 0.0
         return [
-            replace(
-                by_law,
-                static=by_law.static + share * (one.static - by_law.static),
-                forward=by_law.forward + share * (one.forward - by_law.forward),
-                backward=by_law.backward + share * (one.backward - by_law.backward),
-            )
+            by_law.with_amplitudes(share * one.amplitudes + (1 - share) * by_law.amplitudes)
             for one, by_law in zip(measured, self.waves, strict=True)
         ]
 
 
-def _law(waves: Sequence[WaveFit]) -> tuple[str, TiedWaves, float]:
-    """Law of the amplitudes, waves that follow it, and the share of chi-square that it leaves."""
-    laws = {law: [_tied(w, weights) for w in waves] for law, weights in SINGLE.items()}
-    both = [_tied_of_both(w) for w in waves]
-
-    def misfit(tied: Sequence[Tied]) -> float:
-        return sum(one.misfit for one in tied)
-
-    law = min(laws, key=lambda name: misfit(laws[name]))
-    best, unknown = laws[law], OF_ONE
+def _tied(waves: Sequence[WaveFit]) -> TiedWaves:
+    """Waves by the law that they follow."""
+    *single, both = (TiedWaves.of(law, waves) for law in LAWS)
+    best = min(single, key=lambda tied: tied.misfit)
     static = sum(abs(w.static) ** 2 / w.errors[0] ** 2 for w in waves)
     # Two ghosts have more free numbers, and must explain much more than one. Crosstalk causes no
     # static fringes.
-    if misfit(best) > 2 * misfit(both) + TWO_GHOSTS * len(waves) < static:
-        law, best, unknown = BOTH, both, OF_BOTH
-    left = misfit(best) / max(sum(one.unrelated for one in best), 1e-300)
-    tied = TiedWaves([one.wave for one in best], misfit(best), (6 - unknown) * len(best))
-    return law, tied, left
+    two = best.misfit > 2 * both.misfit + TWO_GHOSTS * len(waves) < static
+    return both if two else best
 
 
-def _of_a_beam(waves: Sequence[WaveFit], law: str, left: float, evidence: Evidence) -> bool:
-    """Whether waves are due to a reflection, by their law and the share that it leaves."""
-    moving = law == BOTH or any(SINGLE[law][1:])
-    return left < UNTIED and not (moving and _of_the_flat(waves, evidence))
-
-
-@dataclass(frozen=True)
-class Tied:
-    """A wave whose amplitudes follow a law."""
-
-    wave: WaveFit
-    misfit: float  # chi-square that the law leaves
-    unrelated: float  # the same for unrelated amplitudes of these sizes
-
-
-def _tied(w: WaveFit, weights: tuple[int, int, int]) -> Tied:
-    """Fit of one complex amplitude: static s·a, forward f·a, backward b·conj(a)."""
-    amplitudes = np.array([w.static, w.forward, w.backward.conjugate()])
-    information = 1 / np.array(w.errors[:3]) ** 2
-    unit = np.array(weights)
-    a = complex((information * unit) @ amplitudes / ((information * unit) @ unit))
-    s, f, b = (complex(v) for v in a * unit)
-    misfit = float(information @ np.abs(amplitudes - a * unit) ** 2)
-    tied = replace(w, static=s, forward=f, backward=b.conjugate())
-    return Tied(tied, misfit, float(information @ np.abs(amplitudes) ** 2))
-
-
-def _tied_of_both(w: WaveFit) -> Tied:
-    """Fit of an amplitude for each fibre's ghost; both contribute to the static fringes."""
-    variance = np.array(w.errors[:3]) ** 2
-    sizes = np.abs([w.static, w.forward, w.backward])
-    off = (w.static - w.forward - w.backward.conjugate()) / float(variance.sum())
-    tied = replace(
-        w,
-        static=w.static - off * variance[0],
-        forward=w.forward + off * variance[1],
-        backward=w.backward + off.conjugate() * variance[2],
-    )
-    total = float(variance.sum())
-    return Tied(tied, abs(off) ** 2 * total, float(sizes @ sizes) / total)
+def _of_a_beam(waves: Sequence[WaveFit], tied: TiedWaves, evidence: Evidence) -> bool:
+    """Whether waves are due to a reflection, by their law and the misfit that it leaves."""
+    chi2 = sum(float((np.abs(w.amplitudes / w.errors[:3]) ** 2).sum()) for w in waves)
+    untied = tied.misfit * 6 * len(waves) > UNTIED * tied.freedom * chi2
+    moving = np.any(np.array(LAWS[tied.law])[:, 1:])
+    return not untied and not (moving and _of_the_flat(waves, evidence))
 
 
 def _of_the_flat(waves: Sequence[WaveFit], evidence: Evidence) -> bool:

@@ -8,6 +8,7 @@ A weak third beam multiplies the mean light by ``1 + Re(s e)`` and the fringe's 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from scipy.special import ndtri_exp
@@ -19,7 +20,7 @@ from pixcal.estimators.maps.map_fit import MapPart
 from pixcal.estimators.maps.structure import PERIODS
 from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.significance import sigmas_of_chi2
-from pixcal.model.arrays import F64, Mask
+from pixcal.model.arrays import C128, F64, Mask
 
 # least distance, periods in the window, of a wave from modes that the fit does not determine
 NEAR = 1.5
@@ -45,6 +46,16 @@ class WaveFit:
     backward: complex
     # (5,) float: of s, f, b (of the real and of the imaginary part), then of q
     errors: tuple[float, ...]
+
+    @property
+    def amplitudes(self) -> C128:
+        """(3,) s, f and the conjugate of b, which a ghost of one fibre shares."""
+        return np.array([self.static, self.forward, self.backward.conjugate()])
+
+    def with_amplitudes(self, amplitudes: C128) -> Self:
+        """The wave with other `amplitudes`."""
+        static, forward, backward = amplitudes.tolist()
+        return replace(self, static=static, forward=forward, backward=backward.conjugate())
 
 
 @dataclass(frozen=True)
