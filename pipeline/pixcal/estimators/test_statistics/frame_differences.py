@@ -12,6 +12,7 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack, cached_on_evidence
 from pixcal.estimators.test_statistics import Curve, family, statistic
 from pixcal.estimators.test_statistics.fringe_set_data import ADJACENT, STEPS, neighbour_sums
+from pixcal.estimators.test_statistics.noise import RANGES, in_range
 from pixcal.kernels.line_means import without_line_means
 from pixcal.kernels.sample_sums import frame_means
 from pixcal.model.arrays import F32, F64, Mask
@@ -141,41 +142,18 @@ def bias_change(evidence: Evidence) -> Curve | None:
 KINDS = (("bias",), ("dark",), ("flat",))
 
 
-def _neighbours(evidence: Evidence, kind: str, steps: slice) -> Curve | None:
-    """Correlation in the differences of two frames of a kind, of some of `STEPS`."""
+NEIGHBOURS = tuple((f"{kind}_{own[0]}", kind, *own) for own in RANGES for (kind,) in KINDS)
+
+
+@family(
+    "{0}", NEIGHBOURS, "noise", "correlation of {3} in {1} frames", "correlation", x="{4}",
+    sets=False,
+)  # fmt: skip
+def neighbours(of: str, evidence: Evidence) -> Curve | None:
+    """Correlation in the differences of two frames of a kind."""
+    kind, _, distance = of.partition("_")
     stacks = repeated(evidence, kind)
-    if not stacks:
-        return None
-    every = np.arange(len(STEPS), dtype=float)
-    return Curve(every[steps], _correlation(evidence, stacks)[steps])
-
-
-@family(
-    "{0}_neighbours",
-    KINDS,
-    "noise",
-    "correlation of adjacent pixels in {0} frames",
-    "correlation",
-    x="neighbour",
-    sets=False,
-)
-def neighbours(kind: str, evidence: Evidence) -> Curve | None:
-    """Correlation of pixels that touch, where most crosstalk is."""
-    return _neighbours(evidence, kind, slice(ADJACENT))
-
-
-@family(
-    "{0}_far_neighbours",
-    KINDS,
-    "noise",
-    "correlation of pixels further apart in {0} frames",
-    "correlation",
-    x="far neighbour",
-    sets=False,
-)
-def far_neighbours(kind: str, evidence: Evidence) -> Curve | None:
-    """Correlation of pixels two to four rows or columns apart."""
-    return _neighbours(evidence, kind, slice(ADJACENT, None))
+    return in_range(distance, _correlation(evidence, stacks)) if stacks else None
 
 
 @family(

@@ -61,19 +61,23 @@ def variance_by_time(data: FringeSetData) -> Curve:
     return Curve(np.arange(1.0, 9.0), np.array(value))
 
 
-@of_noise("correlation of adjacent pixels", "correlation", x="neighbour")
-def neighbours(data: FringeSetData) -> Curve:
-    """Correlation of the residuals of adjacent pixels: separate, as most crosstalk is there."""
-    sums, count = data.neighbours
-    return Curve.numbered(_mean_product(sums, count)[:ADJACENT])
+# most crosstalk is between pixels that touch; the others are two to four rows or columns apart
+RANGES = (
+    ("neighbours", "adjacent pixels", "neighbour"),
+    ("far_neighbours", "pixels further apart", "far neighbour"),
+)
 
 
-@of_noise("correlation of pixels further apart", "correlation", x="far neighbour")
-def far_neighbours(data: FringeSetData) -> Curve:
-    """Correlation of the residuals of pixels two to four rows or columns apart."""
-    sums, count = data.neighbours
-    every = np.arange(float(len(STEPS)))
-    return Curve(every[ADJACENT:], _mean_product(sums, count)[ADJACENT:])
+def in_range(distance: str, correlation: F64) -> Curve:
+    """The part of correlations by `STEPS` that is in one of `RANGES`."""
+    steps = slice(ADJACENT) if distance == "neighbours" else slice(ADJACENT, None)
+    return Curve(np.arange(float(len(STEPS)))[steps], correlation[steps])
+
+
+@family("{0}", RANGES, "noise", "correlation of {1}", "correlation", x="{2}")
+def neighbours(distance: str, data: FringeSetData) -> Curve:
+    """Correlation of the residuals of pixels."""
+    return in_range(distance, _mean_product(*data.neighbours))
 
 
 @of_noise(
