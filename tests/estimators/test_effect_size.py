@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from pixcal.estimators.test_statistics import Curve, Key
-from pixcal.estimators.test_statistics.effect_size import EffectSizes, SizeScale, gap_of_sizes
 from pixcal.estimators.test_statistics.expectation import (
     FLOOR,
     STRAIGHT,
@@ -16,7 +15,14 @@ from pixcal.estimators.test_statistics.expectation import (
     signature_key,
     straight_significance,
 )
-from pixcal.estimators.test_statistics.gap import compare, flagged, sigmas_of
+from pixcal.estimators.test_statistics.gap import (
+    EffectSizes,
+    SizeScale,
+    compare,
+    flagged,
+    gap_of_sizes,
+    sigmas_of,
+)
 from pixcal.model.arrays import F64
 
 LINEAR: Key = ("harmonics", "a")

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixcal.estimators.test_statistics import Key
-from pixcal.estimators.test_statistics.effect_size import EffectSizes, SizeScale, gap_of_sizes
 from pixcal.estimators.test_statistics.expectation import (
     Expectation,
     Reference,
@@ -16,9 +15,12 @@ from pixcal.estimators.test_statistics.expectation import (
 from pixcal.estimators.test_statistics.gap import (
     FALSE_ALARM_RATE,
     Difference,
+    EffectSizes,
     Gap,
+    SizeScale,
     compare,
     flagged,
+    gap_of_sizes,
     likelier,
     log_likelihood,
     remaining,
