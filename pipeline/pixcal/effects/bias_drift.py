@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
 from pixcal.estimators.detector.noiseless_charge import noiseless_level
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.light import LIGHT_PARTS, FrameLight, light_of
+from pixcal.estimators.frame_series.light import LIGHT_PARTS, light_of
 from pixcal.estimators.frame_series.offset import (
     OffsetSeries,
     dark_courses,
@@ -18,7 +18,7 @@ from pixcal.estimators.frame_series.offset import (
     offset_modes,
     unlit_stacks,
 )
-from pixcal.estimators.frame_series.profiled import Profiled, ProfiledFit, best_shape
+from pixcal.estimators.frame_series.profiled import Profiled, best_shape
 from pixcal.estimators.frame_series.variance_components import (
     MAX_STEPS,
     Components,
@@ -172,27 +172,17 @@ class BiasDrift(Effect):
         return max(found, key=lambda e: e.significance, default=None)
 
     @classmethod
-    def detect(cls, evidence: Evidence) -> float | None:
-        """As in `Effect.detect`, with a grid of settling time constants, not refined."""
-        chances = []
-        if every := _all_series(evidence):
-            full, drift = _drift(every)
-            fit, times = _settling_fits(every)
-            decay = _settling_chance([fit(value, full, 0) for value in times], full)
-            chances.append([drift, decay, _slope_chance(full)])
-        if light := light_of(evidence):
-            there, sloped, chance = _fits_of_runs(light)
-            chances.append([chance, log_chance(_rise(sloped, there))])
-        return max((sigmas(log_chance_of_any(own)) for own in chances), default=None)
-
-    @classmethod
     def _in_runs(cls, evidence: Evidence) -> Estimate | None:
         """A separate walk or ramp in each fringe set, from B and A of its frames."""
         light = light_of(evidence)
         if light is None:
             return None
         at = LIGHT_PARTS.index("offset_walk")
-        there, sloped, chance = _fits_of_runs(light)
+        light = replace(light, dark=())
+        modes = light.modes(LIGHT_PARTS)
+        there, none = estimate_components(modes), estimate_components(modes, absent=(at - 1, at))
+        sloped = estimate_components(light.modes(LIGHT_PARTS, ramp=True))
+        chance = joint_log_chance(there, none, there.size[-2:])
         # Variation that both explain is attributed to the walk, which is more general.
         rise = _rise(sloped, there)
         law, ramp, errors = "random walk, rms after an hour", 0.0, {}
@@ -221,29 +211,22 @@ class BiasDrift(Effect):
         every = _all_series(evidence)
         if not every:
             return None
-        full, drift = _drift(every)
+        modes = offset_modes(every, [_ramp(s) for s in every])
+        full, none = estimate_components(modes), estimate_components(modes, absent=(0, 1))
+        drift = joint_log_chance(full, none, full.size[:2])
         level = estimate_components(offset_modes(every, [_ramp(s)[:, :0] for s in every]))
         # The walk is refitted without the ramp: if it is only a walk, the ramp then adds little.
         steady = float(np.sqrt(2 * _rise(full, level)))
         best, settling = _settling(every, full)
         found = best.found if best else full
-        slope, slope_error = _slope(found)
-        changes = [drift, settling, _slope_chance(found)]
+        slope, error = float(found.beta[0]), float(np.sqrt(found.shape_covariance((1,))[0, 0]))
+        changes = [drift, settling, log_chance((slope / error) ** 2 / 2)]
         if not best and steady < STEADY:
             found, slope = level, 0.0
-        (jitter, jitter_error), (walk, walk_error) = found.root(0), found.root(1)
-        per_hour = float(np.sqrt(HOUR_S))
-        values: dict[str, Any] = {
-            "jitter_rms": jitter,
-            "ramp_e_h": slope,
-            "walk_e_h": walk * per_hour,
-        }
-        errors = {
-            "jitter_rms": jitter_error,
-            "ramp_e_h": slope_error,
-            "walk_e_h": walk_error * per_hour,
-        }
-        values["settle_e"] = 0.0
+        (jitter, of_jitter), (walk, of_walk) = found.root(0), found.root(1)
+        walk, of_walk = walk * HOUR_S**0.5, of_walk * HOUR_S**0.5
+        values = {"jitter_rms": jitter, "ramp_e_h": slope, "walk_e_h": walk, "settle_e": 0.0}
+        errors = {"jitter_rms": of_jitter, "ramp_e_h": error, "walk_e_h": of_walk}
         if best:
             own = float(np.sqrt(found.shape_covariance((1,))[1, 1]))
             values |= {"settle_e": float(found.beta[1]), "settle_s": best.value}
@@ -279,35 +262,8 @@ def _rise(full: Components, less: Components) -> float:
     return max(full.profile - less.profile, 0.0)
 
 
-def _drift(every: Sequence[OffsetSeries]) -> tuple[Components, float]:
-    """Jitter and walk with a free ramp, and the log probability of the two by chance."""
-    modes = offset_modes(every, [_ramp(s) for s in every])
-    full, none = estimate_components(modes), estimate_components(modes, absent=(0, 1))
-    return full, joint_log_chance(full, none, full.size[:2])
-
-
-def _slope(found: Components) -> tuple[float, float]:
-    """Slope of the ramp and its error, e-/h."""
-    return float(found.beta[0]), float(np.sqrt(found.shape_covariance((1,))[0, 0]))
-
-
-def _slope_chance(found: Components) -> float:
-    slope, error = _slope(found)
-    return log_chance((slope / error) ** 2 / 2)
-
-
-def _fits_of_runs(light: FrameLight) -> tuple[Components, Components, float]:
-    """A walk in each fringe set, without and with a ramp; log chance of the former."""
-    light = replace(light, dark=())
-    at = LIGHT_PARTS.index("offset_walk")
-    modes = light.modes(LIGHT_PARTS)
-    there, none = estimate_components(modes), estimate_components(modes, absent=(at - 1, at))
-    sloped = estimate_components(light.modes(LIGHT_PARTS, ramp=True))
-    return there, sloped, joint_log_chance(there, none, there.size[-2:])
-
-
-def _settling_fits(every: Sequence[OffsetSeries]) -> tuple[ProfiledFit, F64]:
-    """Fits of a decay from the first frame on with a free ramp; trial time constants, s."""
+def _settling(every: Sequence[OffsetSeries], plain: Components) -> tuple[Profiled | None, float]:
+    """Decay from the first frame on if significant; its log probability by chance."""
     step = min(s.step_s for s in every)
     length = max(s.time_s[-1] for s in every) - min(s.time_s[0] for s in every)
 
@@ -315,21 +271,11 @@ def _settling_fits(every: Sequence[OffsetSeries]) -> tuple[ProfiledFit, F64]:
         shapes = [np.hstack([_ramp(s), np.exp(-s.time_s / value)[:, None]]) for s in every]
         return estimate_components(offset_modes(every, shapes), start=start, steps=steps)
 
-    return fit, np.geomspace(3 * step, max(length, 6 * step), SETTLINGS)
-
-
-def _settling(every: Sequence[OffsetSeries], plain: Components) -> tuple[Profiled | None, float]:
-    """Decay from the first frame on if significant; its log probability by chance."""
-    best = best_shape(*_settling_fits(every), True, plain)
-    chance = _settling_chance([best.found], plain)
-    return best if sigmas(chance) > SIGNIFICANT else None, chance
-
-
-def _settling_chance(fits: Sequence[Components], plain: Components) -> float:
-    """Log probability of the best decay by chance."""
+    trials = np.geomspace(3 * step, max(length, 6 * step), SETTLINGS)
+    best = best_shape(fit, trials, True, plain)
     # Neighbouring time constants are correlated: half their number counts as trials.
-    growth = max(_rise(found, plain) for found in fits)
-    return log_chance_of_any([log_chance(growth)] * (SETTLINGS // 2))
+    chance = log_chance_of_any([log_chance(_rise(best.found, plain))] * (SETTLINGS // 2))
+    return best if sigmas(chance) > SIGNIFICANT else None, chance
 
 
 def _with_level(track: Track, evidence: Evidence) -> Track:

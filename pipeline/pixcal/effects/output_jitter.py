@@ -123,12 +123,6 @@ class OutputJitter(Effect):
             "steps between outputs that change in each frame without light",
         )
 
-    @classmethod
-    def detect(cls, evidence: Evidence) -> float | None:
-        """Significance of the clearest edge."""
-        found = _outputs(evidence)
-        return None if found is None else found.sigmas
-
 
 def _outputs(evidence: Evidence) -> "Outputs | None":
     """Outputs in the frames without light, with edges in window coordinates."""

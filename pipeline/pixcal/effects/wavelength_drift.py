@@ -13,7 +13,7 @@ from pixcal.kernels.scene import FrameStates, geometry
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
-from pixcal.simulation.frame_fit import detect_in_frames, fit_frames
+from pixcal.simulation.frame_fit import fit_frames
 from pixcal.simulation.recording import Recording
 
 HOUR_S = 3600.0
@@ -97,12 +97,6 @@ class WavelengthDrift(Effect):
         significance = max(slow.significance, _sharpest(motion))
         refused = SETS_DIFFER if slow.sets_differ > SIGNIFICANT else ""
         return Estimate(effect, errors, significance, slow.why, refused=refused)
-
-    @classmethod
-    def detect(cls, evidence: Evidence) -> float | None:
-        """As in `Effect.detect`."""
-        motion, slow = motion_of(evidence), detect_in_frames(cls, evidence, leave=("hop",))
-        return None if motion is None or slow is None else max(slow, _sharpest(motion))
 
 
 def _sharpest(motion: Motion) -> float:

@@ -20,7 +20,7 @@ from pixcal.model.bench import SimulatedDetector
 from pixcal.model.errors import InputError
 from pixcal.simulation.forward import DOMAINS, ForwardModel, Stage, numbers, with_numbers
 from pixcal.simulation.frame_changes import acts_on_frames_alone
-from pixcal.simulation.frame_fit import detect_in_frames, fit_frames
+from pixcal.simulation.frame_fit import fit_frames
 from pixcal.simulation.light_fit import LightFit, LightStart, fit_light
 from pixcal.simulation.score import score, score_again
 
@@ -205,9 +205,6 @@ class Effect(ForwardModel):
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
         """Significance as in `estimate`; most simulations need nothing else."""
-        inherited = all("estimate" not in vars(c) for c in cls.__mro__[: cls.__mro__.index(Effect)])
-        if inherited and acts_on_frames_alone(cls) and not cls.starts(evidence):
-            return detect_in_frames(cls, evidence)
         found = cls.estimate(evidence)
         return None if found is None else found.significance
 

@@ -16,7 +16,7 @@ from scipy.special import log_ndtr
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.fringe_motion import motion_part, ramps, ramps_and_colour
 from pixcal.estimators.frame_series.light import LIGHT_PARTS
-from pixcal.estimators.frame_series.profiled import HALVINGS, Profiled, best_shape
+from pixcal.estimators.frame_series.profiled import Profiled, best_shape
 from pixcal.estimators.frame_series.series import assemble
 from pixcal.estimators.frame_series.spectral_line import Line
 from pixcal.estimators.frame_series.variance_components import (
@@ -232,12 +232,20 @@ def fit_frames(
     kind: type[ForwardModel], evidence: Evidence, leave: Sequence[str] = ()
 ) -> FrameFit | None:
     """Parameters of a model of whole frames, except ``leave``; None without evidence."""
-    found = _taken(kind, evidence, leave)
-    if found is None:
+    changes = evidence.once("changes of frames", make=lambda: FrameChanges(evidence))
+    every = changes.series(kind())
+    strengths = strengths_of(every, kind(), leave)
+    if not strengths:
         return None
-    fit, changes = found.fit, found.changes
+    plain = [s for s in strengths if not s.of_line]
+    fit = _Fit(kind(), FrameBasis(changes, every, plain))
+    for field in dict.fromkeys(s.field for s in sorted(plain, key=lambda s: s.steady)):
+        fit.take([s for s in plain if s.field == field])
     model, errors = fit.values()
-    for own, line in found.lines:
+    for field in dict.fromkeys(s.field for s in strengths if s.of_line):
+        own = [s for s in strengths if s.field == field]
+        line = changes.line(own[0])
+        fit.chances[field] = 0.0 if line is None else line.log_chance
         if line is not None and line.significant:
             model, of_line = _with_line(model, own, line, fit.basis)
             errors |= of_line
@@ -247,65 +255,18 @@ def fit_frames(
     return FrameFit(
         model,
         errors,
-        found.significance,
+        sigmas(log_chance_of_any(list(fit.chances.values()))),
         f"changes of {' and '.join(varying)} from frame to frame, the same in two halves of the "
         f"pixels{ALIKE if False in kinds and not changes.crossed else ''}",
         fit.sets_differ(),
     )
 
 
-def detect_in_frames(
-    kind: type[ForwardModel], evidence: Evidence, leave: Sequence[str] = ()
-) -> float | None:
-    """Significance as in `fit_frames`, without sizes and errors."""
-    found = _taken(kind, evidence, leave, halvings=1)
-    return None if found is None else found.significance
-
-
-@dataclass(frozen=True)
-class _Taken:
-    """Strengths of a model, as determined by the series of the frames."""
-
-    fit: "_Fit"
-    changes: FrameChanges
-    lines: list[tuple[list[Strength], Line | None]]  # strengths of each line of the spectrum
-
-    @property
-    def chances(self) -> dict[str, float]:
-        """Log p-value of each field if its strength is zero."""
-        of_lines = {
-            own[0].field: 0.0 if line is None else line.log_chance for own, line in self.lines
-        }
-        return self.fit.chances | of_lines
-
-    @property
-    def significance(self) -> float:
-        """Significance of all fields, sigma."""
-        return sigmas(log_chance_of_any(list(self.chances.values())))
-
-
-def _taken(
-    kind: type[ForwardModel], evidence: Evidence, leave: Sequence[str], halvings: int = HALVINGS
-) -> _Taken | None:
-    changes = evidence.once("changes of frames", make=lambda: FrameChanges(evidence))
-    every = changes.series(kind())
-    strengths = strengths_of(every, kind(), leave)
-    if not strengths:
-        return None
-    plain = [s for s in strengths if not s.of_line]
-    fit = _Fit(kind(), FrameBasis(changes, every, plain), halvings)
-    for field in dict.fromkeys(s.field for s in sorted(plain, key=lambda s: s.steady)):
-        fit.take([s for s in plain if s.field == field])
-    fields = dict.fromkeys(s.field for s in strengths if s.of_line)
-    lines = [[s for s in strengths if s.field == field] for field in fields]
-    return _Taken(fit, changes, [(own, changes.line(own[0])) for own in lines])
-
-
 class _Fit:
     """Fit of a model's strengths, added field by field."""
 
-    def __init__(self, start: ForwardModel, basis: FrameBasis, halvings: int) -> None:
-        self.start, self.basis, self._halvings = start, basis, halvings
+    def __init__(self, start: ForwardModel, basis: FrameBasis) -> None:
+        self.start, self.basis = start, basis
         self.taken: list[Strength] = []
         self.chances: dict[str, float] = {}  # log p-value of each field if its strength is zero
         # for each field with a shape: the profile, and the number of strengths fitted with it
@@ -342,7 +303,7 @@ class _Fit:
             return self.basis.components(every, {**self.shapes, field: value}, start, steps)
 
         start, trials = before if steady else None, self.basis.trials(own[0])
-        found = best_shape(fit, trials, steady, start, self._halvings)
+        found = best_shape(fit, trials, steady, start)
         if getattr(self.start, own[0].shape or "") == 0.0:
             plain = fit(0.0, None)
             if sigmas(log_chance(_likelihood(own, found.found, plain))) < SIGNIFICANT:

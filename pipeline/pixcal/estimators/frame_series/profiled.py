@@ -35,11 +35,7 @@ class Profiled:
 
 
 def best_shape(
-    fit: ProfiledFit,
-    trials: F64,
-    steady: bool,
-    start: Components | None = None,
-    halvings: int = HALVINGS,
+    fit: ProfiledFit, trials: F64, steady: bool, start: Components | None = None
 ) -> Profiled:
     """The best of values (n,), in equal steps of the logarithm, and between them.
 
@@ -56,7 +52,7 @@ def best_shape(
     log_value = float(np.log(trials[best]))
     found = fit(float(trials[best]), fits[best])
     width = float(np.log(trials[1] / trials[0]))
-    for _ in range(halvings):
+    for _ in range(HALVINGS):
         # A parabola through the three, ever closer; its curvature is the information.
         sides = tuple(fit(float(np.exp(log_value + w)), found) for w in (-width, width))
         below, above = (high(side) - high(found) for side in sides)
