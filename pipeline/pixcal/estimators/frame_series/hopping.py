@@ -1,27 +1,26 @@
 """Hops between two levels, as a hidden Markov model: their size and rate.
 
 Short stays on a level are hidden in the noise of the frames, and counting significant hops misses
-them. Here every frame has a probability of either level, given all frames; size, rate, and the base
-of each series (a ramp) with its noise have maximum likelihood, by the algorithm of Baum, Petrie,
-Soules & Weiss 1970 (Ann. Math. Statist. 41, 164).
+them. The likelihood of a series is therefore a sum over all sequences of levels (Rabiner 1989,
+Proc. IEEE 77, 257). It is maximised by size, rate, and base (a ramp) and noise of each series; its
+curvature gives their errors.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import minimize
 
 from pixcal.kernels import kernel
 from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F64
 
-ROUNDS = 200
-SETTLED = 1e-4  # growth of the log-likelihood at which they end
 BASES = 33  # start values tried for the base of each series
 # lower limits: noise over the size; number of hops in the whole time
 MIN_NOISE, FEWEST_HOPS = 1e-3, 0.01
-# step of the rate's logarithm, and of the size over the noise, for the likelihood's curvature
-STEP = 0.2
+STEP = 1e-3  # of the numbers, in their errors, for slopes of the likelihood
+FLAT = 1e-9  # least curvature
 
 
 @dataclass(frozen=True)
@@ -39,33 +38,6 @@ class Hopping:
     ramp_error: float = np.inf
 
 
-@dataclass(frozen=True)
-class _Series:
-    values: F64
-    time_s: F64
-    base: F64
-    noise: float
-    second: F64
-    changes: float = 0.0
-    likelihood: float = 0.0
-
-    def weighed(self, size: float, rate: float) -> "_Series":
-        """With the probabilities of its states, and the likelihood."""
-        off = self.values - self.base
-        odds = size * (off - size / 2) / self.noise**2
-        second, changes, growth = likely_states(odds, _change(rate, self.time_s))
-        first = -len(off) * np.log(self.noise) - float(off @ off) / (2 * self.noise**2)
-        return replace(self, second=second, changes=changes, likelihood=first + growth)
-
-    def ramp(self, size: float) -> tuple[float, float]:
-        """Slope of the base and its error, which includes uncertain hops."""
-        time = self.time_s - self.time_s.mean()
-        unsure = size**2 * float(np.sum(time**2 * self.second * (1 - self.second)))
-        square = float(time @ time)
-        slope = float(time @ self.base) / square
-        return slope, float(np.sqrt(self.noise**2 / square + unsure / square**2))
-
-
 def find_hopping(
     values: Sequence[F64], times_s: Sequence[F64], slopes: Sequence[float], size: float, rate: float
 ) -> Hopping:
@@ -73,52 +45,42 @@ def find_hopping(
 
     ``slopes``: of the bases, 1/s. All three are start values.
     """
-    series = zip(values, times_s, slopes, strict=True)
-    every = [_begun(*one, size, rate) for one in series]
-    seconds = sum(float(np.ptp(s.time_s)) for s in every)
-    last = -np.inf
-    for _ in range(ROUNDS):
-        every = [s.weighed(size, rate) for s in every]
-        likelihood = sum(s.likelihood for s in every)
-        if likelihood - last < SETTLED:
-            break
-        last = likelihood
-        size = _size(every) or size
-        every = [_settled(s, size) for s in every]
-        expected = sum(float(_change(rate, s.time_s).sum()) for s in every)
-        rate = max(rate * sum(s.changes for s in every) / expected, FEWEST_HOPS / seconds)
+    times = [time - time.mean() for time in times_s]
+    seconds = sum(float(np.ptp(time)) for time in times)
+    # Size and logarithm of the rate; of each series base, ramp and logarithm of the noise.
+    start, usual = [size, np.log(rate)], [np.inf, (rate * seconds + 1) ** -0.5]
+    least = [-np.inf, np.log(FEWEST_HOPS / seconds)]
+    for v, time, slope in zip(values, times, slopes, strict=True):
+        noise = max(scatter_of(v), MIN_NOISE * abs(size))
+        base = _likeliest_base(v, time, slope, noise, size, rate)
+        error = noise * len(v) ** -0.5
+        start += [base, slope, np.log(noise)]
+        usual += [error, error / max(float(time.std()), 1e-300), (2 * len(v)) ** -0.5]
+        least += [-np.inf, -np.inf, np.log(MIN_NOISE * abs(size))]
+    usual[0] = min(usual[2::3])
+    begin, unit = np.array(start), np.array(usual)
 
-    def of_size(step: float) -> float:
-        # The bases are refitted.
-        moved = [
-            replace(s, base=s.base - step * size * _ramp_of(s.second, s.time_s)) for s in every
-        ]
-        return sum(s.weighed(size * (1 + step), rate).likelihood for s in moved)
+    def loss(steps: F64) -> float:
+        (size, log_rate), own = np.split(begin + steps * unit, [2])
+        every = zip(values, times, own.reshape(-1, 3), strict=True)
+        return -sum(_likelihood(v, t, size, np.exp(log_rate), *numbers) for v, t, numbers in every)
 
-    def of_rate(step: float) -> float:
-        return sum(s.weighed(size, rate * np.exp(step)).likelihood for s in every)
-
-    step = STEP * min(s.noise for s in every) / size
+    limits = [(low, None) for low in (np.array(least) - begin) / unit]
+    options = {"eps": STEP, "maxiter": 1000}
+    best = minimize(loss, np.zeros(len(begin)), method="L-BFGS-B", bounds=limits, options=options).x
+    found, errors = begin + best * unit, unit * _errors(loss, best)
     # The posterior of a rate, without prior, has one hop more: few hops do not constrain it well.
-    relative = _error(of_rate, STEP)
-    rate_error = rate * float(np.hypot(relative, relative**2))
-    ramps, errors = np.array([s.ramp(size) for s in every]).T
-    weight = errors**-2
+    rate, relative = float(np.exp(found[1])), float(errors[1])
+    weight = errors[3::3] ** -2
     return Hopping(
-        size,
-        abs(size) * _error(of_size, step),
+        float(found[0]),
+        float(errors[0]),
         rate,
-        rate_error,
-        tuple(s.noise for s in every),
-        float(ramps @ weight / weight.sum()),
-        weight.sum() ** -0.5,
+        rate * float(np.hypot(relative, relative**2)),
+        tuple(np.exp(found[4::3]).tolist()),
+        float(found[3::3] @ weight / weight.sum()),
+        float(weight.sum() ** -0.5),
     )
-
-
-def _error(likelihood: Callable[[float], float], step: float) -> float:
-    """One sigma, from the curvature of the log-likelihood at its maximum."""
-    curvature = 2 * likelihood(0.0) - likelihood(-step) - likelihood(step)
-    return abs(step) / float(np.sqrt(max(curvature, 1e-9)))
 
 
 def scatter_of(values: F64) -> float:
@@ -126,81 +88,59 @@ def scatter_of(values: F64) -> float:
     return robust_sigma(np.diff(values)) / float(np.sqrt(2)) or 1e-300
 
 
-def _change(rate: float, time_s: F64) -> F64:
-    """Probability (t - 1,) that the number of hops from a frame to the next is odd."""
-    return np.asarray(-np.expm1(-2 * rate * np.diff(time_s)) / 2)
+def _likelihood(
+    values: F64, time_s: F64, size: float, rate: float, base: float, ramp: float, log_noise: float
+) -> float:
+    """Log-likelihood of a series, for a logarithm of its noise."""
+    off = (values - base - ramp * time_s) * np.exp(-log_noise)
+    jump = size * np.exp(-log_noise)
+    # Probability that the number of hops from a frame to the next is odd.
+    change = -np.expm1(-2 * rate * np.diff(time_s)) / 2
+    rest = float(off @ off) / 2 + len(off) * log_noise
+    return float(log_growth(jump * (off - jump / 2), change)) - rest
 
 
-def _begun(values: F64, time_s: F64, slope: float, size: float, rate: float) -> _Series:
-    """With the likeliest base on a grid."""
-    ramp = slope * (time_s - time_s.mean())
-    noise = max(scatter_of(values), MIN_NOISE * abs(size))
-    flat = values - ramp
+def _likeliest_base(
+    values: F64, time_s: F64, slope: float, noise: float, size: float, rate: float
+) -> float:
+    """Of a grid."""
+    flat = values - slope * time_s
     bases = np.linspace(flat.min() - size / 2, flat.max() - size / 2, BASES)
-    nothing = np.zeros(len(values))
-    tried = [
-        _Series(values, time_s, ramp + base, noise, nothing).weighed(size, rate) for base in bases
-    ]
-    return max(tried, key=lambda s: s.likelihood)
+    log = np.log(noise)
+    return float(
+        max(bases, key=lambda base: _likelihood(values, time_s, size, rate, base, slope, log))
+    )
 
 
-def _ramp_of(values: F64, time_s: F64) -> F64:
-    """The part of a series that is a ramp."""
-    time = time_s - time_s.mean()
-    return np.asarray(values.mean() + time * (time @ values) / (time @ time))
-
-
-def _size(every: Sequence[_Series]) -> float:
-    """Size of the hops, with a ramp of each series free; zero where all stay on one level."""
-    seen = total = 0.0
-    for s in every:
-        ramp = _ramp_of(s.second, s.time_s)
-        total += float(s.second.sum() - s.second @ ramp) / s.noise**2
-        seen += float((s.second - ramp) @ s.values) / s.noise**2
-    return seen / total if total > 0 else 0.0
-
-
-def _settled(s: _Series, size: float) -> _Series:
-    """With base and noise refitted for its states."""
-    base = _ramp_of(s.values - size * s.second, s.time_s)
-    off = s.values - base
-    square = off**2 - 2 * size * s.second * off + size**2 * s.second
-    noise = max(float(np.sqrt(max(square.mean(), 0.0))), MIN_NOISE * abs(size))
-    return replace(s, base=base, noise=noise)
+def _errors(loss: Callable[[F64], float], best: F64) -> F64:
+    """Errors (n,) of numbers from the curvature of the loss, over steps of one about the best."""
+    steps = np.eye(len(best)) / 2
+    curvature = np.array(
+        [
+            [
+                sum(s * t * loss(best + s * one + t * other) for s in (1, -1) for t in (1, -1))
+                for other in steps
+            ]
+            for one in steps
+        ]
+    )
+    size, axes = np.linalg.eigh(curvature)
+    return np.asarray(np.sqrt(axes**2 @ (1 / np.maximum(size, FLAT))))
 
 
 @kernel()
-def likely_states(odds: F64, change: F64) -> tuple[F64, float, float]:
-    """Probability of the second state, expected changes, and gain in log-likelihood.
+def log_growth(odds: F64, change: F64) -> float:
+    """Gain in log-likelihood by two states, over all sequences of them.
 
-    Forward and backward through a series (Rabiner 1989, Proc. IEEE 77, 257). ``odds``: (t,)
-    log-likelihood of the second state less the first. ``change``: (t - 1,) probability of a change
-    to the next frame.
+    ``odds``: (t,) log-likelihood of the second state less the first. ``change``: (t - 1,)
+    probability of a change to the next frame.
     """
-    n = len(odds)
-    ahead, second = np.empty(n), np.empty(n)
-    # Forward: probability of the second state, given the frames so far. Backward: likelihood of
-    # later frames for the first and the second state (one, other).
-    before, likelihood = 0.5, 0.0
-    for t in range(n):
+    second, gain = 0.5, 0.0
+    for t in range(len(odds)):
         if t:
-            before = ahead[t - 1] * (1.0 - change[t - 1]) + (1.0 - ahead[t - 1]) * change[t - 1]
+            second = second * (1.0 - change[t - 1]) + (1.0 - second) * change[t - 1]
         high = max(odds[t], 0.0)
-        one, other = (1.0 - before) * np.exp(-high), before * np.exp(odds[t] - high)
-        ahead[t] = other / (one + other)
-        likelihood += np.log(one + other) + high
-    one, other, changes = 0.5, 0.5, 0.0
-    for t in range(n - 1, -1, -1):
-        own_one, own_other = (1.0 - ahead[t]) * one, ahead[t] * other
-        second[t] = own_other / (own_one + own_other)
-        if t == 0:
-            break
-        high, turn = max(odds[t], 0.0), change[t - 1]
-        one, other = one * np.exp(-high), other * np.exp(odds[t] - high)
-        up, down = (1.0 - ahead[t - 1]) * turn * other, ahead[t - 1] * turn * one
-        still = ((1.0 - ahead[t - 1]) * one + ahead[t - 1] * other) * (1.0 - turn)
-        changes += (up + down) / (up + down + still)
-        one, other = one + turn * (other - one), other + turn * (one - other)
-        total = one + other
-        one, other = one / total, other / total
-    return second, changes, likelihood
+        one, other = (1.0 - second) * np.exp(-high), second * np.exp(odds[t] - high)
+        second = other / (one + other)
+        gain += np.log(one + other) + high
+    return gain
