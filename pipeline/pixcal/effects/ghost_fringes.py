@@ -193,15 +193,6 @@ class GhostFringes(Effect):
             by_law=cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=by_law),
         )
 
-    @classmethod
-    def detect(cls, evidence: Evidence) -> float | None:
-        """As in `Effect.detect`, from the strongest wave of each set only."""
-        found = find_waves(evidence, most=1)
-        if found is None:
-            return None
-        of_a_beam = _of_a_beam(found.waves, _tied(found.waves), evidence)
-        return found.significance if of_a_beam else 0.0
-
 
 def _wave(found: WaveFit, middle: tuple[float, float]) -> GhostWave:
     """A wave relative to the window's first pixel instead of its centre."""

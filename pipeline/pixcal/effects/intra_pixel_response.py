@@ -5,6 +5,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.frame_series.fringe_motion import CROSSED
@@ -24,8 +25,8 @@ REPEAT = 0.002  # assumed relative agreement of the visibilities of two fibre pa
 SHARED = "the visibility scatters alike in sets of crossed fringes, which pixel widths do not cause"
 _MIN_PIXELS = 200
 _APART = 1.1
-_TURNS = 60
 _STEP = 1e-3  # change of the width for derivatives, px
+_SQUARE = 1e-4  # the same of its square, px²
 
 
 @dataclass(frozen=True)
@@ -123,22 +124,19 @@ def _log_visibility(found: FringeEvidence) -> float:
 
 def _width(k: F64, seen: F64) -> tuple[float, float]:
     """Square of the width and its error, px², from the logarithms of the visibilities."""
-    square = 0.0
-    for _ in range(_TURNS):
-        width = np.sqrt(np.clip(square, 1e-6, 9))
-        model = np.log(np.abs(transfer(k, width)).prod(axis=1))
-        more = np.log(np.abs(transfer(k, np.sqrt(width**2 + 1e-4))).prod(axis=1))
-        slope = (more - model) / 1e-4
+
+    def law(square: float) -> F64:
+        """Logarithms of the visibilities, about their mean."""
+        near = np.clip(square, 1e-6, 9)
+        log, more = (
+            np.log(np.abs(transfer(k, np.sqrt(near + step))).prod(axis=1)) for step in (0, _SQUARE)
+        )
         # For negative squares the law is extended linearly, so that noise is not one-sided.
-        model = model + slope * (square - width**2)
-        slope = slope - slope.mean()
-        rest = seen - model
-        information = float(slope @ slope) / REPEAT**2
-        step = float(slope @ (rest - rest.mean())) / REPEAT**2 / information
-        square += float(np.clip(step, -1, 1))
-        if abs(step) < 1e-9:
-            break
-    return square, float(1 / np.sqrt(information))
+        model = log + (more - log) / _SQUARE * (square - near)
+        return np.asarray(model - model.mean())
+
+    fit = least_squares(lambda square: (seen - seen.mean() - law(*square)) / REPEAT, [0.0])
+    return float(fit.x[0]), 1 / float(np.linalg.norm(fit.jac))
 
 
 def _bias_variance(evidence: Evidence) -> float:

@@ -11,6 +11,7 @@ from functools import cache, cached_property
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
+from scipy.optimize import minimize_scalar
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid
@@ -133,29 +134,26 @@ class RowRamp:
     def _best(cls, sets: Sequence[tuple[F64, F64, F64]], way: int) -> "RowRamp":
         """From normal sums by row; a knee inside the window only if significantly better."""
         rows = np.unique(np.concatenate([s[0] for s in sets]))
-        first, last = rows[0], rows[-1]
-        edge = 0.0 if way > 0 else last
-        inside = np.linspace(first, last, _KNEES + 2)[1:-1]
-        plain = _slope(sets, [np.maximum(way * (s[0] - edge), 0.0)[:, None] for s in sets])
-        value, error = float(plain[0][0]), float(np.sqrt(plain[1][0, 0]))
-        bent = [
-            _slope(sets, [np.maximum(way * (s[0] - k), 0)[:, None] for s in sets]) for k in inside
-        ]
-        gains = [v[0] ** 2 / c[0, 0] if v[0] > 0 else 0.0 for v, c in bent]
-        step = (last - first) / (_KNEES + 1)
-        if max(gains) < max(value, 0) ** 2 / error**2 + _BENT:
-            return cls(way, value, error, float(edge), float(step))
-        knee, slope = float(inside[np.argmax(gains)]), float(bent[int(np.argmax(gains))][0][0])
-        for _ in range(2 * _TURNS):
-            terms = []
-            for rows_of, _, _ in sets:
-                ramp = np.maximum(way * (rows_of - knee), 0.0)
-                terms.append(np.stack([ramp, -way * slope * (ramp > 0)], axis=1))
-            values, covariance = _slope(sets, terms)
-            # The ramp is refitted; the second term moves its knee.
-            knee = float(np.clip(knee + np.clip(values[1], -step, step), first, last))
-            slope = float(values[0])
-        errors = np.sqrt(np.diag(covariance))
+        first, last = float(rows[0]), float(rows[-1])
+        edge, step = (0.0 if way > 0 else last), (last - first) / (_KNEES + 1)
+
+        def ramps(knee: float) -> list[F64]:
+            return [np.maximum(way * (s[0] - knee), 0.0)[:, None] for s in sets]
+
+        def gain(knee: float) -> float:
+            (value,), ((variance,),) = _slope(sets, ramps(knee))
+            return float(value**2 / variance) if value > 0 else 0.0
+
+        knee = max(np.linspace(first, last, _KNEES + 2)[1:-1].tolist(), key=gain)
+        if gain(knee) < gain(edge) + _BENT:
+            (value,), ((variance,),) = _slope(sets, ramps(edge))
+            return cls(way, float(value), float(np.sqrt(variance)), edge, step)
+        near = max(knee - step, first), min(knee + step, last)
+        knee = float(minimize_scalar(lambda k: -gain(k), bounds=near, method="bounded").x)
+        slope = float(_slope(sets, ramps(knee))[0][0])
+        # The second term moves the knee.
+        terms = [np.hstack([own, -way * slope * (own > 0)]) for own in ramps(knee)]
+        errors = np.sqrt(np.diag(_slope(sets, terms)[1]))
         return cls(way, slope, float(errors[0]), knee, float(errors[1]))
 
 

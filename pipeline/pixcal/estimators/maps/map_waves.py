@@ -101,8 +101,8 @@ class _Map:
 Maps = Mapping[str, Sequence[_Map]]  # of each set, by its name
 
 
-def find_waves(evidence: Evidence, most: int = MOST) -> Waves | None:
-    """The strongest waves in all sets' maps, at most ``most`` per set; None without enough pixels.
+def find_waves(evidence: Evidence) -> Waves | None:
+    """The strongest waves in all sets' maps, at most `MOST` per set; None without enough pixels.
 
     The significance counts all resolvable waves as trials. Waves near harmonics of a set's fringes,
     near zero frequency, and of repeating rows or columns are left out.
@@ -119,7 +119,7 @@ def find_waves(evidence: Evidence, most: int = MOST) -> Waves | None:
     waves = list(best.waves)
     if best.significance > SIGNIFICANT:
         maps: Maps = ways[best.in_flats]
-        for _ in range(most - 1):
+        for _ in range(MOST - 1):
             maps = _less(maps, waves[-len(sets) :])
             more = _strongest(maps, allowed, best.in_flats)
             if more.significance < SIGNIFICANT:
