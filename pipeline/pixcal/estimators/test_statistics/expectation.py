@@ -50,12 +50,8 @@ def statistic_named(name: str) -> Statistic:
         return known_statistics()[name]
     effect, _, domain = name.removeprefix(_PREFIX).rpartition(_INFIX)
     title = f"detection significance of {effect}"
-
-    def nothing(_: object) -> None:
-        return None
-
     return Statistic(
-        name, title, domain, "significance", "σ", "", "linear", False, False, FLOOR, nothing
+        name, title, domain, "significance", "σ", "", "linear", False, False, FLOOR, lambda _: None
     )
 
 
