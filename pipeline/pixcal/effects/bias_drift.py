@@ -34,7 +34,7 @@ from pixcal.kernels.synthesis import walk_normals
 from pixcal.model.arrays import F32, F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
-from pixcal.simulation.recording import KINDS
+from pixcal.simulation.recording import KINDS, Recording
 from pixcal.simulation.shot import Shot
 from pixcal.simulation.track import Track, at
 
@@ -118,32 +118,26 @@ class BiasDrift(Effect):
         return offset
 
     def readout(self, adu: F32, shot: Shot) -> F32:
-        own = f"{shot.recording.kind} frames"
-        if shot.recording.kind == "fringes":
-            offset = self._in_run(shot)
-        elif any(track.set == own for track in self.tracks):
-            offset = float(at(self.tracks, own, shot.recording.times_s[shot.frame]))
+        recording, rng = shot.recording, shot.rng(self.name)
+        lit, time = recording.kind == "fringes", float(recording.times_s[shot.frame])
+        own = recording.set_name if lit else f"{recording.kind} frames"
+        if any(track.set == own for track in self.tracks):
+            # As measured: of fringes without the jitter, which hides in the light.
+            jitter = self.jitter_rms * rng.standard_normal() if lit else 0.0
+            offset = float(at(self.tracks, own, time)) + jitter
         else:
-            offset = self.offset(shot.time_s, shot.bench.seed, shot.rng(self.name))
+            offset = self.offset(shot.time_s, shot.bench.seed, rng)
+            offset += self._in_run(recording, time) if lit else 0.0
         return adu + np.float32(offset / shot.bench.detector.gain_e_per_adu)
 
-    def _in_run(self, shot: Shot) -> float:
-        """Offset of a fringe frame, e-: as measured, otherwise by the laws."""
-        time = float(shot.recording.times_s[shot.frame])
-        name = shot.recording.set_name
-        rng = shot.rng(self.name)
-        if any(track.set == name for track in self.tracks):
-            return float(at(self.tracks, name, time)) + self.jitter_rms * rng.standard_normal()
-        offset = self.offset(shot.time_s, shot.bench.seed, rng)
-        offset += self.run_ramp_e_h * time / HOUR_S
-        if self.run_walk_e_h:
+    def _in_run(self, recording: Recording, time_s: float) -> float:
+        """Offset of a fringe frame, e-, that begins anew with its run."""
 
-            def normal(level: int, place: int) -> float:
-                own = shot.recording.rng(self.name, _RUN + level, place)
-                return float(own.standard_normal())
+        def normal(level: int, place: int) -> float:
+            return float(recording.rng(self.name, _RUN + level, place).standard_normal())
 
-            offset += self.run_walk_e_h * brownian(time, normal) / np.sqrt(HOUR_S)
-        return offset
+        walk = brownian(time_s, normal) / np.sqrt(HOUR_S) if self.run_walk_e_h else 0.0
+        return self.run_ramp_e_h * time_s / HOUR_S + self.run_walk_e_h * walk
 
     def replayed(self, evidence: Evidence) -> Self | None:
         """As in `Effect.replayed`: slow offsets and jitter of fringes; all of dark frames."""

@@ -7,7 +7,6 @@ acts on collected charge, shot noise included, so the noise of neighbours become
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 
@@ -87,33 +86,6 @@ class Ipc(Effect):
             raise InputError(
                 f"couplings: some pixels lose {most:.2f} of their signal; the limit is 0.5"
             )
-
-    @classmethod
-    def nearest(cls, share: float, diagonal: float = 0.0) -> Self:
-        """Equal shares to the four nearest pixels, and another share to the diagonal ones."""
-        weights = np.array([[diagonal, share, diagonal], [share, 0, share]])
-        return cls.of_kernel(np.stack([weights[0], weights[1], weights[0]]))
-
-    @classmethod
-    def of_kernel(cls, kernel: F64) -> Self:
-        """A dense kernel of odd size, the same for all pixels.
-
-        ``kernel[c + dy, c + dx]`` is the share that the pixel at (dy, dx) receives. The centre is
-        not used: a pixel keeps the rest.
-        """
-        return cls(tuple(_couplings_of(np.asarray(kernel, float))))
-
-    @classmethod
-    def of_rows(cls, kernels: Sequence[F64]) -> Self:
-        """A dense kernel, as in `of_kernel`, for sources in each of n rows, which repeat."""
-        n = len(kernels)
-        return cls(
-            tuple(
-                replace(coupling, every_rows=n, row=row)
-                for row, kernel in enumerate(kernels)
-                for coupling in _couplings_of(np.asarray(kernel, float))
-            )
-        )
 
     @property
     def halo(self) -> int:
@@ -237,17 +209,6 @@ def _size(couplings: Sequence[Coupling], errors: F64) -> dict[str, object]:
         "unit": "",
         "of": f"at (dy, dx) = {place}{largest}",
     }
-
-
-def _couplings_of(kernel: F64) -> list[Coupling]:
-    rows, columns = kernel.shape
-    if rows % 2 == 0 or columns % 2 == 0:
-        raise InputError(f"a kernel needs odd numbers of rows and columns, not {rows} x {columns}")
-    return [
-        Coupling(int(y) - rows // 2, int(x) - columns // 2, float(kernel[y, x]))
-        for y, x in np.argwhere(kernel)
-        if (y, x) != (rows // 2, columns // 2)
-    ]
 
 
 def _worth_it(couplings: Sequence[Coupling]) -> tuple[Coupling, ...]:
