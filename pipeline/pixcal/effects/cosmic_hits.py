@@ -323,35 +323,41 @@ def _recur(searches: Sequence[_Search]) -> bool:
 
 
 class _Drawn:
-    """The brightest pixels of drawn tracks, to be placed in frames of any noise."""
+    """The brightest pixels of drawn tracks, placed in the frames of searches."""
 
-    def __init__(self, effect: CosmicHits, pitch_um: float) -> None:
-        self._rng = np.random.default_rng(0)
-        tracks = effect.tracks(self._rng, _DRAWN, pitch_um, (1, 1), 0)
+    def __init__(self, law: CosmicHits, searches: Sequence[_Search], pitch_um: float) -> None:
+        rng, self._searches = np.random.default_rng(0), searches
+        tracks = law.tracks(rng, _DRAWN, pitch_um, (1, 1), 0)
         # At the centre of a tile; longer tracks are truncated.
         tracks[:, :2] += (_TILE - tracks[:, 2:4]) / 2
         self._charges = np.zeros((_DRAWN, _BRIGHTEST))
         self._pixels = np.zeros((_DRAWN, _BRIGHTEST), int)
         for n in range(_DRAWN):
             tile = np.zeros((_TILE, _TILE), np.float32)
-            add_tracks(tile, tracks[n : n + 1], effect.diffusion_um / pitch_um, 0)
+            add_tracks(tile, tracks[n : n + 1], law.diffusion_um / pitch_um, 0)
             lit = np.flatnonzero(tile)
             if len(lit) > _BRIGHTEST:
                 lit = lit[np.argpartition(tile.flat[lit], -_BRIGHTEST)[-_BRIGHTEST:]]
             self._pixels[n, : len(lit)] = lit
             self._charges[n, : len(lit)] = tile.flat[lit]
-        self._noise = self._rng.standard_normal(self._charges.shape)
+        self._noise = rng.standard_normal(self._charges.shape)
+        self._sigmas = [self._placed(s.sigma, rng) for s in searches]
+        self.scale, self.scale_error = self._scaled()
 
-    def noise_at(self, sigma: F32) -> F64:
+    def _placed(self, sigma: F32, rng: np.random.Generator) -> F64:
         """Noise (track, pixel), e-, at random places; infinite for excluded samples."""
-        t, y, x = (self._rng.integers(0, n, (_DRAWN, 1)) for n in sigma.shape)
+        t, y, x = (rng.integers(0, n, (_DRAWN, 1)) for n in sigma.shape)
         dy, dx = np.divmod(self._pixels, _TILE)
         # Periodic window: tracks that leave it stand for tracks that enter from outside.
         own = sigma[t, (y + dy) % sigma.shape[1], (x + dx) % sigma.shape[2]]
         return np.where(np.isfinite(own), own, np.inf)
 
-    def hits(self, scale: float, noise: F64, limit: float) -> _Hits:
-        """Tracks detected with the limits of a `_Search`, for ``scale`` times the charge."""
+    def hits(self, scale: float) -> list[_Hits]:
+        """Tracks that each search detects, for ``scale`` times the charge."""
+        every = zip(self._searches, self._sigmas, strict=True)
+        return [self._detected(scale, sigma, s.limit) for s, sigma in every]
+
+    def _detected(self, scale: float, noise: F64, limit: float) -> _Hits:
         counts = np.isfinite(noise)
         sigma = np.where(counts, noise, 1.0)
         samples = np.where(counts, scale * self._charges + sigma * self._noise, 0.0)
@@ -366,6 +372,43 @@ class _Drawn:
         sizes = (np.count_nonzero(one, axis=1).astype(float) for one in (bright, near))
         return _Hits(samples.max(axis=1, initial=0), *sizes)
 
+    def _scaled(self) -> tuple[float, float | None]:
+        """Charge of the hits over that of the tracks, and its error (None: too few hits)."""
+        hits = sum(len(s.hits.peaks) for s in self._searches)
+        if hits < _MIN_HITS:
+            return 1.0, None
+
+        def rank(log_scale: float) -> float:
+            """Mean rank of the hits among the detected drawn tracks, minus one half."""
+            total = 0.0
+            for s, drawn in zip(self._searches, self.hits(np.exp(log_scale)), strict=True):
+                found = np.sort(drawn.peaks)
+                # If few drawn tracks are detected, hits are brighter than the law can explain.
+                rare = len(found) < _RARE * _DRAWN
+                ranks = np.searchsorted(found, s.hits.peaks)
+                total += len(ranks) if rare else ranks.sum() / len(found)
+            return total / hits - 0.5
+
+        low, high = np.log(0.05), np.log(20.0)
+        if rank(low) * rank(high) >= 0:
+            return 1.0, None
+        found = float(brentq(rank, low, high, xtol=1e-3))
+        slope = abs(rank(found + 0.2) - rank(found - 0.2)) / 0.4
+        scale = float(np.exp(found))
+        return scale, scale / (max(slope, 0.05) * np.sqrt(12 * hits))
+
+    @property
+    def log_likelihood(self) -> float:
+        """Log-likelihood of the classes of the hits, given those of the tracks."""
+        total = 0.0
+        for s, drawn in zip(self._searches, self.hits(self.scale), strict=True):
+            seen, likely = (hits.classes(s.faintest) for hits in (s.hits, drawn))
+            for hits, expected in zip(seen, likely, strict=True):
+                # Half a track more per class, so that none has zero probability.
+                share = (expected + 0.5) / (expected + 0.5).sum()
+                total += float(hits @ np.log(share))
+        return total
+
 
 def _laws(
     start: CosmicHits, searches: list[_Search], pitch_um: float
@@ -377,13 +420,7 @@ def _laws(
 
     def likelihood(law: CosmicHits) -> float:
         if law not in tried:
-            drawn = _Drawn(law, pitch_um)
-            places = [drawn.noise_at(s.sigma) for s in searches]
-            scale, _ = _scale(searches, places, drawn)
-            tried[law] = sum(
-                _log_likelihood(s, drawn.hits(scale, own, s.limit))
-                for s, own in zip(searches, places, strict=True)
-            )
+            tried[law] = _Drawn(law, searches, pitch_um).log_likelihood
         return tried[law]
 
     best, before = start, -np.inf
@@ -404,14 +441,10 @@ def _fitted(
     law: CosmicHits, searches: list[_Search], pitch_um: float
 ) -> tuple[CosmicHits, dict[str, float]] | None:
     """A law with its best rates and charge, and errors; None without detection."""
-    drawn = _Drawn(law, pitch_um)
-    places = [drawn.noise_at(s.sigma) for s in searches]
-    scale, scale_error = _scale(searches, places, drawn)
-    seen = [
-        s.area * len(drawn.hits(scale, own, s.limit).peaks) / _DRAWN
-        for s, own in zip(searches, places, strict=True)
-    ]
-    exposures = np.array([(a * s.seconds, a) for a, s in zip(seen, searches, strict=True)]).T
+    drawn = _Drawn(law, searches, pitch_um)
+    every = zip(searches, drawn.hits(drawn.scale), strict=True)
+    seen = [(s, s.area * len(own.peaks) / _DRAWN) for s, own in every]
+    exposures = np.array([(area * s.seconds, area) for s, area in seen]).T
     if not exposures.sum() > 0:
         return None
     exposed = np.flatnonzero(exposures.any(axis=1))
@@ -419,10 +452,10 @@ def _fitted(
     of = [law.strengths[n] for n in exposed]
     charge = "electrons_per_um"
     errors = dict(zip(of, spread, strict=False))
-    if scale_error is not None:
-        errors[charge] = law.electrons_per_um * scale_error
+    if drawn.scale_error is not None:
+        errors[charge] = law.electrons_per_um * drawn.scale_error
     rates = dict.fromkeys(law.strengths, 0.0) | dict(zip(of, values, strict=True))
-    fitted = replace(law, **rates | {charge: law.electrons_per_um * scale})
+    fitted = replace(law, **rates | {charge: law.electrons_per_um * drawn.scale})
     return fitted, errors
 
 
@@ -430,40 +463,3 @@ def _steps(effect: CosmicHits, other: CosmicHits, errors: float) -> dict[str, fl
     """Change of each number per error, for another law at a distance of ``errors``."""
     own, others = numbers(effect), numbers(other)
     return {n: (others[n] - own[n]) / errors for n in own if others[n] != own[n]}
-
-
-def _log_likelihood(search: _Search, drawn: _Hits) -> float:
-    """Log-likelihood of the classes of the hits, given those of drawn tracks."""
-    total = 0.0
-    seen, likely = (hits.classes(search.faintest) for hits in (search.hits, drawn))
-    for hits, expected in zip(seen, likely, strict=True):
-        # Half a track more per class, so that none has zero probability.
-        expected += 0.5
-        total += float(hits @ np.log(expected / expected.sum()))
-    return total
-
-
-def _scale(searches: list[_Search], places: list[F64], drawn: _Drawn) -> tuple[float, float | None]:
-    """Charge of the hits over that of the drawn tracks, and its error (None: too few hits)."""
-    hits = sum(len(s.hits.peaks) for s in searches)
-    if hits < _MIN_HITS:
-        return 1.0, None
-
-    def rank(log_scale: float) -> float:
-        """Mean rank of the hits among the detected drawn tracks, minus one half."""
-        total = 0.0
-        for s, noise in zip(searches, places, strict=True):
-            found = np.sort(drawn.hits(np.exp(log_scale), noise, s.limit).peaks)
-            # If few drawn tracks are detected, hits are brighter than the law can explain.
-            rare = len(found) < _RARE * _DRAWN
-            ranks = np.searchsorted(found, s.hits.peaks)
-            total += len(ranks) if rare else ranks.sum() / len(found)
-        return total / hits - 0.5
-
-    low, high = np.log(0.05), np.log(20.0)
-    if rank(low) * rank(high) >= 0:
-        return 1.0, None
-    found = float(brentq(rank, low, high, xtol=1e-3))
-    slope = abs(rank(found + 0.2) - rank(found - 0.2)) / 0.4
-    scale = float(np.exp(found))
-    return scale, scale / (max(slope, 0.05) * np.sqrt(12 * hits))
