@@ -8,12 +8,11 @@ import numpy as np
 
 from pixcal.estimators.detector.noiseless_charge import noiseless_level
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.light import LIGHT_PARTS, light_of
+from pixcal.estimators.frame_series.light import LIGHT_PARTS, fringe_courses, light_of
 from pixcal.estimators.frame_series.offset import (
     OffsetSeries,
     dark_courses,
     dark_offsets,
-    fringe_courses,
     fringe_offsets,
     offset_modes,
     unlit_stacks,

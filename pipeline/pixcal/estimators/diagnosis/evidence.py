@@ -273,10 +273,14 @@ def cached_on_evidence(
 
 def stripes(shape: tuple[int, ...]) -> Mask:
     """One half of a window by stripes of rows (columns if rows are few), to broadcast to (y, x)."""
-    # The Thue-Morse sequence has no period that could coincide with fringes.
     axis = 0 if shape[0] >= 2 * STRIPE else 1
-    half = np.bitwise_count(np.arange(shape[axis]) // STRIPE) % 2 == 0
-    return np.expand_dims(half, 1 - axis)
+    return np.expand_dims(stripe_half(shape[axis]), 1 - axis)
+
+
+def stripe_half(count: int) -> Mask:
+    """Every other stripe of rows or columns, in the order of Thue and Morse."""
+    # The sequence has no period that could coincide with fringes.
+    return np.asarray(np.bitwise_count(np.arange(count) // STRIPE) % 2 == 0)
 
 
 def free_frames(

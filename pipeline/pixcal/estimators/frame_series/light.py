@@ -11,19 +11,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import (
-    Evidence,
-    FringeEvidence,
-    Stack,
-    cached_on_evidence,
-    stripes,
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, cached_on_evidence
+from pixcal.estimators.frame_series.offset import dark_offsets
+from pixcal.estimators.frame_series.series import (
+    Course,
+    FrameSeries,
+    assemble,
+    light_series,
+    mode_variance,
+    wiener,
 )
-from pixcal.estimators.frame_series.series import FrameSeries, assemble, light_series, mode_variance
 from pixcal.estimators.frame_series.spectral_line import Line, cleared_of_line
-from pixcal.estimators.frame_series.variance_components import Modes
+from pixcal.estimators.frame_series.variance_components import Modes, estimate_components
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 
+KNOTS = 32  # most points of a course of fringes
 FEWEST_DARK = 12  # fewest frames without light to measure their offset
 IMBALANCE = 0.02, 0.15  # least and most difference of the fibres' powers over their sum
 LIGHT_PARTS = ("power", "power_walk", "contrast", "contrast_walk", "offset", "offset_walk")
@@ -154,25 +157,38 @@ def light_of(evidence: Evidence) -> FrameLight | None:
 
 def _dark_series(stack: Stack, number: int, evidence: Evidence) -> FrameSeries | None:
     """Mean level of frames without light, as the first of two quantities."""
-    if len(stack.adu) < FEWEST_DARK:
+    found = dark_offsets(stack, evidence.good, evidence.gain, evidence.read_noise)
+    if found is None or len(found) < FEWEST_DARK:
         return None
-    signal = (stack.adu - stack.adu.mean(axis=0)) * evidence.gain
-    half = stripes(evidence.good.shape)
-    masks = [evidence.good, evidence.good & half, evidence.good & ~half]
-    if min(int(mask.sum()) for mask in masks) == 0:
-        return None
-    whole, one, other = (signal[:, mask].mean(axis=1) for mask in masks)
-    noise = evidence.read_noise**2 / np.array([mask.sum() for mask in masks])
-    nothing = np.zeros(len(whole))
+    nothing = np.zeros(len(found))
     return FrameSeries(
         name=f"{stack.kind}:{number}",
         k=(0.0, 0.0),
         frame=stack.frame,
         time_s=stack.time_s,
         exptime_s=stack.exptime_s,
-        values=np.stack([whole, nothing], axis=1).astype(float),
-        apart=np.stack([(one - other) / 2, nothing], axis=1).astype(float),
-        shapes=np.zeros((len(whole), 0)),
-        noise=np.diag([max(noise[0], 1e-12), 1.0]),
-        apart_noise=np.diag([max(noise[1] + noise[2], 1e-12) / 4, 1.0]),
+        values=np.stack([found.values[:, 0], nothing], axis=1),
+        apart=np.stack([found.values[:, 1], nothing], axis=1),
+        shapes=np.zeros((len(found), 0)),
+        noise=np.diag([found.noise[0], 1.0]),
+        apart_noise=np.diag([found.noise[1], 1.0]),
     )
+
+
+def fringe_courses(light: FrameLight) -> tuple[list[Course], float]:
+    """Slow offsets of every set, from changes of B but not A; then the remainder, e- rms."""
+    light = replace(light, dark=())
+    drifts, every = ("offset_walk", "offset_smooth"), (*LIGHT_PARTS, "offset_smooth")
+    found, jitter = [], []
+    for series in light.sets:
+        modes = replace(light, sets=(series,)).modes(every)
+        size = np.maximum(estimate_components(modes).size, 0.0)
+        n = len(series) - 1
+        parts = size[:, None, None, None] * modes.parts[:, :n]
+        # In e-, the covariance of (B, log A/B) with the drift.
+        drift = light.level[series.name] * sum(parts[every.index(name)] for name in drifts)
+        offset = series.walk_modes.series(wiener(parts, drift[:, :, 0], modes.values[:n]))
+        some = np.unique(np.linspace(0, n, min(KNOTS, n + 1)).astype(int))
+        found.append((series.name, series.time_s[some], offset[some]))
+        jitter.append(size[every.index("offset")])
+    return found, float(np.sqrt(np.mean(jitter)))

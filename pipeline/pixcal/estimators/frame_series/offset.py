@@ -8,12 +8,12 @@ accordingly.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import STRIPE, Evidence, FringeEvidence, Stack
-from pixcal.estimators.frame_series.light import LIGHT_PARTS, FrameLight
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, stripe_half
+from pixcal.estimators.frame_series.series import Course, wiener
 from pixcal.estimators.frame_series.variance_components import (
     Modes,
     estimate_components,
@@ -33,10 +33,6 @@ NOISES = np.array([[1, 1, 1, 1], [1, 1, 0, 0], [1, 0, 1, 0]])
 MIN_NOISE = 0.05
 BELOW = 0.3
 _MIN_VARIANCE = 1e-6  # e-², of samples in pixels that are not good
-KNOTS = 32  # most points of a course of fringes
-
-Course = tuple[str, F64, F64]
-"""Fringe set or e.g. ``bias frames``; times (t,) from its first frame, s; offsets (t,), e-."""
 
 
 @dataclass(frozen=True)
@@ -117,14 +113,9 @@ def offset_modes(every: Sequence[OffsetSeries], shapes: Sequence[F64]) -> Modes:
 def _quarters(good: Mask) -> list[Mask] | None:
     """Good pixels of the four quarters, in the order of `CONTRASTS`."""
     ny, nx = good.shape
-    rows, columns = _half(ny)[:, None], _half(nx)
+    rows, columns = stripe_half(ny)[:, None], stripe_half(nx)
     masks = [good & (rows == a) & (columns == b) for a in (True, False) for b in (True, False)]
     return masks if min(int(mask.sum()) for mask in masks) >= FEWEST_PIXELS else None
-
-
-def _half(count: int) -> Mask:
-    """Every other stripe, in the order of Thue and Morse."""
-    return np.asarray(np.bitwise_count(np.arange(count) // STRIPE) % 2 == 0)
 
 
 def _sums(found: FringeEvidence, flat: F64, masks: Sequence[Mask]) -> list[tuple[F64, F64]]:
@@ -169,25 +160,6 @@ def _series(
     )
 
 
-def fringe_courses(light: FrameLight) -> tuple[list[Course], float]:
-    """Slow offsets of every set, from changes of B but not A; then the remainder, e- rms."""
-    light = replace(light, dark=())
-    drifts, every = ("offset_walk", "offset_smooth"), (*LIGHT_PARTS, "offset_smooth")
-    found, jitter = [], []
-    for series in light.sets:
-        modes = replace(light, sets=(series,)).modes(every)
-        size = np.maximum(estimate_components(modes).size, 0.0)
-        n = len(series) - 1
-        parts = size[:, None, None, None] * modes.parts[:, :n]
-        # In e-, the covariance of (B, log A/B) with the drift.
-        drift = light.level[series.name] * sum(parts[every.index(name)] for name in drifts)
-        offset = series.walk_modes.series(_wiener(parts, drift[:, :, 0], modes.values[:n]))
-        some = np.unique(np.linspace(0, n, min(KNOTS, n + 1)).astype(int))
-        found.append((series.name, series.time_s[some], offset[some]))
-        jitter.append(size[every.index("offset")])
-    return found, float(np.sqrt(np.mean(jitter)))
-
-
 def unlit_stacks(evidence: Evidence, *kinds: str) -> list[Stack]:
     """Series of frames without light, less those that begin soon after light.
 
@@ -209,12 +181,6 @@ def dark_courses(evidence: Evidence) -> list[Course]:
         modes = offset_modes([series], [np.zeros((len(series), 0))])
         size = np.maximum(estimate_components(modes).size, 0.0)
         parts = size[:, None, None, None] * modes.parts
-        smooth = _wiener(parts, parts[:2].sum(axis=0)[:, :, 0], modes.values)
+        smooth = wiener(parts, parts[:2].sum(axis=0)[:, :, 0], modes.values)
         found.append((f"{kind} frames", stacks[0].time_s, walk_modes(series.time_s).series(smooth)))
     return found
-
-
-def _wiener(parts: F64, wanted: F64, values: F64) -> F64:
-    """Modes (n,) of a quantity whose covariance with the values (n, c) is ``wanted`` (n, c)."""
-    weight = np.linalg.solve(parts.sum(axis=0), wanted[..., None])[..., 0]
-    return np.asarray(np.einsum("nc,nc->n", weight, values))

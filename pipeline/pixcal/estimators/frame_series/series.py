@@ -33,6 +33,10 @@ MIN_NOISE = 0.05  # lowest size of the noise, over the prediction
 BELOW = 0.15  # how negative a size may be, over the noise
 
 
+Course = tuple[str, F64, F64]
+"""Fringe set or e.g. ``bias frames``; times (t,) from its first frame, s; offsets (t,), e-."""
+
+
 @dataclass(frozen=True)
 class FrameSeries:
     """Two quantities of every usable frame of a set."""
@@ -255,3 +259,9 @@ def _noise_parts(noise: F64) -> F64:
     parts[0, 0, 0], parts[2, 1, 1] = noise[0, 0], noise[1, 1]
     parts[1, 0, 1] = parts[1, 1, 0] = noise[0, 1]
     return parts
+
+
+def wiener(parts: F64, wanted: F64, values: F64) -> F64:
+    """Modes (n,) of a quantity whose covariance with the values (n, c) is ``wanted`` (n, c)."""
+    weight = np.linalg.solve(parts.sum(axis=0), wanted[..., None])[..., 0]
+    return np.asarray(np.einsum("nc,nc->n", weight, values))
