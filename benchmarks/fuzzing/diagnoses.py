@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from fuzzing.laws import RUNTIME, Answer, Broken, Case, Kind, lasting_folder, pixcal
+from fuzzing.laws import RUNTIME, Broken, Case, Kind, good_input, lasting_folder, pixcal
 from fuzzing.night import Night
 from fuzzing.own_effects import GOOD
+from fuzzing.settings import small_bench
 
 SHAPE, COUNT = (16, 19), 50
 """As small as can be diagnosed: 24 frames in each half."""
@@ -22,37 +23,29 @@ ONLY = ("--effects", "intensity_noise")
 VERDICTS = ("explained", "partly explained", "unexplained", "no gap")
 
 
-def diagnosed(run: Path, *more: str | Path, names: tuple[str, ...] = ()) -> Answer:
-    """Diagnose, and look whether what is told is a diagnosis."""
-    if pixcal("diagnose", run, *ONLY, *more, *RUNTIME, names=names) == 2:
-        return "refused"
-    told = verdict(run)
+def diagnosed(run: Path, *more: str | Path, names: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Diagnose a run; the product, once it is found to be a diagnosis."""
+    pixcal("diagnose", run, *ONLY, *more, *RUNTIME, names=names)
+    told: dict[str, Any] = json.loads((run / "products" / "diagnosis.json").read_text())
     if told["verdict"] not in VERDICTS:
         raise Broken(f"verdict {told['verdict']}")
     if bool(told["causes"]) != (told["verdict"] in VERDICTS[:2]):
         raise Broken(f"{told['verdict']} with {len(told['causes'])} causes")
-    return "truthful"
-
-
-def verdict(run: Path) -> dict[str, Any]:
-    """The product."""
-    told: dict[str, Any] = json.loads((run / "products" / "diagnosis.json").read_text())
     return told
 
 
-def reduced(night: Night, folder: Path, dtype: str = "uint16") -> Path | None:
-    """A run up to `reduce`, or None where that is refused."""
+def reduced(night: Night, folder: Path, dtype: str = "uint16") -> Path:
+    """A run up to `reduce`."""
     acquisition, run = night.write(folder / "acquisition", dtype), folder / "run"
-    for line in (("ingest", acquisition, "--out", run), ("reduce", run)):
-        if pixcal(*line, *RUNTIME) == 2:
-            return None
+    pixcal("ingest", acquisition, "--out", run, *RUNTIME)
+    pixcal("reduce", run, *RUNTIME)
     return run
 
 
 # Acquisitions
 
 
-def _odd(case: Case) -> Answer:
+def _odd(case: Case) -> None:
     """Frames with which a diagnosis has little or nothing to begin."""
     what = str(
         case.pick(
@@ -91,12 +84,9 @@ def _odd(case: Case) -> Answer:
     elif what == "loud":
         night.frames["vertical"] = fringes * (1 + 0.3 * case.rng.standard_normal((count, 1, 1)))
     run = reduced(night, case.folder, "float32" if what == "masked" else "uint16")
-    if run is None:
-        return "refused"
-    answer = diagnosed(run, names=(str(run), "--memory", "fringes/"))
-    if answer == "truthful" and what in ("few", "tiny", "alone") and verdict(run)["causes"]:
+    told = diagnosed(run, names=(str(run), "--memory", "fringes/"))
+    if what in ("few", "tiny", "alone") and told["causes"]:
         raise Broken(f"{what}: a cause was claimed of a nominal bench")
-    return answer
 
 
 # Artefacts
@@ -107,15 +97,11 @@ def _runs() -> tuple[Path, Path, dict[str, Any]]:
     """A run, another one, and the diagnosis of the first."""
     folder = lasting_folder()
     runs = []
-    for number in (1, 2):
-        night = Night(np.random.default_rng(number), SHAPE, count=COUNT, vectors=VECTORS)
-        run = reduced(night, folder / str(number))
-        assert run is not None
-        runs.append(run)
-    whole = folder / "whole"
-    shutil.copytree(runs[0], whole)
-    assert diagnosed(whole) == "truthful"
-    return whole, runs[1], verdict(whole)
+    with good_input():
+        for number in (1, 2):
+            night = Night(np.random.default_rng(number), SHAPE, count=COUNT, vectors=VECTORS)
+            runs.append(reduced(night, folder / str(number)))
+        return runs[0], runs[1], diagnosed(runs[0])
 
 
 def _spoil(case: Case, file: Path) -> None:
@@ -134,7 +120,7 @@ def _spoil(case: Case, file: Path) -> None:
         file.write_bytes(spoilt.get(how, bytes(body)))
 
 
-def _artefacts(case: Case) -> Answer:
+def _artefacts(case: Case) -> None:
     """Files of RUN damaged or gone; stages missing, or those of another run."""
     whole, other, told = _runs()
     run = case.folder / "run"
@@ -157,10 +143,9 @@ def _artefacts(case: Case) -> Answer:
         shutil.rmtree(run / stage)
         if what == "other":
             shutil.copytree(other / stage, run / stage)
-    answer = diagnosed(run, names=(str(run),))
-    if answer == "truthful" and verdict(run) != told:
-        raise Broken(f"another diagnosis than that of the whole run: {verdict(run)['verdict']}")
-    return answer
+    found = diagnosed(run, names=(str(run),))
+    if found != told:
+        raise Broken(f"another diagnosis than that of the whole run: {found['verdict']}")
 
 
 # Effects of the user's own
@@ -231,7 +216,7 @@ BROKEN = (
 )
 
 
-def _own(case: Case) -> Answer:
+def _own(case: Case) -> None:
     """A broken file of an effect as a candidate; what cannot be estimated is no cause."""
     whole, _, _ = _runs()
     old, new = BROKEN[case.number % len(BROKEN)]
@@ -243,38 +228,13 @@ def _own(case: Case) -> Answer:
     own.write_text(text, encoding="utf-8")
     shutil.copytree(whole, run, copy_function=os.link, ignore=shutil.ignore_patterns("diagnose"))
     effects = ("--own", own, "--effects", "intensity_noise,glow")
-    answer = diagnosed(run, *effects, names=("own.py", "glow", "Glow"))
-    if answer == "truthful" and any(c["effect"] == "glow" for c in verdict(run)["causes"]):
+    told = diagnosed(run, *effects, names=("own.py", "glow", "Glow"))
+    if any(cause["effect"] == "glow" for cause in told["causes"]):
         raise Broken("an effect that is not there was claimed")
-    return answer
 
 
 # The nominal bench
 
-BENCH: dict[str, Any] = {
-    "schema": "pixcal/bench/1",
-    "seed": 3,
-    "detector": {
-        "shape": list(SHAPE),
-        "pitch_um": 4.4,
-        "gain_e_per_adu": 1.0,
-        "read_noise_e": 16,
-        "delta_rms_px": 2.0e-3,
-    },
-    "optics": {
-        "wavelength_nm": 632.8,
-        "distance_mm": 400.0,
-        "beam_radius_mm": 30.0,
-        "visibility": 0.9,
-    },
-    "frames": {
-        "exptime_s": 0.02,
-        "period_s": 0.14,
-        "bias": 12,
-        "fringes": [{"name": "vertical", "baseline_mm": [10.9, 0.0], "count": 50, "peak_e": 38000}],
-    },
-    "effects": {"lag": {}},
-}
 EFFECTS: tuple[Any, ...] = (
     {"lag": {}},
     {},
@@ -304,12 +264,12 @@ EFFECTS: tuple[Any, ...] = (
 )
 
 
-def _nominal(case: Case) -> Answer:
+def _nominal(case: Case) -> None:
     """A bench file for `--nominal` that is none, that does not fit the run, or that does."""
     whole, _, _ = _runs()
     run, file = case.folder / "run", case.folder / "bench.yaml"
     shutil.copytree(whole, run, copy_function=os.link, ignore=shutil.ignore_patterns("diagnose"))
-    bench = json.loads(json.dumps(BENCH))
+    bench = yaml.safe_load(small_bench())
     bench["effects"] = EFFECTS[case.number % len(EFFECTS)]
     text = yaml.safe_dump(bench)
     if case.number >= len(EFFECTS):
@@ -334,7 +294,7 @@ def _nominal(case: Case) -> Answer:
     if not file.is_dir():
         file.write_text(text, encoding="utf-8")
     names = ("bench.yaml", "effects", "--nominal")
-    return diagnosed(run, "--nominal", file, names=names)
+    diagnosed(run, "--nominal", file, names=names)
 
 
 KINDS = [

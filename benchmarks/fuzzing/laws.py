@@ -2,6 +2,7 @@
 
 import atexit
 import io
+import json
 import os
 import re
 import shutil
@@ -21,8 +22,6 @@ from typing import Literal
 import numpy as np
 
 from pixcal_cli.main import invoke
-
-Answer = Literal["refused", "truthful"]
 
 SECONDS = 60
 """A case that takes longer hangs; the slowest takes some seconds."""
@@ -50,6 +49,10 @@ class Broken(AssertionError):
     """A law is broken; the message says which."""
 
 
+class Refused(Exception):
+    """A command refused its input; the message is the line it printed."""
+
+
 class Hang(BaseException):
     """The time limit of a case is over (no Exception, so that nothing swallows it)."""
 
@@ -73,7 +76,7 @@ class Kind:
 
     name: str
     title: str
-    judge: Callable[[Case], Answer]
+    judge: Callable[[Case], object]
     cases: int = 1000
     """In the long version."""
 
@@ -86,19 +89,18 @@ class Verdict:
     why: str = ""
 
 
-LAST_MESSAGE = [""]
-"""The line of the last refusal, for `judged`."""
-
-
 def judged(kind: Kind, number: int) -> Verdict:
     """Make a case and hold what pixcal does with it against the laws."""
-    LAST_MESSAGE[0] = ""
     rng = np.random.default_rng([zlib.crc32(kind.name.encode()), number])
+    verdict = Verdict("truthful")
     with TemporaryDirectory(dir=SCRATCH, prefix="pixcal-fuzz-") as folder:
         try:
             with time_limit(SECONDS), memory_limit(), warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # as the command line does
-                outcome = kind.judge(Case(number, rng, Path(folder)))
+                try:
+                    kind.judge(Case(number, rng, Path(folder)))
+                except Refused as refusal:
+                    verdict = Verdict("refused", str(refusal))
         except Broken as error:
             return Verdict("failed", str(error))
         except Hang:
@@ -107,7 +109,7 @@ def judged(kind: Kind, number: int) -> Verdict:
             where = traceback.extract_tb(error.__traceback__)[-1]
             told = " ".join(f"{type(error).__name__}: {error}".split())
             return Verdict("failed", f"{told:.300} ({Path(where.filename).name}:{where.lineno})")
-    return Verdict(outcome, LAST_MESSAGE[0])
+    return verdict
 
 
 @contextmanager
@@ -127,8 +129,9 @@ def time_limit(seconds: float) -> Iterator[None]:
 
 
 @contextmanager
-def memory_limit(most: int = MEMORY - INTERPRETER) -> Iterator[None]:
+def memory_limit() -> Iterator[None]:
     """Raise `Broken` where this process grew by more than a plan for `MEMORY` allows."""
+    most = MEMORY - INTERPRETER
     status, clear = Path("/proc/self/status"), Path("/proc/self/clear_refs")
     try:
         clear.write_text("5")  # the peak from now on
@@ -147,11 +150,11 @@ def _kib(status: Path, key: str) -> int:
     return int(found[1]) if found else 0
 
 
-def pixcal(*args: str | Path, names: Sequence[str] = ()) -> int:
-    """Run a command in this process and hold its end against the laws; returns 0 or 2.
+def pixcal(*args: str | Path, names: Sequence[str] = ()) -> None:
+    """Run a command in this process and hold its end against the laws.
 
     ``names``: a refusal must name one of these: the file, the key or the option that is bad. Raises
-    Broken for any other exit code, a traceback, not one line, or a line that does not help.
+    Refused for exit code 2 with one line that helps; Broken for any other failure.
     """
     # As the interpreter makes its own: what cannot be encoded is an error on stdout only.
     out = io.TextIOWrapper(io.BytesIO(), "utf-8", "strict")
@@ -167,12 +170,20 @@ def pixcal(*args: str | Path, names: Sequence[str] = ()) -> int:
     if code == 0:
         if said:
             raise Broken(f"{_line(words)}: success, and on stderr {said[:200]!r}")
-        return 0
+        return
     if code != 2:
         raise Broken(f"{_line(words)}: exit code {code}: {said:.300}")
     check_line(said, names, _line(words))
-    LAST_MESSAGE[0] = said.strip()
-    return 2
+    raise Refused(said.strip())
+
+
+@contextmanager
+def good_input() -> Iterator[None]:
+    """What is not to be refused."""
+    try:
+        yield
+    except Refused as refusal:
+        raise Broken(f"good input is refused: {refusal}") from refusal
 
 
 @contextmanager
@@ -219,25 +230,26 @@ def _line(words: Sequence[str]) -> str:
     return " ".join(f"{word:.60}" for word in words if word not in RUNTIME)
 
 
-def calibrate(acquisition: Path, run: Path, names: Sequence[str] = (), *more: str) -> Answer:
+def calibrate(acquisition: Path, run: Path, names: Sequence[str] = (), *more: str) -> None:
     """Take an acquisition through ingest, reduce, fit, allan and ``more``, as far as they go.
 
     ``names``: what a refusal of ingest must name one of; later steps name the set or the run.
     """
-    if pixcal("ingest", acquisition, "--out", run, *RUNTIME, names=names) == 2:
-        return "refused"
+    pixcal("ingest", acquisition, "--out", run, *RUNTIME, names=names)
     for command in ("reduce", "fit", "allan", *more):
-        if (
-            pixcal(
-                command,
-                run,
-                *RUNTIME,
-                names=[str(run), "--memory", "frames.", "fringe set", *names],
-            )
-            == 2
-        ):
-            return "refused"
-    return "truthful"
+        named = [str(run), "--memory", "frames.", "fringe set", *names]
+        pixcal(command, run, *RUNTIME, names=named)
+
+
+def describe_calibration(folder: Path, **frames: list[str]) -> None:
+    """Write ``acquisition.yaml`` with globs of bias, dark or flat frames."""
+    described = {
+        "schema": "pixcal/acquisition/1",
+        "detector": {"pitch_um": 4.4, "gain_e_per_adu": 1.0, "read_noise_e": 16.0},
+        "optics": {"wavelength_nm": 632.8, "distance_mm": 400.0},
+        "frames": frames,
+    }
+    (folder / "acquisition.yaml").write_text(json.dumps(described))
 
 
 def lasting_folder() -> Path:

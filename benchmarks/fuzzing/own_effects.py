@@ -3,8 +3,8 @@
 import numpy as np
 from astropy.io import fits
 
-from fuzzing.laws import RUNTIME, Answer, Broken, Case, Kind, pixcal
-from fuzzing.settings import BENCH
+from fuzzing.laws import RUNTIME, Broken, Case, Kind, pixcal
+from fuzzing.settings import small_bench
 
 GOOD = '''
 from dataclasses import dataclass
@@ -106,7 +106,7 @@ VALUES = (
 )
 
 
-def _own(case: Case) -> Answer:
+def _own(case: Case) -> None:
     """One change of a good file, or two, and values for it in the bench file."""
     text = GOOD
     chosen = [CHANGES[case.number % len(CHANGES)]]
@@ -117,17 +117,13 @@ def _own(case: Case) -> Answer:
     own = case.folder / "own.py"
     own.write_text(text, encoding="utf-8")
     values = VALUES[0] if case.number < len(CHANGES) else str(case.pick(*VALUES))
-    bench = BENCH.read_text(encoding="utf-8").replace("[61, 83]", "[12, 10]")
-    bench = bench.replace("count: 97", "count: 3").replace("count: 89", "count: 3")
     file, acq = case.folder / "bench.yaml", case.folder / "acq"
-    file.write_text(f"{bench}\neffects:\n  glow: {values}\n", encoding="utf-8")
+    file.write_text(f"{small_bench()}\neffects:\n  glow: {values}\n", encoding="utf-8")
     names = ["own.py", "effects", "glow"]
-    if pixcal("simulate", file, "--out", acq, "--own", own, *RUNTIME, names=names) == 2:
-        return "refused"
+    pixcal("simulate", file, "--out", acq, "--own", own, *RUNTIME, names=names)
     frames = np.asarray(fits.getdata(next((acq / "vertical").glob("*.fits*"))))
     if frames.shape[-2:] != (12, 10):
         raise Broken(f"an effect changed the window to {frames.shape}")
-    return "truthful"
 
 
 KINDS = [Kind("own-effects", "files with your own effects", _own, 200)]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fuzzing.laws import LAST_MESSAGE, calibrate
+from fuzzing.laws import Refused, calibrate
 from fuzzing.night import Night
 from pixcal.model.acquisition import Frames
 from pixcal.model.errors import InputError
@@ -21,12 +21,13 @@ def night(seed: int = 1, **options: Any) -> Night:
 
 
 def refused(made: Night, folder: Path, dtype: str = "uint16") -> str:
-    assert calibrate(made.write(folder / "acq", dtype), folder / "run") == "refused"
-    return LAST_MESSAGE[0]
+    with pytest.raises(Refused) as refusal:
+        calibrate(made.write(folder / "acq", dtype), folder / "run")
+    return str(refusal.value)
 
 
 def calibrated(made: Night, folder: Path, dtype: str = "uint16") -> None:
-    assert calibrate(made.write(folder / "acq", dtype), folder / "run") == "truthful"
+    calibrate(made.write(folder / "acq", dtype), folder / "run")
     made.check(folder / "run")
 
 
