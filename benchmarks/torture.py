@@ -42,28 +42,27 @@ def trials(bench: Bench, share: float) -> dict[str, Trial]:
     found: dict[str, Trial] = {}
     mount = full_disk.can_mount(bench.folder)
     for stage in STAGES:
-        found[f"kill {stage}"] = partial(kills.kill, bench, stage, n(40), SEED)
-        found[f"ctrl-c {stage}"] = partial(kills.interrupt, bench, stage, n(10), SEED)
-        found[f"loading {stage}"] = partial(kills.loading, bench, stage, n(20), SEED)
-        found[f"full disk {stage}"] = partial(full_disk.at_writes, bench, stage, n(30), SEED)
+        found[f"kill {stage}"] = partial(kills.kill, bench, stage, n(40))
+        found[f"ctrl-c {stage}"] = partial(kills.interrupt, bench, stage, n(10))
+        found[f"loading {stage}"] = partial(kills.loading, bench, stage, n(20))
+        found[f"full disk {stage}"] = partial(full_disk.at_writes, bench, stage, n(30))
         if mount:
-            small = partial(full_disk.on_small_disks, bench, stage, n(6), SEED)
-            found[f"small disk {stage}"] = small
+            found[f"small disk {stage}"] = partial(full_disk.on_small_disks, bench, stage, n(6))
     for artefact in ARTEFACTS:
         for what, do in (("metadata", damage.metadata), ("chunks", damage.chunks)):
             for how, times in HOW_OFTEN.items():
                 name = f"{how.__name__} {what} {artefact}"
-                found[name] = partial(do, bench, artefact, how, n(times), SEED)
+                found[name] = partial(do, bench, artefact, how, n(times))
     flip = damage.flip_a_bit
     for stage in STAGES:
-        found[f"unfinished {stage}"] = partial(damage.unfinished, bench, stage, flip, n(12), SEED)
-    found["products"] = partial(damage.products, bench, flip, n(6), SEED)
-    found["processes"] = partial(processes.together, bench, n(12), SEED)
+        found[f"unfinished {stage}"] = partial(damage.unfinished, bench, stage, flip, n(12))
+    found["products"] = partial(damage.products, bench, flip, n(6))
+    found["processes"] = partial(processes.together, bench, n(12))
     for change in inputs.CHANGES:
         for stage in ("ingest", "reduce"):
             name = f"inputs {change.__name__} {stage}"
-            found[name] = partial(inputs.change, bench, change, n(6), SEED, stage)
-    found["inputs rot"] = partial(inputs.rot, bench, n(20), SEED)
+            found[name] = partial(inputs.change, bench, change, n(6), stage)
+    found["inputs rot"] = partial(inputs.rot, bench, n(20))
     for jump in clocks.JUMPS:
         found[f"clock {jump.__name__}"] = partial(clocks.jump, bench, jump)
     found["read-only"] = partial(places.read_only, bench)
@@ -76,10 +75,10 @@ def trials(bench: Bench, share: float) -> dict[str, Trial]:
 
 
 def _on_a_cluster(
-    do: Callable[[Bench, str, str, int, int], Outcome], bench: Bench, stage: str, times: int
+    do: Callable[[Bench, str, str, int], Outcome], bench: Bench, stage: str, times: int
 ) -> Outcome:
     with workers.cluster() as address:
-        return do(bench, address, stage, times, SEED)
+        return do(bench, address, stage, times)
 
 
 def write_table(outcomes: list[Outcome]) -> None:
@@ -97,7 +96,7 @@ def write_table(outcomes: list[Outcome]) -> None:
 @lru_cache
 def _trials(folder: Path, share: float) -> dict[str, Trial]:
     """All trials, on a bench of this process."""
-    return trials(make_bench(Path(tempfile.mkdtemp(dir=folder))), share)
+    return trials(make_bench(Path(tempfile.mkdtemp(dir=folder)), SEED), share)
 
 
 def _tried(folder: Path, share: float, name: str) -> tuple[Outcome, float, str]:

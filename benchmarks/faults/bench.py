@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import random
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ class Bench:
     acquisition: Path
     reference: Path  # the undisturbed run: ingest, reduce, fit and allan
     seconds: dict[str, float]  # how long each command took
+    seed: int = 0  # of all moments, files and bits
 
     def copy(self, name: str, *stages: str) -> Path:
         """A new run with some stages of the reference.
@@ -44,9 +46,22 @@ class Bench:
             shutil.copytree(self.reference / stage, run / stage, copy_function=os.link)
         return run
 
+    def before(self, stage: str, name: str) -> Path:
+        """A new run with the stages that precede one."""
+        return self.copy(name, *STAGES[: STAGES.index(stage)])
+
     def command(self, stage: str, run: Path) -> list[str]:
         """The command line that makes a stage."""
         return line(stage, self.acquisition, run)
+
+    def rng(self, *names: str) -> random.Random:
+        """Random numbers for one kind of fault."""
+        return random.Random(" ".join([*names, str(self.seed)]))
+
+    def assert_resumed(self, run: Path, stage: str) -> None:
+        """Run a stage again to its end: with all before it, it is that of the reference."""
+        pixcal(*self.command(stage, run)).succeeded()
+        self.assert_same(run, *STAGES[: STAGES.index(stage) + 1])
 
     def assert_same(self, run: Path, *stages: str) -> None:
         """Assert that stages of a run are those of the reference, bit for bit."""
@@ -61,7 +76,7 @@ def line(stage: str, acquisition: Path, run: Path) -> list[str]:
     return [stage, str(run)]
 
 
-def make_bench(folder: Path) -> Bench:
+def make_bench(folder: Path, seed: int) -> Bench:
     """Simulate an acquisition and make the reference."""
     config = yaml.safe_load((Path(__file__).parents[2] / "tests" / "bench.yaml").read_text())
     config["detector"]["shape"] = list(SHAPE)
@@ -72,7 +87,7 @@ def make_bench(folder: Path) -> Bench:
     seconds = {}
     for stage in (*STAGES, "allan"):
         seconds[stage] = pixcal(*line(stage, acquisition, run)).succeeded().seconds
-    return Bench(folder, acquisition, run, seconds)
+    return Bench(folder, acquisition, run, seconds, seed)
 
 
 def parts_of(stages: tuple[str, ...]) -> list[str]:

@@ -22,7 +22,7 @@ READERS = {"ingest": "reduce", "reduce": "fit", "sweep": "fit", "fit": "allan"}
 """The next command that reads it."""
 
 Damage = Callable[[Path, random.Random], None]
-Trial = Callable[[Bench, str, Damage, int | None, int], Outcome]
+Trial = Callable[[Bench, str, Damage, int], Outcome]
 
 
 def flip_a_bit(file: Path, rng: random.Random) -> None:
@@ -49,29 +49,34 @@ def zero(file: Path, rng: random.Random) -> None:
     _replace(file, bytes(file.stat().st_size))
 
 
-_DONE = {remove: "removed", cut: "cut short", zero: "overwritten with zeros"}
-
-
 def _replace(file: Path, body: bytes) -> None:
     file.unlink()  # a hard link: the reference keeps its own
     file.write_bytes(body)
 
 
-def stored(bench: Bench, artefact: str, *, chunks: bool) -> list[str]:
-    """Files of an artefact: chunks of arrays, or all others."""
+WORDS = {
+    flip_a_bit: "one bit flipped",
+    remove: "removed",
+    cut: "cut short",
+    zero: "overwritten with zeros",
+}
+
+
+def _some(
+    bench: Bench, artefact: str, times: int, rng: random.Random, *, chunks: bool
+) -> list[str]:
+    """Some files of an artefact: chunks of arrays, or others."""
     folder = bench.reference / artefact
     names = (f.relative_to(folder).as_posix() for f in sorted(folder.rglob("*")) if f.is_file())
-    return [name for name in names if ("/c/" in name) == chunks]
+    found = [name for name in names if ("/c/" in name) == chunks]
+    return rng.sample(found, min(times, len(found)))
 
 
-def metadata(bench: Bench, artefact: str, damage: Damage, times: int | None, seed: int) -> Outcome:
-    """Damage the files beside the chunks, or ``times`` of them.
-
-    The next command names them; their own makes them again.
-    """
-    outcome = Outcome(_fault(damage, "metadata file"))
-    rng = random.Random(f"{artefact} {_name(damage)} {seed}")
-    for name in _some(stored(bench, artefact, chunks=False), times, rng):
+def metadata(bench: Bench, artefact: str, damage: Damage, times: int) -> Outcome:
+    """Damage files beside the chunks: the next command names them; their own makes them again."""
+    outcome = Outcome(f"metadata file: {WORDS[damage]}")
+    rng = bench.rng(artefact, damage.__name__)
+    for name in _some(bench, artefact, times, rng, chunks=False):
         run = _ready(bench, artefact)
         damage(run / artefact / name, rng)
         told = name.removesuffix("/chunks.npy").removesuffix("/zarr.json")
@@ -85,17 +90,21 @@ def metadata(bench: Bench, artefact: str, damage: Damage, times: int | None, see
     return outcome
 
 
-def chunks(bench: Bench, artefact: str, damage: Damage, times: int | None, seed: int) -> Outcome:
+def chunks(bench: Bench, artefact: str, damage: Damage, times: int) -> Outcome:
     """Damage chunks: refused when they are read, never taken for anything else."""
-    outcome = Outcome(_fault(damage, "chunk"))
-    rng = random.Random(f"{artefact} {_name(damage)} {seed}")
-    for name in _some(stored(bench, artefact, chunks=True), times, rng):
+    outcome = Outcome(f"chunk: {WORDS[damage]}")
+    rng = bench.rng(artefact, damage.__name__)
+    for name in _some(bench, artefact, times, rng, chunks=True):
         run = _ready(bench, artefact)
         damage(run / artefact / name, rng)
-        _refused_by_its_reader(run, f"{artefact}/{name}")
+        stored = run / artefact / name.partition("/c/")[0]
+        with pytest.raises(DamagedError, match=re.escape(f"{artefact}/{name}")):
+            ArrayReader(stored).read()
         ended = pixcal(*bench.command(READERS[artefact], run))
         if ended.code == 0:
-            _unaffected(bench, run, artefact)
+            # What was made beside the damage is what is made without it.
+            if artefact != READERS[artefact]:
+                bench.assert_same(run, READERS[artefact])
             outcome.ends["not read by the next command"] += 1
             continue
         ended.refused(2, name, f"pixcal {OWNERS[artefact]}")
@@ -106,10 +115,10 @@ def chunks(bench: Bench, artefact: str, damage: Damage, times: int | None, seed:
     return outcome
 
 
-def products(bench: Bench, damage: Damage, times: int, seed: int) -> Outcome:
+def products(bench: Bench, damage: Damage, times: int) -> Outcome:
     """Damage the FITS maps: the fit, up to date as it is, writes them again."""
-    outcome = Outcome(_fault(damage, "FITS map"))
-    rng = random.Random(f"products {_name(damage)} {seed}")
+    outcome = Outcome(f"FITS map: {WORDS[damage]}")
+    rng = bench.rng("products", damage.__name__)
     for number in range(times):
         run = bench.copy("damaged", "ingest", "reduce", "sweep", "fit", "products")
         damage(run / "products" / ("delta_x.fits", "delta_y.fits")[number % 2], rng)
@@ -119,12 +128,12 @@ def products(bench: Bench, damage: Damage, times: int, seed: int) -> Outcome:
     return outcome
 
 
-def unfinished(bench: Bench, stage: str, damage: Damage, times: int, seed: int) -> Outcome:
+def unfinished(bench: Bench, stage: str, damage: Damage, times: int) -> Outcome:
     """Kill a command, damage what it has left half-done, and go on."""
-    outcome = Outcome(_fault(damage, "file of an unfinished build"))
-    rng = random.Random(f"unfinished {stage} {_name(damage)} {seed}")
+    outcome = Outcome(f"file of an unfinished build: {WORDS[damage]}")
+    rng = bench.rng("unfinished", stage, damage.__name__)
     while outcome.tried < times:
-        run = bench.copy("unfinished", *STAGES[: STAGES.index(stage)])
+        run = bench.before(stage, "unfinished")
         command = Command(bench.command(stage, run))
         while command.process.is_alive() and not any(run.glob(".partial/*/*")):
             time.sleep(0.001)
@@ -156,12 +165,6 @@ def _type(bench: Bench, line: str) -> None:
     pixcal(*shlex.split(line.replace("ACQ", str(bench.acquisition)))[1:]).succeeded()
 
 
-def _refused_by_its_reader(run: Path, name: str) -> None:
-    """Assert that a chunk cannot be read."""
-    with pytest.raises(DamagedError, match=re.escape(name)):
-        ArrayReader(run / name.partition("/c/")[0]).read()
-
-
 def _ready(bench: Bench, artefact: str) -> Path:
     """A run up to an artefact, but for what the next command makes."""
     order = ["ingest", "reduce", "sweep", "fit"]
@@ -173,23 +176,3 @@ def _mended(bench: Bench, run: Path, artefact: str) -> None:
     pixcal(*bench.command(OWNERS[artefact], run)).succeeded()
     bench.assert_same(run, OWNERS[artefact])
     assert not list(run.rglob("damage.json"))
-
-
-def _unaffected(bench: Bench, run: Path, artefact: str) -> None:
-    """What was made beside the damage is what is made without it."""
-    if artefact != READERS[artefact]:
-        bench.assert_same(run, READERS[artefact])
-
-
-def _some(names: list[str], times: int | None, rng: random.Random) -> list[str]:
-    return names if times is None else rng.sample(names, min(times, len(names)))
-
-
-def _fault(damage: Damage, what: str) -> str:
-    if damage is flip_a_bit:
-        return f"{what}: one bit flipped"
-    return f"{what}: {_DONE[damage]}"
-
-
-def _name(damage: Damage) -> str:
-    return damage.__name__.replace("_", " ")

@@ -5,7 +5,6 @@ import errno
 import io
 import math
 import os
-import random
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,37 +14,26 @@ from pathlib import Path
 from typing import Any
 
 from faults import Outcome
-from faults.bench import STAGES, Bench
-from faults.forks import Ended, pixcal
+from faults.bench import Bench
+from faults.forks import pixcal
 
 RESUMED = "one line, exit 1; resumed"
-_LINE = ("disk full; complete results are kept: free some space and run the same command again",)
+_LINE = "disk full; complete results are kept: free some space and run the same command again"
 
 
-def at_writes(bench: Bench, stage: str, times: int | None, seed: int) -> Outcome:
-    """Let each write of a command, or ``times`` of them, fail half-way, and all that follow."""
+def at_writes(bench: Bench, stage: str, times: int) -> Outcome:
+    """Let ``times`` of the writes of a command fail half-way, and all that follow."""
     outcome = Outcome("disk full at the n-th write")
-    earlier = STAGES[: STAGES.index(stage)]
-    total = _count(bench, stage, earlier)
-    numbers = range(total)
-    if times is not None:
-        numbers = sorted(random.Random(f"{stage} {seed}").sample(numbers, times))
-    for number in numbers:
-        run = bench.copy(f"{stage}-full", *earlier)
-        ended = pixcal(*bench.command(stage, run), before=partial(_fill_up, run, number))
-        _check(ended)
-        pixcal(*bench.command(stage, run)).succeeded()
-        bench.assert_same(run, *earlier, stage)
+    for number in sorted(bench.rng(stage).sample(range(_count(bench, stage)), times)):
+        run = bench.before(stage, f"{stage}-full")
+        pixcal(*bench.command(stage, run), before=partial(_fill_up, run, number)).refused(1, _LINE)
+        bench.assert_resumed(run, stage)
         outcome.ends[RESUMED] += 1
     return outcome
 
 
-def _check(ended: Ended) -> None:
-    ended.refused(1, *_LINE)
-
-
-def _count(bench: Bench, stage: str, earlier: tuple[str, ...]) -> int:
-    run, told = bench.copy(f"{stage}-full", *earlier), bench.folder / "writes"
+def _count(bench: Bench, stage: str) -> int:
+    run, told = bench.before(stage, f"{stage}-full"), bench.folder / "writes"
     pixcal(*bench.command(stage, run), before=partial(_count_writes, run, told)).succeeded()
     return int(told.read_text())
 
@@ -98,14 +86,13 @@ def _count_writes(run: Path, told: Path) -> None:
     _install(disk)
 
 
-def on_small_disks(bench: Bench, stage: str, times: int, seed: int) -> Outcome:
+def on_small_disks(bench: Bench, stage: str, times: int) -> Outcome:
     """Run a command on tmpfs of random sizes that are too small; then with room."""
     outcome = Outcome("file system too small (tmpfs)")
-    earlier = STAGES[: STAGES.index(stage)]
-    rng = random.Random(f"{stage} {seed}")
+    rng = bench.rng(stage)
     while outcome.tried < times:
         with _tmpfs(bench.folder / "small") as (disk, resize):
-            source = bench.copy("source", *earlier)
+            source = bench.before(stage, "source")
             run = disk / "run"
             subprocess.run(["cp", "-a", source, run], check=True)
             used = _used(disk)
@@ -115,10 +102,9 @@ def on_small_disks(bench: Bench, stage: str, times: int, seed: int) -> Outcome:
             ended = pixcal(*bench.command(stage, run))
             if ended.code == 0:
                 continue  # it was large enough
-            _check(ended)
+            ended.refused(1, _LINE)
             resize(1 << 30)
-            pixcal(*bench.command(stage, run)).succeeded()
-            bench.assert_same(run, *earlier, stage)
+            bench.assert_resumed(run, stage)
             outcome.ends[RESUMED] += 1
     return outcome
 

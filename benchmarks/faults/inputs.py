@@ -9,14 +9,10 @@ from pathlib import Path
 
 from faults import Outcome
 from faults.bench import Bench, line
+from faults.damage import remove
 from faults.forks import Command, pixcal
 
 Change = Callable[[Path, random.Random], None]
-
-
-def vanish(file: Path, rng: random.Random) -> None:
-    """Remove a file."""
-    file.unlink()
 
 
 def cut(file: Path, rng: random.Random) -> None:
@@ -39,17 +35,17 @@ def replace(file: Path, rng: random.Random) -> None:
 
 
 CHANGES = {
-    vanish: "vanishes",
+    remove: "vanishes",
     cut: "is cut short",
     write_into: "is overwritten in part",
     replace: "is replaced",
 }
 
 
-def change(bench: Bench, how: Change, times: int, seed: int, stage: str = "ingest") -> Outcome:
+def change(bench: Bench, how: Change, times: int, stage: str = "ingest") -> Outcome:
     """Change a file of the acquisition at a random moment of a stage, then put it back."""
     outcome = Outcome(f"input file {CHANGES[how]} during a command")
-    rng = random.Random(f"{how.__name__} {stage} {seed}")
+    rng = bench.rng(how.__name__, stage)
     while outcome.tried < times:
         acquisition, run = _fresh(bench, stage)
         name = rng.choice(_files(bench))
@@ -72,10 +68,10 @@ def change(bench: Bench, how: Change, times: int, seed: int, stage: str = "inges
     return outcome
 
 
-def rot(bench: Bench, times: int, seed: int) -> Outcome:
+def rot(bench: Bench, times: int) -> Outcome:
     """Flip a bit of a frame after it was ingested; its size and time stay."""
     outcome = Outcome("FITS file: one bit flipped between `ingest` and `reduce`")
-    rng = random.Random(f"rot {seed}")
+    rng = bench.rng("rot")
     while outcome.tried < times:
         acquisition, run = _fresh(bench, "reduce")
         name = rng.choice(_files(bench))

@@ -1,6 +1,5 @@
 """Kill -9, and Ctrl-C, at random moments."""
 
-import random
 import signal
 import subprocess
 import sys
@@ -9,7 +8,7 @@ from collections.abc import Iterator
 
 from faults import Outcome
 from faults.bench import STAGES, Bench
-from faults.forks import PATIENCE_S, Command, Ended, pixcal
+from faults.forks import PATIENCE_S, Command, Ended
 
 MAIN = "from pixcal_cli.__main__ import main; main()"
 """What the shell command does."""
@@ -18,37 +17,37 @@ LONGER = 1.1
 """Moments are drawn from as long as the undisturbed command takes, and a little more."""
 
 
-def kill(bench: Bench, stage: str, times: int, seed: int) -> Outcome:
+def kill(bench: Bench, stage: str, times: int) -> Outcome:
     """Kill a command at random moments, again and again until it ends by itself; begin anew.
 
     All that is left, and what earlier stages left, must be as without a fault.
     """
     outcome = Outcome("kill -9 at a random moment")
-    for again in _disturbed(bench, stage, times, seed, signal.SIGKILL):
+    for again in _disturbed(bench, stage, times, signal.SIGKILL):
         assert again.code == -signal.SIGKILL
         assert again.err == ""
         outcome.ends["resumed"] += 1
     return outcome
 
 
-def interrupt(bench: Bench, stage: str, times: int, seed: int) -> Outcome:
+def interrupt(bench: Bench, stage: str, times: int) -> Outcome:
     """The same with Ctrl-C: one line, exit code 1."""
     outcome = Outcome("Ctrl-C at a random moment")
-    for again in _disturbed(bench, stage, times, seed, signal.SIGINT):
+    for again in _disturbed(bench, stage, times, signal.SIGINT):
         again.refused(1, "interrupted; run the same command again to resume")
         outcome.ends["one line, exit 1; resumed"] += 1
     return outcome
 
 
-def loading(bench: Bench, stage: str, times: int, seed: int) -> Outcome:
+def loading(bench: Bench, stage: str, times: int) -> Outcome:
     """Ctrl-C in the first second and a half of a new interpreter, while it loads its libraries.
 
     Before it has come to pixcal, which takes some hundredths of a second, Python answers itself.
     """
     outcome = Outcome(f"Ctrl-C in the first {LOADING_S} s, while libraries load")
-    rng = random.Random(f"loading {stage} {seed}")
+    rng = bench.rng("loading", stage)
     while outcome.tried < times:
-        run = bench.copy("loading", *STAGES[: STAGES.index(stage)])
+        run = bench.before(stage, "loading")
         line = [sys.executable, "-c", MAIN, *bench.command(stage, run), "--quiet"]
         # A shell that starts us in the background may have it ignored.
         before = signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -67,22 +66,18 @@ def loading(bench: Bench, stage: str, times: int, seed: int) -> Outcome:
             assert "pixcal_cli" not in said, said
             assert {f.name for f in run.iterdir()} == set(STAGES[: STAGES.index(stage)])
             end = "Python had not started pixcal"
-        pixcal(*bench.command(stage, run)).succeeded()
-        bench.assert_same(run, stage)
+        bench.assert_resumed(run, stage)
         outcome.ends[end] += 1
     return outcome
 
 
-def _disturbed(
-    bench: Bench, stage: str, times: int, seed: int, number: signal.Signals
-) -> Iterator[Ended]:
-    rng = random.Random(f"{stage} {seed}")
-    earlier = STAGES[: STAGES.index(stage)]
+def _disturbed(bench: Bench, stage: str, times: int, number: signal.Signals) -> Iterator[Ended]:
+    rng = bench.rng(stage)
     begun, disturbed, longest = 0, 0, bench.seconds[stage]
     while disturbed < times:
         begun += 1
         assert begun < 10 * times, "the signal has no effect"
-        run = bench.copy(f"{stage}-{number.name}", *earlier)
+        run = bench.before(stage, f"{stage}-{number.name}")
         for _ in range(6):
             command = Command(bench.command(stage, run))
             time.sleep(rng.uniform(0, LONGER * longest))
@@ -95,5 +90,4 @@ def _disturbed(
             yield ended
             if disturbed == times:
                 break
-        pixcal(*bench.command(stage, run)).succeeded()
-        bench.assert_same(run, *earlier, stage)
+        bench.assert_resumed(run, stage)

@@ -1,22 +1,20 @@
 """Several processes at the same time on one run."""
 
-import random
 import time
 from collections import Counter
 
 from faults import Outcome
 from faults.bench import STAGES, Bench
-from faults.forks import Command, pixcal
+from faults.forks import Command
 
 
-def together(bench: Bench, times: int, seed: int) -> Outcome:
+def together(bench: Bench, times: int) -> Outcome:
     """Begin three commands on one run at almost the same time; each does its work or is refused."""
     outcome = Outcome("three commands on one RUN at the same time")
-    rng = random.Random(f"together {seed}")
+    rng = bench.rng("together")
     for number in range(times):
         stage = STAGES[number % len(STAGES)]
-        earlier = STAGES[: STAGES.index(stage)]
-        run = bench.copy("together", *earlier)
+        run = bench.before(stage, "together")
         # Two of the same, and one that would change what they read or write.
         others = [stage, stage, rng.choice(STAGES[: STAGES.index(stage) + 1])]
         commands = []
@@ -32,7 +30,6 @@ def together(bench: Bench, times: int, seed: int) -> Outcome:
             ended.refused(2, f"{run}: another pixcal is working there; wait for it")
             ends["one line, exit 2"] += 1
         assert ends["done or up to date"] > 0
-        pixcal(*bench.command(stage, run)).succeeded()
-        bench.assert_same(run, *earlier, stage)
+        bench.assert_resumed(run, stage)
         outcome.ends += ends
     return outcome

@@ -2,7 +2,6 @@
 
 import json
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -16,8 +15,8 @@ import psutil
 from distributed import Client
 
 from faults import Outcome
-from faults.bench import STAGES, Bench
-from faults.forks import Command, pixcal
+from faults.bench import Bench
+from faults.forks import Command
 
 MEMORY_MIB = 900
 ALLOWED = 1
@@ -70,16 +69,15 @@ def _starve(megabytes: int) -> None:
 
 
 def _leak(megabytes: int) -> None:
-    held = []
-    for _ in range(megabytes):
-        held.append(b"x" * (1 << 20))
+    held = [b"x" * (1 << 20) for _ in range(megabytes)]
     time.sleep(60)
+    del held
 
 
-def killed(bench: Bench, address: str, stage: str, times: int, seed: int) -> Outcome:
+def killed(bench: Bench, address: str, stage: str, times: int) -> Outcome:
     """Kill a worker when the first tasks of a command are done."""
     outcome = Outcome("Dask worker killed")
-    rng = random.Random(f"killed {stage} {seed}")
+    rng = bench.rng("killed", stage)
 
     def kill(client: Client, command: Command, run: Path) -> None:
         pids = list(client.run(os.getpid).values())
@@ -89,10 +87,10 @@ def killed(bench: Bench, address: str, stage: str, times: int, seed: int) -> Out
     return _disturbed(bench, address, stage, times, kill, outcome)
 
 
-def starved(bench: Bench, address: str, stage: str, times: int, seed: int) -> Outcome:
+def starved(bench: Bench, address: str, stage: str, times: int) -> Outcome:
     """Let a worker lose its memory to something else: its nanny kills it."""
     outcome = Outcome("Dask worker short of memory")
-    rng = random.Random(f"starved {stage} {seed}")
+    rng = bench.rng("starved", stage)
 
     def starve(client: Client, command: Command, run: Path) -> None:
         chosen = rng.choice(list(client.scheduler_info(n_workers=-1)["workers"]))
@@ -109,12 +107,11 @@ def _disturbed(
     disturb: Callable[[Client, Command, Path], None],
     outcome: Outcome,
 ) -> Outcome:
-    earlier = STAGES[: STAGES.index(stage)]
     tried = 0
     while outcome.tried < times:
         tried += 1
         assert tried < 5 * times, "the commands are over before the workers die"
-        run = bench.copy(f"{stage}-workers", *earlier)
+        run = bench.before(stage, f"{stage}-workers")
         with Client(address, set_as_default=False) as client:
             client.wait_for_workers(2, timeout=60)
             before = set(client.run(os.getpid).values())
@@ -125,8 +122,7 @@ def _disturbed(
             _wait_for_death(before)
         if ended.code:
             ended.refused(1, "run the same command again to resume")
-            pixcal(*bench.command(stage, run)).succeeded()
-        bench.assert_same(run, *earlier, stage)
+        bench.assert_resumed(run, stage)
         if in_time:
             end = "one line, exit 1; resumed" if ended.code else "tasks done by other workers"
             outcome.ends[end] += 1
