@@ -21,9 +21,10 @@ import yaml
 from comparators.measure import METHODS, PIXCAL
 from pixcal.engine.run import Runtime
 from pixcal.model.acquisition import load_acquisition
-from pixcal.stages import ingest, reduce, simulate
+from pixcal.model.bench import load_bench
 from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.storage.products import read_map
+from reproduction.lab import Scene
 from truth import PLANE, Truth
 
 HERE = Path(__file__).parent
@@ -96,12 +97,11 @@ def measure(
 def compare(scenario: str, options: argparse.Namespace) -> dict[str, Any]:
     """All methods on one scenario: the bound in px, and what each costs and achieves."""
     with tempfile.TemporaryDirectory() as scratch:
-        folder, runtime = Path(scratch), Runtime()
-        source = bench(folder, scenario, options.size, options.frames)
-        simulate.run(source, folder / "acq", simulate.Config(), runtime)
-        ingest.run(folder / "acq", folder / "run", ingest.Config(), runtime)
-        reduce.run(folder / "run", reduce.Config(), runtime)
-        truth = Truth.read(folder / "acq-truth", NAME)
+        folder = Path(scratch)
+        source = load_bench(bench(folder, scenario, options.size, options.frames))
+        scene = Scene.simulate(folder, source, Runtime())
+        scene.reduced()
+        truth = scene.truth(NAME)
         rows = {method: measure(method, folder, truth, options) for method in METHODS}
     return {"bound_px": truth.bound, "methods": rows}
 

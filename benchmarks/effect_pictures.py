@@ -6,7 +6,6 @@ defaults, but for `STRONGER`; all numbers are measured in this run.
 """
 
 import argparse
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,14 +14,14 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+import pixcal
 from pixcal.effects import effects
-from pixcal.engine.run import Runtime
 from pixcal.model.config import to_plain
 from pixcal.report.colours import BLUE, DIVERGING, RED
 from pixcal.report.drawing import axes_grid, draw_blocks, finish, png, unit_for
 from pixcal.report.text import SYMBOLS, number
-from pixcal.stages import fit, ingest, reduce, simulate
 from pixcal.storage.products import read_map
+from study import reduced
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "reference" / "effects"
@@ -40,21 +39,13 @@ class Maps:
     sigma: F64
 
 
-def fitted(folder: Path, on: dict[str, Any], detector: dict[str, Any] | None = None) -> Maps:
+def fitted(on: dict[str, Any]) -> Maps:
     """Fitted maps of the bench with given effects."""
     bench = yaml.safe_load((ROOT / "configs" / "effects.yaml").read_text(encoding="utf-8"))
-    bench["effects"] = on
-    bench["detector"] |= detector or {}
-    folder.mkdir()
-    (folder / "bench.yaml").write_text(yaml.safe_dump(bench), encoding="utf-8")
-    runtime = Runtime(cluster="sync")
-    run = folder / "run"
-    simulate.run(folder / "bench.yaml", folder / "acq", simulate.Config(), runtime)
-    ingest.run(folder / "acq", run, ingest.Config(), runtime)
-    reduce.run(run, reduce.Config(), runtime)
-    # Straight fringes are assumed: what a richer shape could absorb is part of the picture.
-    fit.run(run, fit.Config(model="paraxial"), runtime)
-    found = [read_map(run / "products" / f"{axis}.fits")[:2] for axis in AXES]
+    with reduced(bench | {"effects": on}) as run:
+        # Straight fringes are assumed: what a richer shape could absorb is part of the picture.
+        pixcal.fit(run, model="paraxial")
+        found = [read_map(run / "products" / f"{axis}.fits")[:2] for axis in AXES]
     return Maps(*(np.stack([f[n] for f in found]).astype(float) for n in (0, 1)))
 
 
@@ -101,16 +92,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", help="effects; default: all")
     names = parser.parse_args().names or list(effects())
-    with tempfile.TemporaryDirectory() as scratch:
-        plain = fitted(Path(scratch) / "plain", {})
-        for name in names:
-            effect = effects()[name]().scaled(STRONGER.get(name, 1.0))
-            maps = fitted(Path(scratch) / name, {name: to_plain(effect)})
-            change = maps.delta - plain.delta
-            times = f", {number(STRONGER[name])} times the default" if name in STRONGER else ""
-            draw(f"{name}: {effect.title}{times}", change, plain.sigma, PAGES / f"{name}.png")
-            rms = [float(np.nanstd(c)) for c in change]
-            print(f"{name:22} changes delta_x by {rms[0]:.1e}, delta_y by {rms[1]:.1e} px rms")
+    plain = fitted({})
+    for name in names:
+        effect = effects()[name]().scaled(STRONGER.get(name, 1.0))
+        change = fitted({name: to_plain(effect)}).delta - plain.delta
+        times = f", {number(STRONGER[name])} times the default" if name in STRONGER else ""
+        draw(f"{name}: {effect.title}{times}", change, plain.sigma, PAGES / f"{name}.png")
+        rms = [float(np.nanstd(c)) for c in change]
+        print(f"{name:22} changes delta_x by {rms[0]:.1e}, delta_y by {rms[1]:.1e} px rms")
 
 
 if __name__ == "__main__":

@@ -64,21 +64,40 @@ class Truth:
         rest = np.exp(1j * (phase - self.vector[0] * x - self.vector[1] * y))
         return np.asarray(np.angle(rest / np.nanmean(rest)) / np.hypot(*self.vector))
 
-    def error(self, offsets: F64, modes: int | None = None) -> float:
-        """Error of a map, px rms, with modes removed.
+    def modes(self, most: int | None = None) -> F64:
+        """Modes (mode, y, x) of the physics note's section 2: the first ``PLANE``, or all seven."""
+        shape = self.delta.shape
+        return np.concatenate([plane(shape), harmonics(shape, self.vector)])[:most]
 
-        ``offsets``: (y, x) along the fringe axis, px; NaN where there are none. ``modes``: how many
-        of the seven modes of the physics note's section 2 are removed: the first ``PLANE``, or all.
-        """
-        good = np.isfinite(offsets)
-        y, x = np.nonzero(good)
-        psi = self.vector[0] * x + self.vector[1] * y
-        slopes = [np.ones(len(x)), x - x.mean(), y - y.mean()]
-        fringes = [np.cos(psi), np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)]
-        basis = np.stack([*slopes, *fringes][:modes], axis=1)
-        error = (offsets - self.delta)[good]
-        error -= basis @ np.linalg.lstsq(basis, error, rcond=None)[0]
-        return float(np.sqrt(np.sum(error**2) / (len(error) - basis.shape[1])))
+    def errors(self, offsets: F64, modes: int | None = None) -> F64:
+        """Errors (y, x) of a map along the fringe axis, px, less the modes; NaN where it is NaN."""
+        return without(offsets - self.delta, self.modes(modes))
+
+    def error(self, offsets: F64, modes: int | None = None) -> float:
+        """The same as one number, px rms."""
+        errors = self.errors(offsets, modes)
+        freedom = np.isfinite(errors).sum() - len(self.modes(modes))
+        return float(np.sqrt(np.nansum(errors**2) / freedom))
+
+
+def without(values: F64, basis: F64) -> F64:
+    """A map (y, x) less what the modes (mode, y, x) explain of it; NaN stay NaN."""
+    good = np.isfinite(values)
+    found = np.linalg.lstsq(basis[:, good].T, values[good], rcond=None)[0]
+    return np.asarray(values - np.tensordot(found, basis, 1))
+
+
+def plane(shape: tuple[int, ...]) -> F64:
+    """Piston and slopes (3, y, x)."""
+    y, x = np.indices(shape)
+    return np.stack([np.ones(shape), x / shape[1] - 0.5, y / shape[0] - 0.5])
+
+
+def harmonics(shape: tuple[int, ...], vector: tuple[float, float]) -> F64:
+    """The fringe and its second harmonic, cosine and sine each (4, y, x)."""
+    y, x = np.indices(shape)
+    psi = vector[0] * x + vector[1] * y
+    return np.stack([np.cos(psi), np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)])
 
 
 def phase_bound(

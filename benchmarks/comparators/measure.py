@@ -50,15 +50,15 @@ class Result:
     phase: F64 | None
 
 
-def read_cube(task: Task) -> F64:
-    """Frames (t, y, x) in electrons, as a user of zarr reads them.
+def read_cube(run: Path, name: str) -> F64:
+    """Frames (t, y, x) of a set in electrons, as a user of zarr reads them.
 
     Raises ValueError if samples are missing, which the comparators know nothing of.
     """
-    stored = zarr.open_array(task.run / "reduce" / "reduced.zarr" / task.name / "signal", mode="r")
+    stored = zarr.open_array(run / "reduce" / "reduced.zarr" / name / "signal", mode="r")
     codes, attrs = np.asarray(stored[:]), dict[str, Any](stored.attrs)
     if (codes == attrs["_FillValue"]).any():
-        raise ValueError(f"{task.run}: samples are missing; take a bench that never saturates")
+        raise ValueError(f"{run}: samples are missing; take a bench that never saturates")
     cube: F64 = np.multiply(codes, attrs["scale_factor"], dtype=np.float64)
     cube += attrs["add_offset"]
     return cube
@@ -67,7 +67,7 @@ def read_cube(task: Task) -> F64:
 def whole(fit_phases: Callable[[F64, tuple[float, float]], F64], task: Task) -> Result:
     """A method that takes all pixels at once."""
     begin = time.perf_counter()
-    cube = read_cube(task)
+    cube = read_cube(task.run, task.name)
     reading = time.perf_counter() - begin
     phase = fit_phases(cube, task.vector)
     return Result(time.perf_counter() - begin, reading, phase)
@@ -76,7 +76,7 @@ def whole(fit_phases: Callable[[F64, tuple[float, float]], F64], task: Task) -> 
 def pixel_by_pixel(task: Task) -> Result:
     """``curve_fit`` on some pixels; the time that they took is scaled to all."""
     begin = time.perf_counter()
-    cube = read_cube(task)
+    cube = read_cube(task.run, task.name)
     reading = time.perf_counter() - begin
     frames = curve_fit.demodulate(cube, task.vector)
     ready = time.perf_counter() - begin

@@ -8,12 +8,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from comparators import alternating
+from comparators.measure import read_cube
 from pixcal.model.bench import Bench
 from pixcal.report.colours import BLUE, GREEN, GREY, INK, MARKS, RED
 from pixcal.report.drawing import WIDE, finish, new_figure, png
 from pixcal.report.text import number, with_error
 from reproduction.draw import logarithmic
-from reproduction.lab import Lab, Scene, facts, nominal_vector, read_cube, read_set
+from reproduction.lab import Lab, Scene, facts, nominal_vector, read_set
 from reproduction.outcome import Outcome, Row
 from reproduction.paper import TARGET_PX
 from truth import PLANE

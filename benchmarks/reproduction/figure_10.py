@@ -16,7 +16,7 @@ from pixcal.simulation.recording import recordings
 from pixcal.stages.budget.expected import phase_information
 from reproduction.draw import THOUSANDTHS, image
 from reproduction.lab import Lab, Scene, read_set
-from reproduction.maps import Whiteness, harmonics, plane, without
+from reproduction.maps import Whiteness, plane, without
 from reproduction.outcome import Outcome, Row
 
 F64 = NDArray[np.float64]
@@ -69,8 +69,6 @@ def measure(scene: Scene) -> Estimates:
     fringe = np.stack([np.cos(psi), np.sin(psi)])
     second = np.stack([np.cos(2 * psi), np.sin(2 * psi)])
     ones = np.ones((1, *iota.shape))
-    kx, ky = truth.vector
-    open_modes = np.concatenate([plane(delta.shape), harmonics(delta.shape, (kx, ky))])
     rough = without(iota, plane(iota.shape))
     away = np.angle(np.exp(1j * (phi - np.array(told["phi"]))))
     away = np.angle(np.exp(1j * (away - np.angle(np.exp(1j * away).mean()))))
@@ -84,7 +82,7 @@ def measure(scene: Scene) -> Estimates:
         delta,
         iota_error=without(iota / true_iota, np.concatenate([ones, fringe])),
         alpha_error=without(alpha / true_alpha, np.concatenate([ones, fringe, second])),
-        delta_error=without(delta - truth.delta, open_modes),
+        delta_error=truth.errors(delta),
         sigma=sigma,
         phi=phi,
         phi_error=without(away[None], turns[:, None]).ravel(),

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from comparators import alternating
+from comparators.measure import read_cube
 from pixcal.effects import parse_effects
 from pixcal.effects.ipc import Ipc
 from pixcal.kernels.crosstalk import Coupling
@@ -16,9 +17,10 @@ from pixcal.report.colours import BLUE, GREY, INK, RED
 from pixcal.report.drawing import WIDE, finish, new_figure, png, symmetric_scale
 from pixcal.report.text import number
 from reproduction.draw import THOUSANDTHS, image
-from reproduction.lab import Lab, Scene, facts, nominal_vector, read_cube, read_set
-from reproduction.maps import harmonics, plane, teeth, without
+from reproduction.lab import Lab, Scene, facts, nominal_vector, read_set
+from reproduction.maps import teeth, without
 from reproduction.outcome import Outcome, Row
+from truth import PLANE
 
 F64 = NDArray[np.float64]
 
@@ -107,14 +109,12 @@ def measure(scene: Scene, name: str, delta: F64, *, free: bool) -> Teeth:
     truth, couplings = scene.truth(name), couplings_of(scene)
     period = period_of(couplings)
     kernel = predicted_teeth(couplings, truth.vector)
-    every = np.concatenate([plane(delta.shape), harmonics(delta.shape, truth.vector)])
-    modes = every if free else plane(delta.shape)
-    error = without(delta - truth.delta, modes)
-    found = teeth(error, period)
+    modes = truth.modes(None if free else PLANE)
+    found = teeth(without(delta - truth.delta, modes), period)
     pattern = np.broadcast_to(np.resize(kernel, len(delta))[:, None], delta.shape)
     expected = teeth(without(pattern, modes), period)
     inner = (slice(2, -2), slice(2, -2))
-    rest = float(np.nanstd(without(delta - truth.delta - pattern, every)[inner]))
+    rest = float(np.nanstd(truth.errors(delta - pattern)[inner]))
     pixels = np.isfinite(delta[inner]).sum() / period
     return Teeth(delta, kernel, found, expected, rest / float(np.sqrt(pixels)), rest)
 

@@ -15,16 +15,14 @@ from pixcal.report.colours import BLUE, GREY, RED
 from pixcal.report.drawing import WIDE, finish, new_figure, png, symmetric_scale
 from pixcal.report.text import number, with_error
 from reproduction.draw import THOUSANDTHS, image
-from reproduction.figure_12 import couplings_of, period_of, predicted_teeth
-from reproduction.lab import Lab, Scene, facts, nominal_vector, read_cube, read_set
-from reproduction.maps import Crest, harmonics, plane, sloping_harmonics, teeth, without
+from reproduction.figure_12 import OFFSET, SETS, by_paper, couplings_of, period_of, predicted_teeth
+from reproduction.lab import Lab, Scene, facts, read_set
+from reproduction.maps import Crest, sloping_harmonics, teeth, without
 from reproduction.outcome import Outcome, Row
 
 F64 = NDArray[np.float64]
 
 QUICK_NOISY, QUICK_CLEAN = 100, 50
-SETS = ("horizontal", "vertical")
-OFFSET = {"horizontal": "δy", "vertical": "δx"}
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,6 @@ def measure(scene: Scene) -> dict[str, Bent]:
         kx, ky = truth.vector
         crest = Crest.of(straight[name] - truth.delta)
         middle = ((nx - 1) / 2 * g.pitch, (ny - 1) / 2 * g.pitch)
-        modes = np.concatenate([plane((ny, nx)), harmonics((ny, nx), (kx, ky))])
         shape = told["geometry"]
         found[name] = Bent(
             straight[name],
@@ -78,7 +75,7 @@ def measure(scene: Scene) -> dict[str, Bent]:
             ),
             fitted_sigma=tuple(shape.get(f"centre_{a}_sigma_mm", np.nan) for a in "xy"),
             model=told["model"],
-            error=float(np.nanstd(without(auto - truth.delta, modes))),
+            error=float(np.nanstd(truth.errors(auto))),
         )
     return found
 
@@ -101,10 +98,9 @@ class Mixed:
 
 def mixture(scene: Scene, name: str) -> Mixed:
     """Crosstalk, moving fringes and their curvature in one map."""
-    run, truth, couplings = scene.fit(), scene.truth(name), couplings_of(scene)
-    psi = alternating.fit_phases(read_cube(run, name), nominal_vector(run, name), constant=True)
-    delta, (auto,) = truth.offsets(psi), read_set(run, name, "delta")
-    crest = Crest.of(delta - truth.delta)
+    truth, couplings = scene.truth(name), couplings_of(scene)
+    delta = by_paper(scene, name, alternating.ITERATIONS)
+    (auto,) = read_set(scene.fit(), name, "delta")
     return Mixed(
         delta,
         auto,
@@ -114,7 +110,7 @@ def mixture(scene: Scene, name: str) -> Mixed:
         expected_teeth=float(np.ptp(predicted_teeth(couplings, truth.vector))),
         fringes=fringes_left(delta - truth.delta, truth.vector),
         auto_fringes=fringes_left(auto - truth.delta, truth.vector),
-        crest=crest,
+        crest=Crest.of(delta - truth.delta),
     )
 
 
@@ -132,9 +128,8 @@ def causes(lab: Lab, bench: Bench, name: str) -> dict[str, float]:
     found = {}
     for cause, one in alone.items():
         scene = lab.scene(f"figure-14-{cause}", one)
-        run, truth = scene.reduced(), scene.truth(name)
-        psi = alternating.fit_phases(read_cube(run, name), nominal_vector(run, name), constant=True)
-        found[cause] = fringes_left(truth.offsets(psi) - truth.delta, truth.vector)
+        truth, delta = scene.truth(name), by_paper(scene, name, alternating.ITERATIONS)
+        found[cause] = fringes_left(delta - truth.delta, truth.vector)
     return found
 
 

@@ -119,17 +119,6 @@ def facts(run: Path, name: str) -> dict[str, Any]:
     return found
 
 
-def read_cube(run: Path, name: str) -> F64:
-    """Electrons (t, y, x) of a reduced set."""
-    stored = ArrayReader(run / "reduce" / "reduced.zarr" / name / "signal")
-    cube = stored.read().astype(np.float64)
-    if (cube == stored.attrs["_FillValue"]).any():
-        raise ValueError(f"{run}: samples of {name} are missing; take a bench that does not clip")
-    cube *= stored.attrs["scale_factor"]
-    cube += stored.attrs["add_offset"]
-    return cube
-
-
 def nominal_vector(run: Path, name: str) -> tuple[float, float]:
     """Fringe vector (kx, ky) that the acquisition declares, rad/px."""
     return declared_vector(load_run(run), name)

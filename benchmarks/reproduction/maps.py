@@ -5,27 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from truth import harmonics, plane, without
+
 F64 = NDArray[np.float64]
-
-
-def without(values: F64, basis: F64) -> F64:
-    """A map (y, x) less what the modes (mode, y, x) explain of it; NaN stay NaN."""
-    good = np.isfinite(values)
-    found = np.linalg.lstsq(basis[:, good].T, values[good], rcond=None)[0]
-    return np.asarray(values - np.tensordot(found, basis, 1))
-
-
-def plane(shape: tuple[int, int]) -> F64:
-    """Piston and slopes (3, y, x)."""
-    y, x = np.indices(shape)
-    return np.stack([np.ones(shape), x / shape[1] - 0.5, y / shape[0] - 0.5])
-
-
-def harmonics(shape: tuple[int, int], vector: tuple[float, float]) -> F64:
-    """The fringe and its second harmonic, cosine and sine each (4, y, x)."""
-    y, x = np.indices(shape)
-    psi = vector[0] * x + vector[1] * y
-    return np.stack([np.cos(psi), np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)])
 
 
 def sloping_harmonics(shape: tuple[int, int], vector: tuple[float, float]) -> F64:

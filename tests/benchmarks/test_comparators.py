@@ -216,7 +216,7 @@ def task(
 
 
 def test_the_cube_is_read_in_electrons(task: tuple[measure.Task, SimpleNamespace]) -> None:
-    cube = measure.read_cube(task[0])
+    cube = measure.read_cube(task[0].run, "vertical")
     expected, _ = task[1].electrons("vertical")
     assert cube.shape == expected.shape
     pull = (cube - expected) / np.sqrt(expected + task[1].read_noise ** 2)
@@ -230,7 +230,7 @@ def test_missing_samples_are_refused(
     bench = make_bench(shape=(11, 13), frames=20, sets={"vertical": (6.0, 0.0)}, level=60_000.0)
     run = write_reduced(bench, tmp_path / "run")
     with pytest.raises(ValueError, match="samples are missing"):
-        measure.read_cube(measure.Task(run, "vertical", (1.2, 0.0), 16.0, 10))
+        measure.read_cube(run, "vertical")
 
 
 @pytest.mark.parametrize("method", [m for m in measure.METHODS if m != measure.PIXCAL])

@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from comparators.measure import read_cube
 from pixcal.effects import parse_effects
 from pixcal.engine.run import Runtime
 from pixcal.kernels.optics import interfringe, paraxial_vector
 from pixcal.kernels.scene import geometry
 from pixcal.model.bench import Bench, load_bench
 from reproduction import figure_05, figure_09, figure_10, figure_11, figure_12, figure_14, figure_16
-from reproduction.lab import CONFIGS, Lab, Scene, read_cube, resized
+from reproduction.lab import CONFIGS, Lab, Scene, resized
 from reproduction.maps import Whiteness
 
 INTERFRINGES = {
