@@ -82,12 +82,13 @@ def fit_levels(curve: TransferCurve, times: F64, flat: F64) -> LadderCurve | Non
     # One knot beyond the highest level: a natural spline has no curvature at its end, knees do.
     above = max(2 * curve.levels[-1] - curve.levels[-2], float(signal.max()))
     knots = np.concatenate([[0.0], curve.levels, [above]])
-    # Signals up to the lowest level are straight: their slope is part of the gain.
-    unit = LOOSE * knots[2:]
+    # Signals up to the second level are straight: a line through two levels is known by the gain
+    # and the offset of exposure times, and no curve that is a line beyond them is told from it.
+    unit = LOOSE * knots[3:]
 
     def rest(sizes: F64) -> F64:
         gain, rate, offset = sizes[:3] * _GAIN
-        change = CubicSpline(knots, [0.0, 0.0, *sizes[3:] * unit], bc_type="natural")
+        change = CubicSpline(knots, [0.0, 0.0, 0.0, *sizes[3:] * unit], bc_type="natural")
         charge, slope = signal - change(signal), 1 / (1 - change(signal, 1))
         share = (1 + gain) * (slope**2 * charge).mean(axis=1) / curve.levels
         line = (1 + rate) * curve.top * times / times[-1] + offset * curve.levels[0]
@@ -96,9 +97,9 @@ def fit_levels(curve: TransferCurve, times: F64, flat: F64) -> LadderCurve | Non
             [(curve.shares - share) / curve.errors, of_lamp, sizes[:1], sizes[3:]]
         )
 
-    fit = least_squares(rest, np.zeros(n + 3))
+    fit = least_squares(rest, np.zeros(n + 2))
     if sigmas_of_chi2(float(fit.fun[: 2 * n] @ fit.fun[: 2 * n]), n) > SIGNIFICANT:
         return None
-    change = np.append(0.0, unit * fit.x[3:])
+    change = np.concatenate([[0.0, 0.0], unit * fit.x[3:]])
     errors = np.linalg.cholesky(np.linalg.inv(fit.jac.T @ fit.jac)[3:, 3:])
-    return LadderCurve(knots[1:] - change, change, np.pad(unit[:, None] * errors, ((1, 0), (0, 0))))
+    return LadderCurve(knots[1:] - change, change, np.pad(unit[:, None] * errors, ((2, 0), (0, 0))))
