@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pixcal.estimators.detector.straightness import LAMP, RATES
 from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack, cached_on_evidence
 from pixcal.kernels.robust import robust_sigma
@@ -18,9 +19,7 @@ from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 
 MIN_STEPS = 3  # fewest levels of flats that separate a curve from a line
-LAMP = 1e-3  # least relative error of the light of a flat, exposure time included
 STEADY = 0.1  # relative rms of levels about the curve above which the lamp was changed
-RATES = 1.3  # largest ratio of light per second among few levels of one lamp
 OFF = 8.0  # typical distances from the curve beyond which a level has another lamp setting
 DISAGREE = 4.0  # errors between the curvature of levels and of their noise
 

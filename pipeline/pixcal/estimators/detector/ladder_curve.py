@@ -12,7 +12,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from pixcal.estimators.detector.flat_ladder import LAMP, Ladder, straight_line, unproven_ladder
+from pixcal.estimators.detector.flat_ladder import Ladder, straight_line, unproven_ladder
+from pixcal.estimators.detector.straightness import LAMP
 from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2

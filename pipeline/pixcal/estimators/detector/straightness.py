@@ -17,7 +17,7 @@ from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import F64, Mask
 
 LAMP = 1e-3  # least relative error of the light of a flat, exposure time included
-CHANGED = 0.3  # relative change of light per second that shows that flats are not of one lamp
+RATES = 1.3  # largest ratio of light per second among levels of one lamp
 _BENT = 0.02  # largest deviation from a line with an offset in exposure time that one lamp gives
 SURE = 5.0  # errors from which a lamp or a response is told
 _DEGREE = 6  # highest of the polynomial of the lamp's light in time
@@ -25,6 +25,9 @@ _DETERMINED = 1e10  # condition of its normal equations
 # least width of the residuals of rounded times, over that of their distribution, and least share of
 # it that no curve in level explains
 _FILLED, _ROUGH = 0.2, 0.3
+# scatter of times about the line over that of a lamp about it, up to which rounding is likelier:
+# few lamps scatter from level to level and not from frame to frame
+_ALIKE = 1.5
 _NOISE = 5e-3  # least relative error of the noise of a level
 _ORDERED = 0.9  # correlation of exposure time and time of recording that a drift can mimic
 
@@ -95,7 +98,7 @@ def straightness(
 
 def _one_lamp(rates: F64, line: Linearity) -> bool:
     """Whether light per second can be of one lamp, perhaps with exposures longer than stated."""
-    alike = bool(rates.max() < (1 + CHANGED) * rates.min())
+    alike = bool(rates.max() < RATES * rates.min())
     return alike or (np.isfinite(line.late[1]) and line.max_deviation < _BENT)
 
 
@@ -261,13 +264,17 @@ def _rounded_to(times: F64, levels: F64) -> float:
     share = (levels[middle] - levels[low]) / (levels[high] - levels[low])
     furthest = np.abs(times[middle] - times[low] - share * (times[high] - times[low])).max() / 2
 
-    def scatter(degree: int) -> float:
-        rest = times - np.polyval(np.polyfit(levels, times, degree), levels)
-        return float(np.sqrt(rest @ rest / (len(times) - degree - 1)))
+    def width(degree: int, unit: F64) -> float:
+        """Of distances from a curve in a unit (n,), which has one size for all."""
+        rest = (times - np.polyval(np.polyfit(levels, times, degree, w=1 / unit), levels)) / unit
+        scale = float(np.exp(np.log(unit).mean()))
+        return scale * float(np.linalg.norm(rest)) / float(np.sqrt(len(times) - degree - 1))
 
-    width = scatter(1)
-    even = width > _FILLED * step / np.sqrt(12) and scatter(2) > _ROUGH * width
-    return step if even and furthest <= step / 2 else 0.0
+    line, same = width(1, np.ones_like(times)), np.ones_like(times)
+    even = line > _FILLED * step / np.sqrt(12) and width(2, same) > _ROUGH * line
+    # A lamp that scatters is off by shares of the time.
+    alike = line < _ALIKE * width(1, times)
+    return step if even and alike and furthest <= step / 2 else 0.0
 
 
 def _may_drift(levels: Sequence[Level]) -> bool:

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pixcal.estimators.detector.flat_ladder import LAMP, flicker, ladder, rise_of, straight_line
+from pixcal.estimators.detector.flat_ladder import flicker, ladder, rise_of, straight_line
+from pixcal.estimators.detector.straightness import LAMP
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.gain_fit import LADDER
 from pixcal.kernels.photon_transfer import LAGS, pair_statistics

@@ -139,7 +139,7 @@ def _linearity_warnings(summary: Summary) -> list[str]:
         )
     if found.rounded:
         said.append(
-            f"the exposure times of the flats are rounded to {found.rounded:g} s: the levels "
+            f"the exposure times of the flats seem rounded to {found.rounded:g} s: the levels "
             f"deviate by up to {off} from a straight line over them, by less than half of that "
             "step, and their noise does not follow; the linearity error allows for it. Write the "
             "true times into the headers, or expose for whole multiples of the step" + unflagged
