@@ -138,8 +138,10 @@ def _apart(times: F64, deviation: F64) -> float:
 def _drift(levels: Sequence[Level]) -> list[list[F64]] | None:
     """Light (t,) of the lamp in each level, and with each independent error added; None if steady.
 
-    From frames of the same exposure time, without the first of each level, which lag may dim.
+    From frames of the same exposure time, without the first of each level, which lag may dim;
+    pairs count whole where a level is repeated, which tells more than they do.
     """
+    repeated = len({one.exptime for one in levels}) < len(levels)
     every = np.concatenate([one.time for one in levels])
     if not np.ptp(every) > 0:
         return None
@@ -148,10 +150,11 @@ def _drift(levels: Sequence[Level]) -> list[list[F64]] | None:
     design, value = [np.zeros((0, _DEGREE))], [np.zeros(0)]
     for t in {one.exptime for one in levels if one.usable}:
         own = [n for n, one in enumerate(levels) if one.exptime == t and one.usable]
-        light = np.concatenate([levels[n].light[1:] for n in own])
+        rest = [slice(int(len(levels[n].light) > 2 or not repeated), None) for n in own]
+        light = np.concatenate([levels[n].light[one] for n, one in zip(own, rest, strict=True)])
         if len(light) < 2 or light.mean() <= 0:
             continue
-        terms = np.concatenate([powers[n][1:] for n in own])
+        terms = np.concatenate([powers[n][one] for n, one in zip(own, rest, strict=True)])
         # Photon noise falls with the root of the light.
         weight = np.sqrt(light.mean())
         design.append(weight * (terms - terms.mean(axis=0)))
