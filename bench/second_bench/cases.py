@@ -42,7 +42,7 @@ def make_case(
             bench.notes[run.name]["phases"] = "random"
     effects = []
     for law, size in chosen:
-        parameters = law.apply(bench, size, stream(seed, "effect", law.effect))
+        parameters = law.apply(bench, size, stream(seed, "effect", law.effect)) or {}
         effects.append(
             {
                 "effect": law.effect,

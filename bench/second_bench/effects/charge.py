@@ -5,10 +5,8 @@ from typing import Any
 import galsim
 import numpy as np
 
-from second_bench.effects.law import law
+from second_bench.effects.law import Drawn, law
 from second_bench.model import F64, Bench, Frame, Step
-
-_Drawn = dict[str, Any]
 
 
 def coupled(e: F64, kernel: F64) -> F64:
@@ -21,7 +19,7 @@ def coupled(e: F64, kernel: F64) -> F64:
     return np.asarray(image.array)
 
 
-def _given(kernel: F64) -> _Drawn:
+def _given(kernel: F64) -> Drawn:
     """Shares (y, x) that a pixel gives to its neighbours, from a kernel of received shares."""
     return {"kernel": kernel[::-1, ::-1].tolist()}
 
@@ -37,7 +35,7 @@ def _kernel(sides: F64, corners: F64) -> F64:
 
 
 @law("ipc", "symmetric", 1.5e-3, 0.02, "to each next pixel")
-def symmetric(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def symmetric(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Capacitances between neighbours, and about a tenth of them between diagonal ones."""
     kernel = _kernel(np.full(4, size), np.full(4, size * rng.uniform(0.05, 0.15)))
     bench.signal.append(lambda e, _: coupled(e, kernel))
@@ -45,7 +43,7 @@ def symmetric(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 @law("ipc", "asymmetric", 1.5e-3, 0.02, "to the next pixel, the largest")
-def asymmetric(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def asymmetric(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Each direction has its own share; wiring couples one way as well."""
     sides = size * rng.uniform(0.1, 1, 4)
     sides *= size / sides.max()
@@ -55,7 +53,7 @@ def asymmetric(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 @law("ipc", "four_rows", 3e-3, 0.03, "to the next row, the largest")
-def four_rows(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def four_rows(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Readout lines shared by groups of four rows: coupling differs from row to row."""
     rows = np.arange(bench.shape[0]) % 4
     up, down, across = rng.uniform(0, 1, (3, 4)) * np.array([[1], [1], [0.25]])
@@ -96,14 +94,13 @@ def _left_behind(shares: F64, frames: F64) -> Step:
 
 
 @law("lag", "linear", 2e-4, 0.02, "of the last frame", varied_phases=True)
-def linear_lag(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def linear_lag(bench: Bench, size: float, rng: np.random.Generator) -> None:
     """All remaining charge appears in the next frame."""
     bench.charge.append(_left_behind(np.array([size]), np.array([1e-9])))
-    return {}
 
 
 @law("lag", "exponentials", 4e-4, 0.02, "of a frame, in all", varied_phases=True)
-def exponentials(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def exponentials(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Two kinds of traps."""
     share = float(rng.uniform(0.3, 0.7))
     frames = np.array([rng.uniform(0.5, 1.5), rng.uniform(4, 15)])
@@ -112,7 +109,7 @@ def exponentials(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 @law("lag", "traps", 20, 800, "e- that traps hold", varied_phases=True, needs="pyxel")
-def traps(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def traps(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Traps of limited capacity, by Pyxel's model of persistence."""
     from pyxel.models.charge_collection.utils_persistence import compute_simple_persistence
 
@@ -146,7 +143,7 @@ def _deflecting(model: Any) -> Step:
 
 
 @law("brighter_fatter", "power_law", 5e-8, 6e-7, "px/e- of the next border")
-def power_law(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def power_law(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Shifts of borders by charge, a power law of distance (Antilogus et al. 2014)."""
     across, alpha = float(rng.uniform(0.6, 1.4)), float(rng.uniform(1.8, 3))
     far = size * 0.2
@@ -158,7 +155,7 @@ def power_law(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 @law("brighter_fatter", "table", 5e-8, 6e-7, "px/e- of the next border")
-def table(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def table(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Coefficients as measured: no power law, with individual scatter (Gruen et al. 2015).
 
     A border belongs to two pixels, so both have the same coefficient for the same charge.

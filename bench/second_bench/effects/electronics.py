@@ -1,36 +1,31 @@
 """Readout: noise of lines, drifting levels, telegraph noise and converters."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from second_bench.effects.fringes import SLOW
-from second_bench.effects.law import Apply, law
+from second_bench.effects.law import Drawn, law
 from second_bench.model import F64, Bench, Frame, Run, stream
 
-_Drawn = dict[str, Any]
 
-
-def _lines(axis: int) -> Apply:
+def _lines(bench: Bench, size: float, rng: np.random.Generator, *, axis: int) -> None:
     """Every row (axis 0) or column of every frame has an offset."""
 
-    def applies(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-        def adds(e: F64, frame: Frame) -> F64:
-            one: F64 = frame.rng.standard_normal((e.shape[0], 1) if axis == 0 else (1, e.shape[1]))
-            return e + size * one
+    def adds(e: F64, frame: Frame) -> F64:
+        one: F64 = frame.rng.standard_normal((e.shape[0], 1) if axis == 0 else (1, e.shape[1]))
+        return e + size * one
 
-        bench.offset.append(adds)
-        return {}
-
-    return applies
+    bench.offset.append(adds)
 
 
 for _axis, _name in enumerate(("rows", "columns")):
-    law("row_noise", _name, 0.5, 10, "e- rms")(_lines(_axis))
+    law("row_noise", _name, 0.5, 10, "e- rms")(partial(_lines, axis=_axis))
 
 
 @law("row_noise", "correlated", 0.5, 10, "e- rms")
-def correlated(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def correlated(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """The reference drifts during readout, so noise of neighbouring rows is correlated."""
     kept = float(rng.uniform(0.4, 0.85))
 
@@ -46,22 +41,18 @@ def correlated(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     return {"correlation": kept}
 
 
-def _drifting(course: str) -> Apply:
-    def drifts(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-        for run in bench.runs:
-            moved = size * rng.uniform(0.7, 1.3) * SLOW[course](run.frames, rng)
-            run.level_e = run.level_e + moved
-        return {}
-
-    return drifts
+def _drifts(bench: Bench, size: float, rng: np.random.Generator, *, course: str) -> None:
+    for run in bench.runs:
+        moved = size * rng.uniform(0.7, 1.3) * SLOW[course](run.frames, rng)
+        run.level_e = run.level_e + moved
 
 
 for _course in SLOW:
-    law("bias_drift", _course, 2, 80, "e- over each run")(_drifting(_course))
+    law("bias_drift", _course, 2, 80, "e- over each run")(partial(_drifts, course=_course))
 
 
 @law("bias_drift", "night", 4, 120, "e- over the night")
-def night(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def night(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Warming-up through all runs."""
     end = max(run.start_s + run.frames * bench.period_s for run in bench.runs)
     scale = float(rng.uniform(0.3, 2)) * end
@@ -107,7 +98,7 @@ def _telegraph(
 
 
 @law("telegraph_noise", "population", 15, 250, "e-, the median")
-def population(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def population(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Amplitudes over a decade, dwell times over more, unequal in the two levels."""
     share = float(np.exp(rng.uniform(np.log(0.005), np.log(0.04))))
     _telegraph(bench, share, lambda n: size * np.exp(rng.uniform(-1.15, 1.15, n)), rng)
@@ -115,7 +106,7 @@ def population(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 @law("telegraph_noise", "exponential", 15, 250, "e-, the mean")
-def exponential(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def exponential(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Exponentially distributed amplitudes, as in MOS transistors (Wang et al. 2006)."""
     share = float(np.exp(rng.uniform(np.log(0.005), np.log(0.04))))
     _telegraph(bench, share, lambda n: rng.exponential(size, n), rng)
@@ -123,16 +114,17 @@ def exponential(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 @law("telegraph_noise", "spikes", 40, 400, "e-, the median")
-def spikes(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def spikes(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Pixels that are in the upper level for a small part of the time."""
     share, high = (float(np.exp(rng.uniform(*np.log(r)))) for r in ((0.005, 0.04), (0.03, 0.15)))
     _telegraph(bench, share, lambda n: size * np.exp(rng.uniform(-0.6, 0.6, n)), rng, high)
     return {"share": share, "high": high}
 
 
-def _coarse(bench: Bench, rng: np.random.Generator) -> None:
+def _coarse(bench: Bench, rng: np.random.Generator) -> Drawn:
     """A converter of about 12 bits with steps similar to the noise."""
     bench.coarsen(float(rng.uniform(8, 30)) / bench.gain_e_per_adu)
+    return {"gain_e_per_adu": bench.gain_e_per_adu}
 
 
 def _codes(bench: Bench) -> int:
@@ -140,9 +132,9 @@ def _codes(bench: Bench) -> int:
 
 
 @law("quantisation", "missing", 0.02, 0.3, "of the codes")
-def missing(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def missing(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Codes that never occur and are replaced by the next one."""
-    _coarse(bench, rng)
+    drawn = _coarse(bench, rng)
     there = rng.random(_codes(bench)) >= size
     there[-1] = True
     following = np.flatnonzero(there)
@@ -152,23 +144,23 @@ def missing(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
         return np.asarray(code[np.clip(np.rint(adu), 0, len(code) - 1).astype(int)])
 
     bench.samples.append(converts)
-    return {"gain_e_per_adu": bench.gain_e_per_adu}
+    return drawn
 
 
 @law("quantisation", "steps", 0.05, 0.6, "codes rms")
-def steps(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def steps(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Displaced thresholds, as in a flash or ramp converter."""
-    _coarse(bench, rng)
+    drawn = _coarse(bench, rng)
     count = _codes(bench)
     thresholds = np.sort(np.arange(1, count) - 0.5 + rng.normal(0, size, count - 1))
     bench.samples.append(lambda adu, _: np.searchsorted(thresholds, adu).astype(float))
-    return {"gain_e_per_adu": bench.gain_e_per_adu}
+    return drawn
 
 
 @law("quantisation", "weights", 5e-4, 0.01, "rms of a bit's weight")
-def weights(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def weights(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Successive approximation with inaccurate references."""
-    _coarse(bench, rng)
+    drawn = _coarse(bench, rng)
     bits = int(np.ceil(np.log2(_codes(bench))))
     true = 2.0 ** np.arange(bits) * (1 + size * rng.standard_normal(bits))
 
@@ -181,13 +173,13 @@ def weights(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
         return code
 
     bench.samples.append(converts)
-    return {"gain_e_per_adu": bench.gain_e_per_adu, "weights": true.tolist()}
+    return drawn | {"weights": true.tolist()}
 
 
 @law("quantisation", "levels", 5e-4, 0.01, "rms of a bit's weight")
-def levels(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def levels(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """The nearest of the levels of inaccurate weights."""
-    _coarse(bench, rng)
+    drawn = _coarse(bench, rng)
     codes = np.arange(_codes(bench))
     bits = int(np.ceil(np.log2(len(codes))))
     true = 2.0 ** np.arange(bits) * (1 + size * rng.standard_normal(bits))
@@ -195,16 +187,16 @@ def levels(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     order = np.argsort(level, kind="stable")
     between = (level[order][1:] + level[order][:-1]) / 2
     bench.samples.append(lambda adu, _: order[np.searchsorted(between, adu)].astype(float))
-    return {"gain_e_per_adu": bench.gain_e_per_adu, "weights": true.tolist()}
+    return drawn | {"weights": true.tolist()}
 
 
 @law("quantisation", "references", 0.1, 1.0, "codes rms")
-def references(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def references(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Coarse steps between independently inaccurate references, with uniform fine steps."""
-    _coarse(bench, rng)
+    drawn = _coarse(bench, rng)
     fine = 2 ** int(rng.integers(4, 7))
     count = _codes(bench)
     off = np.repeat(rng.normal(0, size, count // fine + 1), fine)[: count - 1]
     thresholds = np.maximum.accumulate(np.arange(1, count) - 0.5 + off)
     bench.samples.append(lambda adu, _: np.searchsorted(thresholds, adu).astype(float))
-    return {"gain_e_per_adu": bench.gain_e_per_adu, "fine": fine}
+    return drawn | {"fine": fine}

@@ -1,17 +1,15 @@
 """Errors of the shape, position or phase of fringes."""
 
-from typing import Any
+from functools import partial
 
 import numpy as np
 
-from second_bench.effects.law import Apply, law
+from second_bench.effects.law import Drawn, law
 from second_bench.model import F64, Bench, Run
-
-_Drawn = dict[str, Any]
 
 
 @law("hyperbolic_fringes", "foot", 4, 20, "mm")
-def foot(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def foot(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Fibre pairs offset from the detector's axis, differently for each set."""
     drawn = {}
     for one in bench.sets:
@@ -24,7 +22,7 @@ def foot(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 @law("hyperbolic_fringes", "depth", 0.1, 0.6, "mm")
-def depth(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def depth(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """One tip behind the other: fringes are sections of rings far from their centre."""
     drawn = {}
     for one in bench.sets:
@@ -46,15 +44,14 @@ def _directions(rng: np.random.Generator) -> F64:
 
 
 @law("fringe_jitter", "white", 0.05, 0.8, "um rms of a tip")
-def white(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def white(bench: Bench, size: float, rng: np.random.Generator) -> None:
     """White vibration of a tip in both directions."""
     for run in bench.fringe_runs():
         run.tilt = run.tilt + _tilt(bench, size * rng.standard_normal((run.frames, 2)))
-    return {}
 
 
 @law("fringe_jitter", "resonance", 0.05, 0.8, "um rms of a tip")
-def resonance(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def resonance(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """A resonance of the mount in one direction, sampled far below its frequency."""
     hertz = float(rng.uniform(20, 90))
     for run in bench.fringe_runs():
@@ -65,12 +62,11 @@ def resonance(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 @law("fringe_jitter", "knocks", 0.05, 0.8, "um rms of a tip")
-def knocks(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def knocks(bench: Bench, size: float, rng: np.random.Generator) -> None:
     """Rare large excursions among small ones."""
     for run in bench.fringe_runs():
         moved = rng.standard_t(3, (run.frames, 2)) / np.sqrt(3)
         run.tilt = run.tilt + _tilt(bench, size * moved)
-    return {}
 
 
 def _ramp(n: int, rng: np.random.Generator) -> F64:
@@ -90,18 +86,16 @@ SLOW = {"ramp": _ramp, "walk": _walk, "settling": _settling}
 """Slow courses of a run, with a range of about one."""
 
 
-def _drifting(course: str) -> Apply:
-    def drifts(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-        for run in bench.fringe_runs():
-            moved = size * rng.uniform(0.7, 1.3) * SLOW[course](run.frames, rng)
-            run.tilt = run.tilt + _tilt(bench, moved[:, None] * _directions(rng))
-        return {}
-
-    return drifts
+def _drifts(bench: Bench, size: float, rng: np.random.Generator, *, course: str) -> None:
+    for run in bench.fringe_runs():
+        moved = size * rng.uniform(0.7, 1.3) * SLOW[course](run.frames, rng)
+        run.tilt = run.tilt + _tilt(bench, moved[:, None] * _directions(rng))
 
 
 for _course in SLOW:
-    law("fringe_drift", _course, 0.15, 4, "um of a tip over a run")(_drifting(_course))
+    law("fringe_drift", _course, 0.15, 4, "um of a tip over a run")(
+        partial(_drifts, course=_course)
+    )
 
 
 def _steps(run: Run) -> F64:
@@ -111,7 +105,7 @@ def _steps(run: Run) -> F64:
 
 
 @law("rolling_shutter", "exponential", 0.004, 0.08, "of the step", varied_phases=True)
-def settles(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def settles(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Rows that are read first include the end of the modulator's step."""
     rows = np.arange(bench.shape[0]) / bench.shape[0]
     scale = float(rng.uniform(0.15, 1))
@@ -121,7 +115,7 @@ def settles(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 @law("rolling_shutter", "ringing", 0.004, 0.08, "of the step", varied_phases=True)
-def rings(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def rings(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """The modulator overshoots, with damped ringing."""
     rows = np.arange(bench.shape[0]) / bench.shape[0]
     scale, turns = float(rng.uniform(0.3, 1)), float(rng.uniform(0.5, 2))
@@ -132,9 +126,8 @@ def rings(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 @law("rolling_shutter", "linear", 0.004, 0.08, "of the step", varied_phases=True)
-def creeps(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def creeps(bench: Bench, size: float, rng: np.random.Generator) -> None:
     """The modulator creeps at a constant rate until the last row is read."""
     rows = np.arange(bench.shape[0]) / bench.shape[0]
     for run in bench.fringe_runs():
         run.row_phase = run.row_phase - size * _steps(run)[:, None] * (1 - rows)
-    return {}

@@ -8,7 +8,8 @@ import numpy as np
 
 from second_bench.model import Bench
 
-Apply = Callable[[Bench, float, np.random.Generator], dict[str, Any]]
+Drawn = dict[str, Any]
+Apply = Callable[[Bench, float, np.random.Generator], Drawn | None]
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Law:
     weak: float  # weak, strong: sizes at strengths 0 and 1
     strong: float
     unit: str  # of the size
-    apply: Apply  # changes a bench by a size; returns further drawn values
+    apply: Apply  # changes a bench by a size; returns further drawn values, if any
     known: bool = True  # whether pixcal has this effect
     decidable: bool = True  # whether frames of the bench can show it at all
     varied_phases: bool = False  # whether it shows only if phase steps differ from frame to frame

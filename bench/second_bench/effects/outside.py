@@ -1,13 +1,9 @@
 """Effects that pixcal does not have: the right answer is an unexplained gap."""
 
-from typing import Any
-
 import numpy as np
 
-from second_bench.effects.law import law
+from second_bench.effects.law import Drawn, law
 from second_bench.model import F64, Bench, Frame
-
-_Drawn = dict[str, Any]
 
 
 @law(
@@ -19,7 +15,7 @@ _Drawn = dict[str, Any]
     known=False,
     needs="pyxel",
 )
-def charge_transfer(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def charge_transfer(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Charge captured by traps during its transfer to the output, and released later.
 
     By Pyxel's model of distortion (Short et al. 2013): the tail grows with the number of transfers,
@@ -52,7 +48,7 @@ def charge_transfer(bench: Bench, size: float, rng: np.random.Generator) -> _Dra
 
 
 @law("modulated_glow", "corner", 8, 400, "e- at the corner", known=False)
-def modulated_glow(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def modulated_glow(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Stray light of the modulator's driver, bright at high voltage."""
     x, y = bench.grid()
     ny, nx = bench.shape
@@ -70,7 +66,7 @@ def modulated_glow(bench: Bench, size: float, rng: np.random.Generator) -> _Draw
 
 
 @law("pickup", "tone", 1, 25, "e- amplitude")
-def pickup(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def pickup(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """A tone of a power supply, sampled as pixels are read one after the other."""
     ny, nx = bench.shape
     turns = float(np.exp(rng.uniform(np.log(0.003), np.log(0.3))))
@@ -85,18 +81,17 @@ def pickup(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 @law("pixel_nonlinearity", "quadratic", 1e-3, 0.015, "rms at the peak", known=False)
-def pixel_nonlinearity(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def pixel_nonlinearity(bench: Bench, size: float, rng: np.random.Generator) -> None:
     """Individual nonlinearity of pixels, zero on average."""
     own = size * rng.standard_normal(bench.shape)
     own -= own.mean()
     bench.signal.append(lambda e, _: e * (1 - own * e / bench.peak_e))
-    return {}
 
 
 @law(
     "mirror_crosstalk", "halves", 3e-4, 0.01, "of the mirrored pixel", known=False, decidable=False
 )
-def mirror_crosstalk(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def mirror_crosstalk(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Coupling of two outputs that are read simultaneously, from both sides inwards.
 
     The mirrored fringes add harmonics of the fringe, which a fit with free intensities absorbs.

@@ -1,14 +1,11 @@
 """Particles that cross the detector."""
 
-from typing import Any
-
 import numpy as np
 from scipy.stats import moyal
 
-from second_bench.effects.law import law
+from second_bench.effects.law import Drawn, law
 from second_bench.model import F64, Bench, Frame
 
-_Drawn = dict[str, Any]
 PAIRS_PER_UM = 80.0
 """Electrons that a minimum-ionising particle frees in silicon."""
 DEPTH_UM = 8.0
@@ -23,7 +20,7 @@ def _deposit(e: F64, x_um: F64, y_um: F64, charge: F64, pitch_um: float) -> None
 
 
 @law("cosmic_hits", "tracks", 0.05, 15, "a frame")
-def tracks(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def tracks(bench: Bench, size: float, rng: np.random.Generator) -> None:
     """Muons from above: straight tracks through the sensitive layer, energies after Landau."""
     ny, nx = bench.shape
 
@@ -43,11 +40,10 @@ def tracks(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
         return out
 
     bench.charge.append(hits)
-    return {}
 
 
 @law("cosmic_hits", "spots", 0.05, 15, "a frame")
-def spots(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def spots(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Radioactivity of the glass: short-ranged electrons, charge in a few pixels."""
     ny, nx = bench.shape
     typical = float(rng.uniform(1000, 6000))

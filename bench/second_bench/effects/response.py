@@ -1,32 +1,26 @@
 """Response: nonlinearity, and errors of flats."""
 
-from typing import Any
-
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from second_bench.effects.law import law
+from second_bench.effects.law import Drawn, law
 from second_bench.model import F64, Bench, Frame
-
-_Drawn = dict[str, Any]
 
 
 @law("nonlinearity", "quadratic", 1e-3, 0.03, "at the peak")
-def quadratic(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def quadratic(bench: Bench, size: float, rng: np.random.Generator) -> None:
     """Response that falls in proportion to the signal."""
     bench.signal.append(lambda e, _: e * (1 - size * e / bench.peak_e))
-    return {}
 
 
 @law("nonlinearity", "cubic", 1e-3, 0.03, "at the peak")
-def cubic(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def cubic(bench: Bench, size: float, rng: np.random.Generator) -> None:
     """Response that falls with the square of the signal."""
     bench.signal.append(lambda e, _: e * (1 - size * (e / bench.peak_e) ** 2))
-    return {}
 
 
 @law("nonlinearity", "dead_zone", 10, 200, "e-")
-def dead_zone(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def dead_zone(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Loss of the first electrons, which saturates with the signal."""
     scale = float(rng.uniform(800, 4000))
     bench.signal.append(lambda e, _: e - size * (1 - np.exp(-np.maximum(e, 0) / scale)))
@@ -34,7 +28,7 @@ def dead_zone(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 @law("nonlinearity", "knee", 4e-3, 0.1, "at the peak")
-def knee(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def knee(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Linear up to a knee below the full well."""
     level = float(rng.uniform(0.55, 0.8))
 
@@ -55,7 +49,7 @@ def _smooth(shape: tuple[int, int], scale: float, rng: np.random.Generator) -> F
 
 
 @law("flat_error", "illumination", 0.002, 0.03, "rms")
-def illumination(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def illumination(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Uneven illumination by the lamp."""
     scale = float(min(bench.shape) * rng.uniform(0.06, 0.14))
     bench.flat_response = bench.flat_response * (1 + size * _smooth(bench.shape, scale, rng))
@@ -63,14 +57,13 @@ def illumination(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
 
 
 @law("flat_error", "pixels", 1e-3, 0.02, "rms")
-def pixels(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def pixels(bench: Bench, size: float, rng: np.random.Generator) -> None:
     """Pixels respond differently to the lamp's colour."""
     bench.flat_response = bench.flat_response * (1 + size * rng.standard_normal(bench.shape))
-    return {}
 
 
 @law("flat_error", "etalon", 1e-3, 0.02, "rms")
-def etalon(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+def etalon(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     """Interference of the lamp's light in the window's glass: rings about a distant point."""
     x, y = bench.grid()
     centre, period = rng.normal(0, 600, 2), float(rng.uniform(12, 45))

@@ -45,19 +45,17 @@ def vignetted(sensor: Sensor) -> Drawn:
 
 
 @kind()
-def few(sensor: Sensor) -> Drawn:
+def few(sensor: Sensor) -> None:
     """Two bias frames, no darks, pairs of flats at three levels."""
     flats = [one for one in sensor.series if one.kind == "flat"]
     chosen = [flats[0], flats[len(flats) // 2], flats[-1]]
     sensor.series = [Series("bias", 2, 0.0, 0.0), *chosen]
-    return {}
 
 
 @kind()
-def without_bias(sensor: Sensor) -> Drawn:
+def without_bias(sensor: Sensor) -> None:
     """Darks at two exposure times, no bias frames."""
     sensor.series = [one for one in sensor.series if one.kind != "bias"]
-    return {}
 
 
 @kind("?")

@@ -25,7 +25,7 @@ def make(
     # If the lamp changes with the exposure time, levels cannot be derived from it.
     ladder = ladder or LADDERS[seed % len(LADDERS)]
     sensor = ordinary(rng, shape, ladder, own.highest, counts, own.converter)
-    drawn = own.change(sensor)
+    drawn = own.change(sensor) or {}
     sensor.declared_gain /= 2**sensor.shift
     good = ~sensor.defects
     truth = {

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,14 +173,15 @@ def middle(sensor: Sensor) -> Series:
 
 
 Drawn = dict[str, Any]
-Change = Callable[[Sensor], Drawn]
+Change = Callable[[Sensor], Drawn | None]
+C = TypeVar("C", bound=Change)
 
 
 @dataclass(frozen=True)
 class Kind:
     """Kind of camera."""
 
-    change: Change  # changes an ordinary sensor; returns the drawn values
+    change: Change  # changes an ordinary sensor; returns the drawn values, if any
     # causes to name, joined by " + ", each with its alternatives; empty: none, and no gap; "?":
     # none, as the change is not a listed effect
     cause: str
@@ -193,10 +194,10 @@ KINDS: dict[str, Kind] = {}
 
 def kind(
     cause: str = "", highest: float = 0.9, converter: Converter | None = None
-) -> Callable[[Change], Change]:
+) -> Callable[[C], C]:
     """Register a kind in `KINDS`."""
 
-    def entered(change: Change) -> Change:
+    def entered(change: C) -> C:
         KINDS[change.__name__] = Kind(change, cause, highest, converter)
         return change
 

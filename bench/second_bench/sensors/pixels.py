@@ -8,15 +8,13 @@ from second_bench.sensors.model import F64, Drawn, Sensor, kind
 
 
 @kind()
-def plain(sensor: Sensor) -> Drawn:
+def plain(sensor: Sensor) -> None:
     """Nothing."""
-    return {}
 
 
 @kind(highest=1.35)
-def saturated(sensor: Sensor) -> Drawn:
+def saturated(sensor: Sensor) -> None:
     """Levels beyond the end of the converter or of the wells."""
-    return {}
 
 
 @kind()

@@ -212,15 +212,13 @@ def _eight_bits(rng: np.random.Generator) -> tuple[int, float, float]:
 
 
 @kind(converter=_eight_bits)
-def eight_bits(sensor: Sensor) -> Drawn:
+def eight_bits(sensor: Sensor) -> None:
     """Eight bits above a black level."""
-    return {}
 
 
 @kind(converter=lambda rng: (int(rng.integers(10, 15)), 10.0, 30.0))
-def noisy(sensor: Sensor) -> Drawn:
+def noisy(sensor: Sensor) -> None:
     """30 e- of read noise."""
-    return {}
 
 
 @kind()
