@@ -127,7 +127,7 @@ def _understood(file: Path) -> Iterator[None]:
         yield
     except (AttributeError, LookupError, TypeError, ValueError) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        damaged = DamagedError(f"{file}: damaged ({reason:.200})", file)
+        damaged = DamagedError(file, f"damaged ({reason:.200})")
         case = next(up for up in file.parents if up.parent.name == RUNS)
         damaged.advice = f"remove {case} and run 'pixcal blind run {case.parents[1]}'"
         raise damaged from error

@@ -194,7 +194,7 @@ def test_an_error_is_one_line_that_names_it(
     ("error", "code", "names"),
     [
         (InputError("a.yaml: detector.pitch_um: missing"), 2, ["a.yaml: detector.pitch_um"]),
-        (DamagedError("c/0/0: chunk missing"), 2, ["c/0/0: chunk missing"]),
+        (DamagedError("c/0/0", "chunk missing"), 2, ["c/0/0: chunk missing"]),
         (KeyboardInterrupt(), 1, ["interrupted", "again to resume"]),
         (OSError(errno.ENOSPC, "No space left", "/x/y"), 1, ["/x/y", "disk full", "resume"]),
         (OSError(errno.EDQUOT, "Quota exceeded"), 1, ["disk full", "resume"]),

@@ -151,7 +151,7 @@ def test_a_function_is_unpacked_once_in_each_worker(cluster: Any, tmp_path: Path
     "error",
     [
         InputError("acq/bias/1.fits: EXPTIME missing; add it"),
-        DamagedError("RUN/x: chunk missing"),
+        DamagedError("RUN/x", "chunk missing"),
         OSError(28, "No space left on device", "RUN/x"),
         MemoryError(),
         ValueError("seven"),

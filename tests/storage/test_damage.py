@@ -163,7 +163,7 @@ def test_damage_elsewhere_is_not_noted(tmp_path: Path) -> None:
     key = complete(tmp_path / "run")
     complete(tmp_path / "run", "fitter")
     with pytest.raises(DamagedError), lock(tmp_path / "run"):
-        raise DamagedError("x", tmp_path / "run" / "fitter" / "facts.json")
+        raise DamagedError(tmp_path / "run" / "fitter" / "facts.json", "x")
     assert up_to_date(tmp_path / "run", "fit", key) is not None
 
 

@@ -4,7 +4,8 @@ import ctypes
 import os
 from contextlib import suppress
 
-# From malloc.h, see mallopt(3).
+# From malloc.h, see mallopt(3): sizes (bytes) above which free memory is returned and arrays are
+# mapped separately; number of arenas.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 
 OF_THE_NANNY = "65536"  # MALLOC_TRIM_THRESHOLD_ that Dask's nanny sets for its workers
@@ -16,24 +17,16 @@ def keep_freed_memory() -> None:
     The nanny sets MALLOC_TRIM_THRESHOLD_, which stops malloc from adapting: fresh pages for each
     chunk make a sweep 3 to 4 times slower. The limits here are those that malloc would adapt to.
     """
-    if os.environ.get("MALLOC_TRIM_THRESHOLD_") != OF_THE_NANNY:
-        return
-    _set(mmap=32 << 20, trim=64 << 20)
+    if os.environ.get("MALLOC_TRIM_THRESHOLD_") == OF_THE_NANNY:
+        _mallopt({_MMAP_THRESHOLD: 32 << 20, _TRIM_THRESHOLD: 64 << 20})
 
 
 def keep_arrays() -> None:
     """Let malloc reuse the arrays of a simulation: fresh pages would take a fifth of the time."""
-    _set(mmap=512 << 20, trim=1 << 30)
-    _mallopt(_ARENA_MAX, 1)
+    _mallopt({_MMAP_THRESHOLD: 512 << 20, _TRIM_THRESHOLD: 1 << 30, _ARENA_MAX: 1})
 
 
-def _set(mmap: int, trim: int) -> None:
-    """Set sizes (bytes) above which arrays are mapped separately, and free memory is returned."""
-    _mallopt(_MMAP_THRESHOLD, mmap)
-    _mallopt(_TRIM_THRESHOLD, trim)
-
-
-def _mallopt(option: int, value: int) -> None:
-    # Other C libraries lack this function.
-    with suppress(AttributeError):
-        ctypes.CDLL(None).mallopt(option, value)
+def _mallopt(options: dict[int, int]) -> None:
+    with suppress(AttributeError):  # Other C libraries lack this function.
+        for option, value in options.items():
+            ctypes.CDLL(None).mallopt(option, value)

@@ -13,18 +13,23 @@ class InputError(PixcalError):
 
 
 class DamagedError(InputError):
-    """A file written by pixcal is missing or altered: ``path``, with ``message`` about it.
+    """A file written by pixcal is missing or altered: ``path``, and ``what`` is wrong with it.
 
     ``advice`` is how to repair it; code that knows the run gives the exact command.
     """
 
-    def __init__(self, message: str, path: object = "") -> None:
-        super().__init__(message)
+    def __init__(self, path: object, what: str) -> None:
+        super().__init__(str(path), what)
         self.path = str(path)
         self.advice = "run the command that wrote it again"
 
     def __str__(self) -> str:
-        return f"{self.args[0]}; {self.advice}"
+        return f"{self.path}: {self.args[1]}; {self.advice}"
+
+
+def reason_of(error: BaseException) -> str:
+    """What an exception says, in one line."""
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 @contextmanager

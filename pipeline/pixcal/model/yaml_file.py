@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 from pixcal.model.config import to_plain
-from pixcal.model.errors import InputError
+from pixcal.model.errors import InputError, reason_of
 
 MAX_CONFIG_BYTES = 1_000_000
 
@@ -94,7 +94,7 @@ def _reason(error: Exception) -> str:
     if isinstance(error, yaml.MarkedYAMLError) and error.problem and error.problem_mark:
         mark = error.problem_mark
         return f"{error.problem} (line {mark.line + 1}, column {mark.column + 1})"
-    return " ".join(str(error).split())
+    return reason_of(error)
 
 
 def to_yaml(config: Any) -> str:

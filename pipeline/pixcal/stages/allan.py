@@ -318,5 +318,5 @@ def noise_levels(path: Path, region: Region) -> F64:
     """Quantiles of the expected deviation of one batch over a region, px."""
     levels, count = quantiles_of_parts(partial(_positive, path, None, region), NOISE_LEVELS)
     if not count:
-        raise DamagedError(f"{path}: no errors of batches", path)
+        raise DamagedError(path, "no errors of batches")
     return levels

@@ -25,7 +25,7 @@ from numcodecs import Blosc, blosc
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec
 
-from pixcal.model.errors import DamagedError
+from pixcal.model.errors import DamagedError, reason_of
 from pixcal.storage.folder import INDEX, File, copy_files, link_files, open_folder, read_file
 from pixcal.storage.memory import MemoryArray, MemoryPath
 from pixcal.storage.place import Place, UrlPath
@@ -151,6 +151,12 @@ def _grid(shape: Ints, chunks: Ints) -> Ints:
     return tuple(-(-n // c) for n, c in zip(shape, chunks, strict=True))
 
 
+def _shapes(metadata: dict[str, Any]) -> tuple[Ints, Ints]:
+    """Shapes of an array and of its chunks."""
+    chunks = metadata["chunk_grid"]["configuration"]["chunk_shape"]
+    return tuple(metadata["shape"]), tuple(chunks)
+
+
 def _seal(metadata: bytes, index: bytes) -> bytes:
     """Checksum of an array's metadata and index, kept at the end of the index."""
     seal: int = google_crc32c.value(metadata + index)
@@ -235,14 +241,12 @@ class ArrayWriter:
             try:
                 for name, (size, tail) in zip(names, folder.ends(names), strict=True):
                     if len(tail) < 4:
-                        path = f"{self.path}/{name}"
-                        raise DamagedError(f"{path}: truncated chunk", path)
+                        raise DamagedError(self.path / name, "truncated chunk")
                     rows.append((size, int.from_bytes(tail, "little")))
             except OSError as error:
                 if error.errno not in _LOST:
                     raise
-                path = str(error.filename)
-                raise DamagedError(f"{path}: chunk missing ({error.strerror})", path) from error
+                raise DamagedError(error.filename, f"chunk missing ({error.strerror})") from error
             index[first] = np.array(rows, _INDEX_DTYPE).reshape(grid[1:])
         body = BytesIO()
         np.save(body, index)
@@ -274,8 +278,7 @@ def remove_arrays(path: Place) -> None:
         if meta["node_type"] == "group":
             remove_arrays(path / child)
         else:
-            grid = _grid(meta["shape"], meta["chunk_grid"]["configuration"]["chunk_shape"])
-            for names in _names(grid):
+            for names in _names(_grid(*_shapes(meta))):
                 node.remove(names)
         # Last, so that an interrupted removal can be repeated.
         node.remove([INDEX, "zarr.json"])
@@ -291,10 +294,8 @@ class ArrayReader:
     def __init__(self, path: Place) -> None:
         self.path = path
         self.chunks_read = 0
-        self.shape: tuple[int, ...]
-        self.chunks: tuple[int, ...]
-        self.dtype: np.dtype[Any]
-        self.attrs: dict[str, Any]
+        self.shape: Ints
+        self.chunks: Ints
         self._memory = path.array if isinstance(path, MemoryPath) else None
         if self._memory is not None:
             self.shape, self.chunks = self._memory.values.shape, self._memory.chunks
@@ -308,22 +309,18 @@ class ArrayReader:
             # The seal guarantees zarr's metadata, so zarr's event loop is not needed, which is slow
             # when many threads open many arrays.
             meta = json.loads(metadata)
-            grid = _grid(meta["shape"], meta["chunk_grid"]["configuration"]["chunk_shape"])
-            count = math.prod(grid)
+            self.shape, self.chunks = _shapes(meta)
+            self.dtype, self.attrs = np.dtype(meta["data_type"]), meta["attributes"]
+            count = self.n_chunks
             # Not np.load: parsing its header as Python is not safe in the threads of a Dask worker,
             # where callbacks of the garbage collector come in between (CPython 3.11, gh-106905).
             begin = len(body) - 4 - count * _INDEX_DTYPE.itemsize
-            self._index = np.frombuffer(body, _INDEX_DTYPE, count, begin).reshape(grid)
+            index = np.frombuffer(body, _INDEX_DTYPE, count, begin)
+            self._index = index.reshape(_grid(self.shape, self.chunks))
         except (OSError, ValueError, KeyError, TypeError) as error:
             if isinstance(error, OSError) and error.errno not in _LOST:
                 raise
-            reason = " ".join(str(error).split())
-            raise DamagedError(
-                f"{path}: not a complete array ({reason})", path / "zarr.json"
-            ) from error
-        self.shape = tuple(meta["shape"])
-        self.chunks = tuple(meta["chunk_grid"]["configuration"]["chunk_shape"])
-        self.dtype, self.attrs = np.dtype(meta["data_type"]), meta["attributes"]
+            raise DamagedError(path, f"not a complete array ({reason_of(error)})") from error
         self._ahead = ReadAhead(path) if isinstance(path, UrlPath) else None
         # Absolute, because a reader may be sent to a process in another folder.
         self._folder = f"{path.absolute() if isinstance(path, Path) else path}/"
@@ -339,10 +336,6 @@ class ArrayReader:
             return self._memory.chunk(index)
         name = _chunk_name(index)
         size, crc = self._index[tuple(index)].item()
-
-        def damaged(what: str) -> DamagedError:
-            return DamagedError(f"{self.path / name}: {what}", self.path / name)
-
         try:
             if self._ahead is None:
                 body = read_file(f"{self._folder}{name}", size, self._next(index))
@@ -351,16 +344,18 @@ class ArrayReader:
         except OSError as error:
             if error.errno not in _LOST:
                 raise
-            raise damaged(f"chunk missing ({error.strerror})") from error
+            what = f"chunk missing ({error.strerror})"
+            raise DamagedError(self.path / name, what) from error
         if len(body) != size:
-            raise damaged(f"{len(body)} bytes where {size} were written")
+            raise DamagedError(self.path / name, f"{len(body)} bytes where {size} were written")
         if int.from_bytes(body[-4:], "little") != crc or google_crc32c.value(body) != _RESIDUE:
-            raise damaged("checksum does not match, the chunk was altered")
+            what = "checksum does not match, the chunk was altered"
+            raise DamagedError(self.path / name, what)
         buffer = np.empty(self.chunks, self.dtype) if out is None else out
         try:
             blosc.decompress(memoryview(body)[:-4], buffer)
         except (RuntimeError, ValueError) as error:
-            raise damaged(f"cannot be decoded ({error})") from error
+            raise DamagedError(self.path / name, f"cannot be decoded ({error})") from error
         self.chunks_read += 1
         return buffer
 

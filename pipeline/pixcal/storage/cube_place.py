@@ -106,7 +106,7 @@ def _read(artefact: Local) -> Mapping[str, Any] | None:
 
 
 def _damaged(file: Local, reason: str) -> DamagedError:
-    error = DamagedError(f"{file}: damaged{reason}", file)
+    error = DamagedError(file, f"damaged{reason}")
     error.advice = "give --cubes again to write the cubes anew (--cubes RUN keeps them in RUN)"
     return error
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from astropy.io import fits
 
-from pixcal.model.errors import InputError
+from pixcal.model.errors import InputError, reason_of
 from pixcal.storage.frame_file import STORED, Container, FrameFile, SampleFormat
 from pixcal.storage.header_values import (
     Header,
@@ -49,19 +49,19 @@ def inspect(source: SourceFile) -> FrameFile:
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
             raise damaged_gzip(source.path, error) from error
         except fits.VerifyError as error:
-            reason = " ".join(str(error).split()).partition(",")[0]
+            reason = reason_of(error).partition(",")[0]
             raise InputError(
                 f"{source.path}: damaged header ({reason}); copy it again, or remove it"
             ) from error
         except ValueError as error:
-            raise InputError(f"{source.path}: {' '.join(str(error).split())}") from error
+            raise InputError(f"{source.path}: {reason_of(error)}") from error
         except OSError as error:
             raise unreadable(source.path, error) from error
 
 
 def damaged_gzip(path: Path, error: Exception) -> InputError:
     """The InputError for a gzip file that is cut or altered."""
-    reason = "cut short" if isinstance(error, EOFError) else " ".join(str(error).split())
+    reason = "cut short" if isinstance(error, EOFError) else reason_of(error)
     return InputError(f"{path}: damaged gzip file ({reason}); copy it again, or remove it")
 
 

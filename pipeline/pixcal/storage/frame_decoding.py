@@ -18,7 +18,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from pixcal.model.arrays import F32, F64
-from pixcal.model.errors import InputError
+from pixcal.model.errors import InputError, reason_of
 from pixcal.storage.cube import CHUNK
 from pixcal.storage.fits_in import damaged_gzip
 from pixcal.storage.frame_file import FrameFile, SampleFormat
@@ -231,8 +231,7 @@ def _decoded(file: FrameFile) -> Iterator[tuple[int, int, NDArray[Any]]]:
                     raise ValueError(f"decoded as {piece.dtype}, header says {file.coding.stored}")
                 yield t0, y0, piece
     except Exception as error:  # the decoders raise a dozen kinds, all of which mean one thing
-        reason = " ".join(str(error).split())
         raise InputError(
-            f"{file.source.path}: its tiles cannot be decoded ({reason}); copy it again, or "
-            "remove it"
+            f"{file.source.path}: its tiles cannot be decoded ({reason_of(error)}); copy it again, "
+            "or remove it"
         ) from error

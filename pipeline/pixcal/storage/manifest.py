@@ -64,7 +64,7 @@ def file_digest(path: Local) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()[:32]
     except OSError as error:
-        raise DamagedError(f"{path}: cannot be read ({error.strerror})", path) from error
+        raise DamagedError(path, f"cannot be read ({error.strerror})") from error
 
 
 def _json(data: Any) -> str:
@@ -97,9 +97,9 @@ def _read(path: Local) -> tuple[str, Any]:
         text = path.read_text(encoding="utf-8")
         return text, json.loads(text)
     except OSError as error:
-        raise DamagedError(f"{path}: cannot be read ({error.strerror})", path) from error
+        raise DamagedError(path, f"cannot be read ({error.strerror})") from error
     except ValueError as error:
-        raise DamagedError(f"{path}: damaged ({error})", path) from error
+        raise DamagedError(path, f"damaged ({error})") from error
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
@@ -118,10 +118,10 @@ def read_manifest(folder: Local) -> Manifest | None:
     try:
         sealed = data.pop("seal", None) is not None
         if sealed and text != _json(data | {"seal": digest(data)}):
-            raise DamagedError(f"{path}: altered since it was written", path)
+            raise DamagedError(path, "altered since it was written")
         return Manifest(**data)
     except (AttributeError, TypeError) as error:
-        raise DamagedError(f"{path}: not a manifest that this version reads", path) from error
+        raise DamagedError(path, "not a manifest that this version reads") from error
 
 
 def list_files(folder: Path) -> dict[str, str]:
@@ -147,14 +147,12 @@ def check_intact(folder: Path, manifest: Manifest) -> None:
     """
     mark = folder / UNFLUSHED
     if mark.exists() and mark.read_bytes() != boot().encode():
-        raise DamagedError(
-            f"{folder}: incomplete: the machine stopped before it was flushed to disk", mark
-        )
+        raise DamagedError(folder, "incomplete: the machine stopped before it was flushed to disk")
     for name in damaged_files(folder):
-        raise DamagedError(f"{folder / name}: damaged", folder / name)
+        raise DamagedError(folder / name, "damaged")
     for name, expected in manifest.files.items():
         if file_digest(folder / name) != expected:
-            raise DamagedError(f"{folder / name}: altered since it was written", folder / name)
+            raise DamagedError(folder / name, "altered since it was written")
 
 
 def damaged_files(folder: Path) -> list[str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from pixcal.model.errors import InputError, PixcalError, RemoteError
+from pixcal.model.errors import InputError, PixcalError, RemoteError, reason_of
 from pixcal.storage.memory import MemoryPath
 
 # package to install for a protocol, if its name differs
@@ -75,7 +75,7 @@ def explained(url: str) -> Iterator[None]:
     except (PixcalError, MemoryError):
         raise
     except FileNotFoundError as error:
-        message = " ".join(str(error).split())
+        message = reason_of(error)
         # Some messages hold only the path, which the URL already gives.
         reason = message if " " in message else os.strerror(errno.ENOENT)
         raise FileNotFoundError(errno.ENOENT, reason, url) from error
@@ -86,10 +86,9 @@ def explained(url: str) -> Iterator[None]:
             f"{url}: a package is missing ({error}); pip install '{package}'"
         ) from error
     except Exception as error:  # each driver has errors of its own
-        reason = " ".join(str(error).split()) or type(error).__name__
         raise RemoteError(
-            f"{url}: {reason:.300}; check the URL, the endpoint, the credentials (AWS_…, FSSPEC_…) "
-            "and the network, and run again"
+            f"{url}: {reason_of(error):.300}; check the URL, the endpoint, the credentials "
+            "(AWS_…, FSSPEC_…) and the network, and run again"
         ) from error
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pixcal import __version__
 from pixcal.model.arrays import F32, U8, Source
-from pixcal.model.errors import DamagedError
+from pixcal.model.errors import DamagedError, reason_of
 from pixcal.model.flags import PixelFlag
 from pixcal.storage.fits_out import BLOCK
 from pixcal.storage.folder import written_aside
@@ -54,9 +54,7 @@ class FitsMap:
                 ):
                     raise ValueError("altered: its checksum does not match")
         except (OSError, LookupError, TypeError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            message = f"{path}: not a map that this version reads ({reason})"
-            raise DamagedError(message, path) from error
+            raise _not_a_map(path, error) from error
         return found
 
     @property
@@ -72,8 +70,12 @@ class FitsMap:
             for row, values in zip(range(*y), block, strict=True):
                 file.seek(self.data_at + (row * self.shape[1] + x[0]) * dtype.itemsize)
                 if file.readinto(values.view(np.uint8)) != values.nbytes:
-                    raise DamagedError(f"{self.path}: cut short while it was read", self.path)
+                    raise DamagedError(self.path, "cut short while it was read")
         return block.astype(dtype.newbyteorder("="))
+
+
+def _not_a_map(path: Path, error: Exception) -> DamagedError:
+    return DamagedError(path, f"not a map that this version reads ({reason_of(error)})")
 
 
 def word_sum(path: Path, start: int, n_bytes: int) -> int:
@@ -207,5 +209,5 @@ def read_map(path: Path) -> tuple[F32, F32, U8, dict[str, Any]]:
             sigma = np.array(hdus["SIGMA"].data, dtype=np.float32)
             mask = np.array(hdus["MASK"].data, dtype=np.uint8)
     except _NOT_A_MAP as error:
-        raise DamagedError(f"{path}: not a map that this version reads ({error})", path) from error
+        raise _not_a_map(path, error) from error
     return data, sigma, mask, header

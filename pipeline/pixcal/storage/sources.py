@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import ClassVar
 
 from pixcal.model.acquisition import Frames
-from pixcal.model.errors import InputError
+from pixcal.model.errors import InputError, reason_of
 from pixcal.storage.manifest import digest
 
 HEADERS = "headers.csv"
@@ -57,8 +57,9 @@ def read_headers(folder: Path, names: Iterable[str]) -> dict[str, Header]:
                         raise InputError(f"{place}: {name} has a header already; list it once")
                     found[name] = header
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: cannot be read ({reason}); write it as UTF-8 text") from error
+        raise InputError(
+            f"{path}: cannot be read ({reason_of(error)}); write it as UTF-8 text"
+        ) from error
     return found
 
 
@@ -124,7 +125,7 @@ class SourceFile:
 
 def unreadable(path: Path, error: OSError) -> InputError:
     """The InputError with the reason why a file cannot be read."""
-    reason = error.strerror or " ".join(str(error).split())
+    reason = error.strerror or reason_of(error)
     return InputError(f"{path}: cannot be read ({reason}); restore the file or its permissions")
 
 

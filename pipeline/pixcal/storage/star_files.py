@@ -14,7 +14,7 @@ from astropy.wcs import WCS, DistortionLookupTable
 
 from pixcal import __version__
 from pixcal.model.arrays import F32, F64
-from pixcal.model.errors import InputError
+from pixcal.model.errors import InputError, reason_of
 from pixcal.storage.folder import written_aside
 
 
@@ -24,9 +24,7 @@ def read_table(path: Path) -> Table:
     try:
         return Table.read(path, format=kinds.get(path.suffix.lower()))
     except Exception as error:  # the readers raise a dozen kinds, all of which mean one thing
-        reason = " ".join(str(error).split())[:200]
-        if not path.exists():
-            reason = "no such file"
+        reason = reason_of(error)[:200] if path.exists() else "no such file"
         raise InputError(
             f"{path}: cannot be read as a table ({reason}); give CSV, ECSV, FITS or VOTable"
         ) from error

@@ -140,7 +140,7 @@ def _intact(folder: Path, earlier: Manifest, name: str) -> Any:
     """Content of a file of an earlier artefact, verified by its digest."""
     content = read_json(folder / name)
     if file_digest(folder / name) != earlier.files.get(name):
-        raise DamagedError(f"{folder / name}: altered since it was written", folder / name)
+        raise DamagedError(folder / name, "altered since it was written")
     return content
 
 
