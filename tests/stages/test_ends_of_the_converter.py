@@ -151,3 +151,18 @@ def test_full_wells_may_be_read_as_one_of_two_codes(scatter: float, well: float,
 def test_the_highest_codes_of_flats_that_are_not_full_are_no_saturation(noise: float) -> None:
     samples = flats(noise, 1e5, 0.0).astype(np.uint16)
     assert FlatSurvey.of({"flat": Frames(samples)}).saturation is None
+
+
+@pytest.mark.parametrize("level", [32700.0, 45000.0, 60000.0])
+def test_only_unsigned_samples_read_as_signed_are_negative_by_light(level: float) -> None:
+    rng = np.random.default_rng(3)
+    unlit, *lit = (rng.normal(mean, 200, SHAPE).astype(np.uint16) for mean in (900, 9000, level))
+    taken = {"bias": unlit, "flat": np.concatenate(lit)}
+    for first, kind in ((None, np.uint16), (SHAPE[0], np.int16)):
+        read = {name: Frames(samples.astype(kind)) for name, samples in taken.items()}
+        assert FlatSurvey.of(read).wrapped == first
+    # Frames less their dark level are negative too, as are those less half of the range.
+    for lit_too, dark in ((taken["flat"] // 2, 900), (taken["flat"], 32768)):
+        moved = {"bias": Frames((unlit - dark * 1.0).astype(np.int16))}
+        moved["flat"] = Frames((lit_too - dark * 1.0).astype(np.int16))
+        assert FlatSurvey.of(moved).wrapped is None

@@ -51,3 +51,11 @@ def test_flats_that_hold_no_light_at_all_are_refused(tmp_path: Path) -> None:
     assert len(Ingested(run / "ingest").tables["flat"]["plane"]) == 9
     with pytest.raises(InputError, match="the flats hold no light"):
         reduce.run(run, reduce.Config(), Runtime(cluster="sync", quiet=True))
+
+
+def test_unsigned_flats_written_as_signed_are_refused_by_name(tmp_path: Path) -> None:
+    taken = {name: cube.astype(np.int16) for name, cube in frames((41, 53)).items()}
+    taken["flat"] = (taken["flat"].astype(np.uint16) + 26000).astype(np.int16)
+    run, _ = ingested(tmp_path / "wrapped", taken)
+    with pytest.raises(InputError, match=r"flat\.fits: .* as unsigned .*BZERO = 32768"):
+        reduce.run(run, reduce.Config(), Runtime(cluster="sync", quiet=True))

@@ -25,6 +25,7 @@ APART = 0.05  # relative distance of two levels that exceeds the flicker of a la
 FINE, STEADY = 0.005, 6.0
 MIN_SHARE = 1e-3  # least share of the samples of a frame at the highest code
 MIN_SAMPLES = 50
+_WRAPS = 1024  # least distance (ADU) of wrapped samples below those that are possible
 MIN_CHANGES = 3  # fewest frame-to-frame changes to measure a lamp's flicker
 NEIGHBOURS = 16  # codes below the highest that are compared with it
 _LIT = 1.0  # level of a flat, over the noise of a sample without light, from which it is lit
@@ -45,6 +46,7 @@ class FlatSurvey:
     # code (ADU) at which samples pile up; None if none do, or samples are real numbers
     saturation: float | None
     noise: float = 0.0  # of a sample in bias frames (ADU); zero without two of them
+    wrapped: int | None = None  # first flat whose highest codes were read as negative numbers
 
     @property
     def lit(self) -> Mask:
@@ -63,7 +65,8 @@ class FlatSurvey:
     def of(cls, arrays: Mapping[str, Reader]) -> "FlatSurvey":
         """Survey the middle rows of all flats, and of a frame without light."""
         dark = next((arrays[name] for name in ("bias", "dark") if name in arrays), None)
-        pedestal = 0.0 if dark is None else float(np.nanmean(middle_rows(dark, 0, 1)))
+        unlit = None if dark is None else middle_rows(dark, 0, 1)
+        pedestal = 0.0 if unlit is None else float(np.nanmean(unlit))
         bias = arrays.get("bias")
         noise = 0.0 if bias is None or bias.shape[0] < 2 else math.sqrt(_noise_of_pair(bias, 0, 1))
         flats = arrays["flat"]
@@ -71,9 +74,13 @@ class FlatSurvey:
         step = code_step([flats]) if whole else 1
         levels: list[float] = []
         tops: list[_Top] = []
+        lowest = _lowest(flats, unlit)
+        wrapped: list[int] = []
         blocks = range(0, flats.shape[0], TOGETHER)
         for frame in (s for n in blocks for s in middle_rows(flats, n, n + TOGETHER)):
             samples = frame[np.isfinite(frame)] if np.isfinite(frame).any() else np.array(pedestal)
+            if np.mean(samples < lowest) > MIN_SHARE:
+                wrapped.append(len(levels))
             levels.append(float(samples.mean(dtype=float)) - pedestal)
             if whole:
                 top = int(samples.max())
@@ -83,7 +90,7 @@ class FlatSurvey:
                 low, high = np.quantile(samples, _ONE_SIGMA)
                 share, spread = float(counts[0] / samples.size), float(high - low) / step
                 tops.append(_Top(top, counts, share, spread))
-        return cls(np.array(levels), _pile(tops, step), noise)
+        return cls(np.array(levels), _pile(tops, step), noise, min(wrapped, default=None))
 
     def steps(self, exposures: Sequence[float | None]) -> list[int]:
         """Index from 0 of each frame's level among those of its exposure time."""
@@ -122,6 +129,17 @@ class FlatSurvey:
 
     def _mean(self, frames: I64) -> float:
         return float(self.levels[frames].mean())
+
+
+def _lowest(flats: Reader, unlit: NDArray[Any] | None) -> float:
+    """Negative sample (ADU) below which no flat of signed 16-bit integers can fall; else -inf.
+
+    Light makes no sample darker. ``unlit``: samples of a frame without light, if there is one.
+    """
+    if flats.dtype != np.int16 or unlit is None:
+        return -math.inf
+    low, middle = np.nanquantile(unlit, (MIN_SHARE, 0.5))
+    return min(float(2 * low - middle), 0.0) - _WRAPS
 
 
 def rough_gain(arrays: Mapping[str, Reader], levels: F64, groups: Sequence[Sequence[int]]) -> float:

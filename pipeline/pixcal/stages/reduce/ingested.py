@@ -60,8 +60,19 @@ class Ingested:
 
     @cached_property
     def _all_flats(self) -> FlatSurvey | None:
-        """Survey of the flats, unlit ones included; None without flats."""
-        return FlatSurvey.of(self._chosen(self._whole)) if "flat" in self._catalogue else None
+        """Survey of the flats, unlit ones included; None without flats. InputError if they wrap."""
+        if "flat" not in self._catalogue:
+            return None
+        found = FlatSurvey.of(self._chosen(self._whole))
+        if found.wrapped is not None:
+            raise InputError(
+                f"{self._catalogue['flat']['file'][self._whole['flat'][found.wrapped]]}: light "
+                "makes its samples negative: unsigned 16-bit samples that were written as signed "
+                "ones, so that levels above 32767 ADU wrap; write all frames again as unsigned "
+                "(astropy: fits.writeto(NEW, data.astype('uint16'), header), which adds "
+                "BZERO = 32768)"
+            )
+        return found
 
     @cached_property
     def _used(self) -> dict[str, list[int]]:
