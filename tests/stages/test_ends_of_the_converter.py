@@ -166,3 +166,13 @@ def test_only_unsigned_samples_read_as_signed_are_negative_by_light(level: float
         moved = {"bias": Frames((unlit - dark * 1.0).astype(np.int16))}
         moved["flat"] = Frames((lit_too - dark * 1.0).astype(np.int16))
         assert FlatSurvey.of(moved).wrapped is None
+
+
+@pytest.mark.parametrize("noise", [0.9, 1.2, 1.5, 2.0, 2.5, 4.0])
+@pytest.mark.parametrize("level", [124.0, 126.0, 127.3, 127.5])
+@pytest.mark.parametrize("count", [2, 4, 8])
+def test_codes_of_unequal_width_are_no_cut_off(noise: float, level: float, count: int) -> None:
+    """As of a camera that averages frames and rounds halves to even codes."""
+    rng = np.random.default_rng([int(10 * noise), count])
+    mean = sum(np.rint(rng.normal(level, noise, SHAPE)) for _ in range(count)) / count
+    assert CutOff.of(Frames(np.rint(mean).astype(np.uint16)), 1.0) is None

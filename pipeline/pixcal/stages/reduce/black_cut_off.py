@@ -55,7 +55,8 @@ class CutOff:
             code = _pile(counts, lower, step) if noise > _NOISE * step else _edge(counts, step)
             # Else a quiet camera: all usual pixels are at this code, and a few warm ones above.
             leaving = samples[1:][samples[:-1] == code] > code
-            code = code if code > 0 and leaving.mean() > _LEAVE else 0
+            alike = counts.alike_above(code)
+            code = code if code > 0 and leaving.mean() > _LEAVE and alike else 0
         if not code and samples.min() < 0:
             return None
         share = float((samples <= code).mean())
@@ -95,6 +96,18 @@ class _Counts(NamedTuple):
     def many(self) -> Mask:
         """Whether a code has enough samples to compare with those below."""
         return np.asarray(self.number > max(_SHARE * self.number.sum(), _COUNT))
+
+    def alike_above(self, code: int) -> bool:
+        """Whether the codes above one are equally wide, as far as noise tells.
+
+        The logarithm of its counts bends downwards, where pixels differ upwards too, but not to and
+        fro from code to code.
+        """
+        number = self.number[self.code > code].astype(float)
+        error = np.sqrt(1 / number[:-2] + 4 / number[1:-1] + 1 / number[2:])
+        bend = np.diff(np.log(number), 2) / error
+        up, down = bend > _SURE, bend < -_SURE
+        return not bool((down[:-2] & up[1:-1] & down[2:]).any())
 
 
 def _pile(found: _Counts, most: float, step: float) -> int:
