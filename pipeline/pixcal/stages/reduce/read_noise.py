@@ -102,20 +102,30 @@ def _before_rounding(
     assert job.read_series is not None
     bias, rate = on_grid(folder, job.shape, ("bias", "dark_rate"))
     means = bias + rate * job.read_series.exptime
-    frames, step = len(job.read_series.frames), job.quantum
+    step, alike = job.quantum, _frames_alike(job, job.read_series.exptime)
     in_steps = variance[0] / step**2, variance[1] / step**2
     levels, counts = means[np.isfinite(means)] / step, code_counts([job.read_series], job)
     reader = job.frames[job.read_series.array]
     if not len(missing_codes(counts)):
-        found = noise_before_rounding(*in_steps, levels, frames)
+        found = noise_before_rounding(*in_steps, levels, alike)
     else:
         # A few frames without light cannot show a pattern of missing codes.
         multiple = step_of(code_counts([job.read_series, *job.flat], job))[0]
         # With missing codes, means of darks are not linear in exposure time.
         own = np.mean([middle_rows(reader, n, n + 1) for n in job.read_series.frames], axis=0)
         levels = own.ravel() / step
-        found = noise_before_missing_codes(*in_steps, levels, frames, counts, multiple)
+        found = noise_before_missing_codes(
+            *in_steps, levels, len(job.read_series.frames), counts, multiple
+        )
     return found and (step * found[0], step * found[1])
+
+
+def _frames_alike(job: Measuring, exptime: float) -> float:
+    """Frames of an exposure time (s) whose mean is as certain as the line through all darks."""
+    times = np.repeat([g.exptime for g in job.dark], [len(g.frames) for g in job.dark])
+    off = times - times.mean()
+    per_rate = 1 / (off @ off) if times.max() > times.min() else 0.0
+    return float(1 / (1 / len(times) + per_rate * (exptime - times.mean()) ** 2))
 
 
 def code_counts(groups: Sequence[Group], job: Measuring) -> F64:
