@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.detector.amplifiers import relative_gain
+from pixcal.estimators.detector.amplifiers import differing_outputs, relative_gain
 
 SHAPE = (70, 61)
 GOOD = np.ones(SHAPE, bool)
@@ -39,3 +39,51 @@ def test_a_step_of_the_response_is_none_of_the_gain() -> None:
 
 def test_an_even_detector_has_one_gain() -> None:
     assert (relative_gain(*frames(1.0, of_gain=True), GOOD) == 1).all()
+
+
+def camera(gains: np.ndarray, seed: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    """Response in ADU, with vignetting, and shot variance over light, of outputs of given gains."""
+    rng = np.random.default_rng(seed)
+    y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in gains.shape), indexing="ij")
+    light = (1 - 0.05 * (x**2 + y**2) + 0.02 * x) * (1 + 0.01 * rng.standard_normal(gains.shape))
+    return light / gains, rng.chisquare(400, gains.shape) / 400 / gains
+
+
+Y, X = np.indices((96, 150))
+LAYOUTS = {
+    "halves": (1.03 ** (X >= 70), ["columns up to 69", "columns from 70"]),
+    "alternate": (1.03 ** (X % 2), ["even columns", "odd columns"]),
+    "quadrants": (
+        1.03 ** (X >= 70) * 0.98 ** (Y >= 40) * 1.005 ** ((X >= 70) & (Y >= 40)),
+        [
+            f"rows {r}, columns {c}"
+            for r in ("up to 39", "from 40")
+            for c in ("up to 69", "from 70")
+        ],
+    ),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("seed", range(3))
+def test_outputs_are_named_with_their_gains(layout: str, seed: int) -> None:
+    gains, names = LAYOUTS[layout]
+    found = differing_outputs(*camera(gains, seed), gains > 0)
+    assert found is not None
+    assert found.names == names
+    true = gains / gains.mean()
+    each = np.unique(true.round(9))
+    order = np.argsort(found.gain)
+    # The mean of noise over pixels is that of 1 / gain, which differs in the second order.
+    assert (abs(found.gain[order] - each) < 4 * found.error[order] + 1e-3).all()
+    assert (found.error < 0.01).all()
+    np.testing.assert_allclose(found.of_pixel, true, rtol=3e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_light_mosaic_and_response_make_no_outputs(seed: int) -> None:
+    flat, noise = camera(np.ones(X.shape), seed)
+    assert differing_outputs(flat, noise, flat > 0) is None
+    # A colour mosaic, and a step of the response of the pixels, as of a stitched sensor.
+    for factor in (0.6 ** (X % 2 * (Y % 2)), 1.03 ** (X >= 70)):
+        assert differing_outputs(flat * factor, noise, flat > 0) is None

@@ -19,7 +19,9 @@ DSNU, COLUMN, PRNU = 4.0, 1.5, 1.2
 """e- and e- of whole columns; per cent."""
 
 
-def write_camera(folder: Path, levels: tuple[float, ...], seed: int = 8, overscan: int = 0) -> Path:
+def write_camera(
+    folder: Path, levels: tuple[float, ...], seed: int = 8, overscan: int = 0, full: Any = FULL
+) -> Path:
     """A 12-bit camera: bias, two series of darks at -10 C, a ladder of flats."""
     rng = np.random.default_rng(seed)
     offset = 200.3 * GAIN + DSNU * rng.standard_normal(SHAPE)
@@ -29,7 +31,7 @@ def write_camera(folder: Path, levels: tuple[float, ...], seed: int = 8, oversca
 
     def expose(name: str, count: int, electrons: float, seconds: float) -> None:
         charge = rng.poisson(electrons * response + DARK * seconds, (count, *SHAPE))
-        read = np.minimum(charge, FULL) + offset + READ * rng.standard_normal((count, *SHAPE))
+        read = np.minimum(charge, full) + offset + READ * rng.standard_normal((count, *SHAPE))
         samples = np.clip(np.rint(read / GAIN), 0, 4095).astype(np.uint16)
         header = fits.Header({"EXPTIME": seconds, "CCD-TEMP": -10.0})
         fits.writeto(folder / f"{name}.fits", samples, header)
@@ -94,6 +96,40 @@ def test_a_ladder_that_saturates_gives_the_full_well(tmp_path: Path) -> None:
     assert abs(found["value"] - FULL / GAIN) < 3 * found["error"] < 0.15 * FULL / GAIN
 
 
+def test_wells_that_differ_are_known_to_half_a_step_of_the_ladder(tmp_path: Path) -> None:
+    wells = np.where(np.arange(SHAPE[1]) < 75, 8300, 9700)
+    acquisition = write_camera(tmp_path / "acq", (500, 2500, 5000, 8000, 11000), full=wells)
+    reduced = pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run"))
+    found = reduced.reduction["figures_of_merit"]["saturation"]
+    assert abs(found["value"] - wells.mean() / GAIN) < 3 * found["error"]
+    assert 2 * found["error"] == pytest.approx(wells.mean() / GAIN - found["value"], rel=0.15)
+
+
+def test_noise_of_half_a_code_comes_from_pairs_of_many_darks(tmp_path: Path) -> None:
+    rng = np.random.default_rng(6)
+    offset = 4 + 0.15 * rng.standard_normal(SHAPE)
+    (tmp_path / "acq").mkdir()
+    noise, gain, seconds = 0.5, 40.0, np.linspace(0.001, 0.02, 16)
+    for kind, light in (("dark", 0.0), ("flat", 4e5)):
+        for n, time in enumerate(seconds):
+            charge = rng.poisson(light * time, (2, *SHAPE)) / gain
+            read = offset + noise * rng.standard_normal((2, *SHAPE))
+            samples = np.rint(charge + read).clip(0, 255).astype(np.uint8)
+            header = fits.Header({"EXPTIME": time})
+            fits.writeto(tmp_path / "acq" / f"{kind}{n}.fits", samples, header)
+    listed = {
+        "schema": "pixcal/acquisition/1",
+        "detector": {"pitch_um": 5.5, "read_noise_e": 20.0},
+        "frames": {kind: [f"{kind}*.fits"] for kind in ("dark", "flat")},
+    }
+    (tmp_path / "acq" / "acquisition.yaml").write_text(yaml.safe_dump(listed))
+    reduced = pixcal.reduce(pixcal.ingest(tmp_path / "acq", tmp_path / "run")).reduction
+    figures = reduced["figures_of_merit"]
+    value, error = (figures["read_noise"][key] for key in ("value", "error"))
+    gain = figures["conversion_gain"]["value"]
+    assert abs(value / gain - noise) < 3 * error / gain < 0.05 * noise
+
+
 def test_few_levels_one_of_full_pixels_give_the_gain_beside_an_overscan(tmp_path: Path) -> None:
     acquisition = write_camera(tmp_path / "acq", (500, 6000, 11000), overscan=14)
     reduced = pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run"))
@@ -107,7 +143,9 @@ def test_few_levels_one_of_full_pixels_give_the_gain_beside_an_overscan(tmp_path
     assert (mask[:, 14:] != 0).mean() < 1e-4
 
 
-def camera_run(folder: Path, frames: dict[str, Any], seed: int = 4) -> dict[str, Any]:
+def camera_run(
+    folder: Path, frames: dict[str, Any], seed: int = 4, gain: Any = GAIN
+) -> dict[str, Any]:
     """Figures of frames (t, y, x) of 100 ADU bias, given light (e-), number and what each adds."""
     rng = np.random.default_rng(seed)
     response = 1 + PRNU / 100 * rng.standard_normal(SHAPE)
@@ -117,7 +155,7 @@ def camera_run(folder: Path, frames: dict[str, Any], seed: int = 4) -> dict[str,
             (count, *SHAPE)
         )
         signal += row * rng.standard_normal((count, SHAPE[0], 1))
-        samples = step * np.rint((1600 + signal / GAIN) / step)
+        samples = step * np.rint((1600 + signal / gain) / step)
         header = fits.Header({"EXPTIME": float(light > 0)})
         fits.writeto(folder / "acq" / f"{kind}.fits", samples.astype(np.uint16), header)
     listed = {
@@ -179,6 +217,29 @@ def test_what_frames_without_exposure_times_do_not_tell_is_said(tmp_path: Path) 
 def test_noise_of_rows_is_told_from_that_of_pixels(tmp_path: Path) -> None:
     noise = camera_run(tmp_path, {"bias": (0, 40, 1, 2.0), "flat": (30000, 8, 1, 2.0)})["row_noise"]
     assert abs(noise["value"] - 2.0) < 4 * noise["error"] < 0.4
+
+
+def test_outputs_of_different_gain_are_told_and_leave_the_response(tmp_path: Path) -> None:
+    frames = {"bias": (0, 20, 1, 0), "flat": (30000, 40, 1, 0)}
+    plain = camera_run(tmp_path / "plain", frames)
+    ratio = 1.04 ** (np.arange(SHAPE[1]) >= 70)
+    found = camera_run(tmp_path / "outputs", frames, gain=GAIN * ratio)
+    reduced = pixcal.open_run(tmp_path / "outputs" / "run").reduction
+    outputs = reduced["gain_e_per_adu"]["outputs"]
+    assert [one["where"] for one in outputs] == ["columns up to 69", "columns from 70"]
+    for one, true in zip(outputs, (GAIN, 1.04 * GAIN), strict=True):
+        # The error of the gain of both together comes on top.
+        error = np.hypot(one["error"], found["conversion_gain"]["error"])
+        assert abs(one["gain"] - true) < 4 * error < 0.08 * true
+    assert outputs[1]["gain"] / outputs[0]["gain"] == pytest.approx(1.04, abs=0.01)
+    said = [w for w in reduced["warnings"] if "the gain differs between outputs" in w]
+    assert len(said) == 1
+    assert "columns from 70" in said[0]
+    assert "columns from 70" in found["conversion_gain"]["note"]
+    for name in ("prnu", "prnu_column", "read_noise"):
+        error = np.hypot(found[name]["error"], plain[name]["error"])
+        assert abs(found[name]["value"] - plain[name]["value"]) < 3 * error
+    assert "outputs" not in pixcal.open_run(tmp_path / "plain" / "run").reduction["gain_e_per_adu"]
 
 
 def test_the_same_whatever_the_workers(run: pixcal.Run, tmp_path: Path) -> None:

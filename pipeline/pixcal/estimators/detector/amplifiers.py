@@ -6,16 +6,21 @@ the common gain, is smaller by the same factor. Where the pixels themselves resp
 the noise follows the light and has no step.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
 from pixcal.kernels.robust import robust_sigma
-from pixcal.model.arrays import F64, Mask
+from pixcal.model.arrays import F64, I64, Mask
 
 MAX_BOUNDARIES = 7  # most boundaries along each axis
 NARROWEST = 8  # fewest rows or columns of an amplifier
 SIGNIFICANT = 6.0  # standard deviations of a step of the flat
 SMOOTH = 2  # degree of the lamp's variation
+CERTAIN = 6.0  # the same of a step of the noise, to name the outputs
+_TILE = 32  # side (px) of the blocks to which a trend is fitted
 
 
 def relative_gain(flat: F64, noise: F64, good: Mask) -> F64:
@@ -24,23 +29,132 @@ def relative_gain(flat: F64, noise: F64, good: Mask) -> F64:
     ``flat``: (y, x) relative response. ``noise``: (y, x) mean square of samples over that expected.
     """
     log_gain = np.zeros(flat.shape)
-    used = good & (flat > 0) & (noise > 0)
-    response = np.where(used, np.log(np.where(used, flat, 1.0)), np.nan)
-    squares = np.where(used, noise, np.nan)
+    response, squares = _used(flat, noise, good)
     for axis in (0, 1):
         along = _profile(response, axis)
-        steps = _boundaries(along)
+        steps = [np.arange(len(along)) >= at for at in _boundaries(along)]
         if not steps:
             continue
         size, _ = _sizes(along, steps)
         in_noise, error = _sizes(_profile(squares, axis), steps)
-        place = np.arange(flat.shape[axis])
         for number, step in enumerate(steps):
             of_gain = (in_noise[number] - size[number]) ** 2 < in_noise[number] ** 2
             clear = abs(size[number]) > 2 * error[number]
             if of_gain and clear:
-                log_gain -= np.expand_dims(size[number] * (place >= step), 1 - axis)
+                log_gain -= np.expand_dims(size[number] * step, 1 - axis)
     return np.asarray(np.exp(log_gain - log_gain.mean()))
+
+
+def _used(flat: F64, noise: F64, good: Mask) -> tuple[F64, F64]:
+    """Logarithms of the response, and noise (y, x); NaN in pixels that are not used."""
+    used = good & (flat > 0) & (noise > 0)
+    response = np.where(used, np.log(np.where(used, flat, 1.0)), np.nan)
+    return response, np.where(used, noise, np.nan)
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Outputs whose gains differ, told by flat and noise alike."""
+
+    names: list[str]  # which rows and columns each output reads
+    gain: F64  # gain, error: (output,) over the mean, by the noise
+    error: F64
+    of_pixel: F64  # (y, x) gain of each pixel's output over the mean, by the flat
+
+
+def differing_outputs(
+    flat: F64, noise: F64, good: Mask, first: tuple[int, int] = (0, 0)
+) -> Outputs | None:
+    """Outputs of blocks of rows and columns, or of alternate ones; None if no gains differ.
+
+    flat, noise : (y, x) relative response, and shot variance over light, of each pixel
+    good : (y, x)
+    first : row and column of the first pixel, for the names
+    """
+    response, ratio = _used(flat, noise, good)
+    used = np.isfinite(response)
+    if not used.any():
+        return None
+    ratio /= np.nanmean(ratio)
+    found = [_parts(response, ratio, axis) for axis in (0, 1)]
+    if not any(found):
+        return None
+    labels, names = [], []
+    for axis, patterns in enumerate(found):
+        own = np.array([np.zeros(flat.shape[axis], np.bool_), *patterns])
+        _, at, label = np.unique(own, axis=1, return_index=True, return_inverse=True)
+        labels.append(label)
+        names.append([_name(patterns, place, first[axis], ("row", "column")[axis]) for place in at])
+    cell = labels[0][:, None] * len(names[1]) + labels[1]
+    level, error = _of_cells(ratio, cell, used)
+    share = np.bincount(cell[used], minlength=len(level)) / used.sum()
+    known = share > 0
+    log_gain = -_of_cells(response, cell, used)[0]
+    log_gain -= share @ log_gain
+    return Outputs(
+        [", ".join(filter(None, (r, c))) for r in names[0] for c in names[1]],
+        (share @ level) / np.where(known, level, np.nan),
+        error / np.where(known, level, np.nan),
+        np.exp(log_gain[cell]),
+    )
+
+
+def _parts(response: F64, ratio: F64, axis: int) -> list[Mask]:
+    """Places (place,) along an axis of outputs whose gains differ from those of the others."""
+    along, in_noise = _profile(response, axis), _profile(ratio, axis)
+    place = np.arange(len(along))
+    if len(along) < 4 * NARROWEST:
+        return []
+    odd = place % 2 == 1
+    even_out = along - _sizes(along, [odd])[0][0] * odd
+    patterns = [odd, *(place >= at for at in _boundaries(even_out))]
+    (size, error), (seen, noise) = (_sizes(one, patterns) for one in (along, in_noise))
+    there = (abs(size) > SIGNIFICANT * error) & (abs(seen) > CERTAIN * noise)
+    alike = abs(seen - size) < np.maximum(CERTAIN / 2 * noise, abs(size) / 2)
+    return [pattern for pattern, kept in zip(patterns, there & alike, strict=True) if kept]
+
+
+def _name(patterns: Sequence[Mask], place: int, first: int, line: str) -> str:
+    """Words for the rows or columns that are in the same patterns (place,) as one of them."""
+    if not patterns:
+        return ""
+    own = np.flatnonzero(np.all([p == p[place] for p in patterns], axis=0))
+    count, every = len(patterns[0]), np.diff(own).max(initial=1) == 1
+    kind = f"{line}s" if every else f"{('even', 'odd')[place % 2]} {line}s"
+    reach = 1 if every else 2
+    low, high = own[0] >= reach, own[-1] < count - reach
+    begin, end = first + own[0] - (0 if every else own[0] % 2), first + own[-1]
+    if low and high:
+        return f"{kind} {begin} to {end}"
+    return f"{kind} from {begin}" if low else f"{kind} up to {end}" if high else kind
+
+
+def _of_cells(values: F64, cell: I64, used: Mask) -> tuple[F64, F64]:
+    """Mean of each cell's pixels beside a smooth trend over all, and its error from their scatter.
+
+    ``values``: (y, x); ``cell``: (y, x) number of each pixel's.
+    """
+    y, x = (np.linspace(-1, 1, n) for n in values.shape)
+    rows, columns = (np.arange(n) // _TILE for n in values.shape)
+    tile = rows[:, None] * (columns[-1] + 1) + columns
+    _, group = np.unique((cell * (tile.max() + 1) + tile)[used], return_inverse=True)
+    count = np.bincount(group)
+
+    def mean(map_: F64) -> F64:
+        return np.asarray(np.bincount(group, map_[used]) / count)
+
+    one = np.ones(values.shape)
+    trend = [
+        mean(y[:, None] ** m * x**n * one) for m, n in ((0, 1), (1, 0), (0, 2), (1, 1), (2, 0))
+    ]
+    numbers = np.rint(mean(cell * one)).astype(int)
+    cells = np.arange(cell.max() + 1)
+    design = np.column_stack([numbers[:, None] == cells, *trend]) * np.sqrt(count)[:, None]
+    seen = mean(values)
+    inverse = np.linalg.pinv(design.T @ design)
+    fitted = inverse @ (design.T @ (np.sqrt(count) * seen))
+    scatter = (np.square(values[used]).sum() - count @ seen**2) / max(used.sum() - len(count), 1)
+    return fitted[: len(cells)], np.sqrt(scatter * np.diag(inverse)[: len(cells)])
 
 
 def _profile(values: F64, axis: int) -> F64:
@@ -59,7 +173,8 @@ def _boundaries(along: F64) -> list[int]:
     places = range(NARROWEST, len(along) - NARROWEST + 1)
     while noise > 0 and len(steps) < MAX_BOUNDARIES:
         free = [p for p in places if all(abs(p - s) >= NARROWEST for s in steps)]
-        basis = np.linalg.qr(_terms(len(along), steps))[0]
+        taken = [np.arange(len(along)) >= at for at in steps]
+        basis = np.linalg.qr(_terms(len(along), taken))[0]
         rest = along - basis @ (basis.T @ along)
         best, at = 0.0, 0
         for place in free:
@@ -73,14 +188,13 @@ def _boundaries(along: F64) -> list[int]:
     return sorted(steps)
 
 
-def _terms(count: int, steps: list[int]) -> F64:
-    smooth = legvander(np.linspace(-1, 1, count), SMOOTH)
-    return np.column_stack([smooth, *[(np.arange(count) >= s).astype(float) for s in steps]])
+def _terms(count: int, patterns: Sequence[Mask]) -> F64:
+    return np.column_stack([legvander(np.linspace(-1, 1, count), SMOOTH), *patterns])
 
 
-def _sizes(along: F64, steps: list[int]) -> tuple[F64, F64]:
-    """Steps of a profile, and their errors from its scatter."""
-    terms = _terms(len(along), steps)
+def _sizes(along: F64, patterns: Sequence[Mask]) -> tuple[F64, F64]:
+    """Steps of a profile, at places (place,) of patterns, and their errors from its scatter."""
+    terms = _terms(len(along), patterns)
     inverse = np.linalg.inv(terms.T @ terms)
     fitted = inverse @ (terms.T @ along)
     scatter = float(np.var(along - terms @ fitted)) * len(along) / (len(along) - terms.shape[1])

@@ -147,6 +147,30 @@ def relative_response(steps: Sequence[ExposureLevel], levels: F64) -> tuple[F64,
         return charge / light, np.sqrt(variance) / np.abs(light)
 
 
+def shot_over_light(
+    steps: Sequence[ExposureLevel], levels: F64, read: F64, rate: F64, gain: float
+) -> F64:
+    """Shot variance of each pixel over its light and dark signal, 1 / gain (ADU/e-); else NaN.
+
+    steps : of flats, with the variance of a sample (ADU²) instead of that of the signal
+    levels : (step,) of `step_levels`
+    read, rate : (y, x) variance without light (ADU²), and dark signal (ADU/s)
+    gain : rough value (e-/ADU), for the weights of the steps
+    """
+    variance, light = np.zeros((2, *read.shape))
+    usual = max(finite_median(read), 0.0)
+    for step, level in zip(steps, levels, strict=True):
+        if step.frames < 2 or not level > 0:
+            continue
+        weight = (step.frames - 1) / level / (1 + usual * gain / level) ** 2
+        signal = step.signal + np.maximum(rate, 0) * step.exptime
+        used = np.isfinite(signal) & np.isfinite(step.variance)
+        variance += np.where(used, weight * (step.variance - read), 0.0)
+        light += np.where(used, weight * signal, 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(variance / light)
+
+
 def unsaturated(
     steps: Sequence[ExposureLevel], levels: F64, dark_variance: float = 0.0
 ) -> tuple[Sequence[ExposureLevel], F64]:

@@ -20,6 +20,7 @@ from pixcal.stages.reduce.detector_summary import Summary, pair_sums
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.halves import Window, frames_of, middle_of, read_halves
 from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.reduce.outputs import outputs_of, report_outputs
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.manifest import write_json
@@ -51,6 +52,9 @@ def characterise(
     middle = middle_of(source.shape)
     halves = read_halves(made, source, summary, top, middle, entry["used"], runtime)
     note = "" if measured else "declared, not measured"
+    outputs = outputs_of(made, summary, middle)
+    if outputs is not None:
+        note = report_outputs(outputs, gain[0], facts)
     found: Json = {"conversion_gain": _figure("conversion gain", "e-/ADU", gain, note)}
     noise = _read_noise(found, summary, gain[0], source.quantum)
     _line_noise(found, dark, gain[0], job.shape)
@@ -68,7 +72,8 @@ def characterise(
             said = found["dsnu"]["note"], "lower limit: dark pixels are cut off at the lowest code"
             found["dsnu"]["note"] = "; ".join(filter(None, said))
     if halves.flat is not None:
-        percent = np.stack([100 * emva.without_trend(half, halves.good) for half in halves.flat])
+        light = halves.flat if outputs is None else halves.flat * outputs.of_pixel
+        percent = np.stack([100 * emva.without_trend(half, halves.good) for half in light])
         facts["warnings"] += _spread(found, curves, "prnu", "%", percent, halves.good)
     scale = gain[0] / entry["used"]
     _dark_current(found, made, source, job, scale, middle)
@@ -128,7 +133,10 @@ def _top(summary: Summary, job: Measuring, clipped: bool) -> tuple[Measure | Non
     """
     peak, end = summary.well, job.saturation - summary.usual.bias
     if peak is not None and (not clipped or peak[0] + 2 * peak[1] < _WELL * end):
-        return peak, True
+        # Wells differ: some pixels may be full far below the next level of the flats.
+        beyond = summary.levels[summary.full & (summary.levels > sum(peak))]
+        half = (float(beyond.min()) - peak[0]) / 2 if len(beyond) else 0.0
+        return (peak[0], max(peak[1], half)), True
     if not len(summary.levels) or not summary.usable.any():
         return None, False
     if clipped and (peak is not None or not summary.usable.all()):

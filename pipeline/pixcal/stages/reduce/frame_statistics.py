@@ -7,7 +7,7 @@ columns.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any
 
@@ -52,6 +52,7 @@ STATISTICS = (
     "dark_dof",
     "kurtosis",
     "outliers",
+    "shot",  # shot variance of flats over their light, 1/gain (ADU/e-); NaN where unknown
     "flags",
 )
 
@@ -102,7 +103,7 @@ def statistics_writers(folder: Place, shape: tuple[int, int], flats: int) -> dic
 def measure_bytes(dark: Sequence[Group], flat: Sequence[Group], width: int) -> int:
     """Peak of `measure`: copies of a column's batch; one chunk and the maps of each column."""
     chunk, tile = 4 * CHUNK[0] * CHUNK[1] * CHUNK[2], 8 * CHUNK[1] * CHUNK[2]
-    maps = max(width, STRIP) * tile * (60 + 8 * len(dark) + 16 * len(flat))
+    maps = max(width, STRIP) * tile * (60 + 8 * len(dark) + 24 * len(flat))
     return (6 + width) * chunk + maps
 
 
@@ -119,6 +120,7 @@ class _Column:
     line_noise: LineNoise = field(default_factory=LineNoise)
     line: DarkLine | None = None
     steps: list[ExposureLevel] = field(default_factory=list)
+    variances: list[F64] = field(default_factory=list)  # of a sample of each pixel in each step
 
     @classmethod
     def begin(cls, job: Measuring, index: Index) -> "_Column":
@@ -230,6 +232,7 @@ def _measure_level(job: Measuring, column: _Column, number: int, found: Combined
     if line is not None:
         variance = variance + column.noise * line.variance(exptime)
     column.steps.append(ExposureLevel(group.exptime, frames, signal, variance, usual))
+    column.variances.append(found.variance)
 
 
 def _measure_response(job: Measuring, column: _Column) -> None:
@@ -242,6 +245,13 @@ def _measure_response(job: Measuring, column: _Column) -> None:
         for before, after in zip(column.steps, steps, strict=True)
     ]
     maps["response"], maps["response_error"] = calibration.relative_response(steps, levels)
+    maps["shot"] = calibration.shot_over_light(
+        [replace(step, variance=own) for step, own in zip(steps, column.variances, strict=True)],
+        levels,
+        maps["dark_variance"],
+        maps["dark_rate"] if job.flats_timed else 0 * maps["dark_rate"],
+        job.gain,
+    )
     maps["flags"][nonlinear(steps, levels, job.options.nonlinear_share)] += int(PixelFlag.NONLINEAR)
 
 
