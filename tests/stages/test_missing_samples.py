@@ -11,7 +11,9 @@ import pytest
 from test_cut_frames import LEVELS, frames, ingested
 
 from pixcal.engine.run import Runtime
+from pixcal.model.flags import PixelFlag
 from pixcal.stages import reduce
+from pixcal.stages.ingest import stage as ingest
 from pixcal.storage.cube import ArrayReader
 
 
@@ -41,3 +43,20 @@ def test_a_frame_that_lacks_samples_costs_no_more_than_these(
     light = LEVELS["flat"] - LEVELS["bias"]
     for before, after, unit in zip(maps, changed, (1.0, light), strict=True):
         np.testing.assert_allclose(after[mask == 0], before[mask == 0], rtol=0, atol=most / unit)
+
+
+def test_missing_samples_of_a_flat_are_told_from_saturated_ones(tmp_path: Path) -> None:
+    taken = {name: cube.astype(np.float32) for name, cube in frames((41, 53)).items()}
+    taken["flat"][3, 5:9, 7:11] = np.nan
+    taken["flat"][4, 20:24, 30:36] = 9500
+    run, _ = ingested(tmp_path / "both", taken)
+    declared = "read_noise_e: 16.0"
+    description = run.parent / "both" / "acquisition.yaml"
+    limited = description.read_text().replace(declared, f"{declared}, saturation_adu: 9400")
+    description.write_text(limited)
+    ingest.run(run.parent / "both", run, ingest.Config(), Runtime(cluster="sync", quiet=True))
+    reduce.run(run, reduce.Config(), Runtime(cluster="sync", quiet=True))
+    mask = ArrayReader(run / "reduce/calibration.zarr/mask").read()
+    assert (mask[5:9, 7:11] == PixelFlag.NO_DATA).all()
+    assert (mask[20:24, 30:36] == PixelFlag.SATURATED).all()
+    assert np.count_nonzero(mask & (PixelFlag.NO_DATA | PixelFlag.SATURATED)) == 16 + 24

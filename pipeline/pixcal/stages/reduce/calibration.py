@@ -189,7 +189,8 @@ def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> U
         )
         mask[warm] |= np.uint8(PixelFlag.HOT)
     if job.has_flat:
-        mask[~np.isfinite(flat)] |= np.uint8(PixelFlag.NO_DATA)
+        told = mask & (PixelFlag.SATURATED | PixelFlag.NO_DATA) > 0
+        mask[~np.isfinite(flat) & ~told] |= np.uint8(PixelFlag.NO_DATA)
         where = dead(flat, error, limits.dead_below, limits.dead_above, FLAT_FLOOR)
         # The response of a hot pixel that its dark signal fills is not known.
         mask[where & ~(warm & (flat > FLAT_FLOOR))] |= np.uint8(PixelFlag.DEAD)

@@ -28,7 +28,7 @@ from pixcal.estimators.detector.pair_noise import LineNoise, dark_pair_sums, fla
 from pixcal.kernels.photon_transfer import COLUMNS, N_BINS
 from pixcal.kernels.robust import BATCH, Combination, Combined, finite_median, lit
 from pixcal.kernels.rounding import SHEPPARD
-from pixcal.model.arrays import F32, F64
+from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.flags import PixelFlag
 from pixcal.model.options import Reduce
 from pixcal.stages import tiles
@@ -116,7 +116,8 @@ class _Column:
     pairs: F64
     levels: F64
     noise: F64  # typical variance of a sample in this column (ADU²)
-    loud: NDArray[np.bool_]  # pixels noisy without light, which photon transfer leaves out
+    loud: Mask  # pixels noisy without light, which photon transfer leaves out
+    full: Mask  # pixels with saturated samples in flats
     line_noise: LineNoise = field(default_factory=LineNoise)
     line: DarkLine | None = None
     steps: list[ExposureLevel] = field(default_factory=list)
@@ -129,7 +130,8 @@ class _Column:
         maps = {name: np.zeros(shape) for name in STATISTICS}
         levels = np.zeros(job.writers["levels"].shape[2:])
         pairs = np.zeros((2, N_BINS, COLUMNS))
-        return cls(index, maps, pairs, levels, np.zeros(shape), np.zeros(shape, np.bool_))
+        loud, full = np.zeros((2, *shape), np.bool_)
+        return cls(index, maps, pairs, levels, np.zeros(shape), loud, full)
 
 
 def measure(job: Measuring, parts: Sequence[Strip]) -> None:
@@ -240,10 +242,10 @@ def _measure_response(job: Measuring, column: _Column) -> None:
     maps, levels = column.maps, calibration.step_levels(column.steps)
     column.levels[:, 0] = levels
     steps, levels = calibration.unsaturated(column.steps, levels, float(np.median(column.noise)))
-    column.levels[:, 3] = [
-        np.isfinite(before.signal).sum() - np.isfinite(after.signal).sum()
-        for before, after in zip(column.steps, steps, strict=True)
-    ]
+    for number, (before, after) in enumerate(zip(column.steps, steps, strict=True)):
+        ended = np.isfinite(before.signal) & ~np.isfinite(after.signal)
+        column.full |= ended
+        column.levels[number, 3] = ended.sum()
     maps["response"], maps["response_error"] = calibration.relative_response(steps, levels)
     maps["shot"] = calibration.shot_over_light(
         [replace(step, variance=own) for step, own in zip(steps, column.variances, strict=True)],
@@ -252,6 +254,8 @@ def _measure_response(job: Measuring, column: _Column) -> None:
         maps["dark_rate"] if job.flats_timed else 0 * maps["dark_rate"],
         job.gain,
     )
+    lost = ~np.isfinite(maps["response"]) & column.full
+    maps["flags"][lost] += int(PixelFlag.SATURATED)
     maps["flags"][nonlinear(steps, levels, job.options.nonlinear_share)] += int(PixelFlag.NONLINEAR)
 
 
@@ -276,6 +280,8 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
         for column, combination, pedestal, charge, samples in zip(
             columns, every, pedestals, charges, batch, strict=True
         ):
+            if lamp:
+                column.full |= (samples >= job.saturation).any(axis=0)
             frames = _usable(job, samples, lamp)
             if pedestal is not None:
                 frames -= pedestal
@@ -299,7 +305,7 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
     return [combination.result() for combination in every]
 
 
-def _loud(job: Measuring, frames: F32) -> NDArray[np.bool_]:
+def _loud(job: Measuring, frames: F32) -> Mask:
     """Pixels whose noise without light is far above typical."""
     if len(frames) < 2:
         return np.zeros(frames.shape[1:], np.bool_)
