@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from astropy.io import fits
 from click.testing import CliRunner
 
 import pixcal
+from pixcal.stages.reduce.detector_warnings import _declared_gain_warnings
 from pixcal_cli.main import cli
 
 SHAPE = (140, 150)
@@ -390,3 +392,13 @@ def test_shot_noise_of_the_dark_signal_is_not_taken_for_that_of_light(tmp_path: 
     assert abs(gain["value"] - GAIN) < 3 * gain["error"] < 0.06 * GAIN
     noise = reduction["figures_of_merit"]["read_noise"]
     assert abs(noise["value"] - read) < 3 * noise["error"]
+
+
+@pytest.mark.parametrize(("declared", "said"), [(0.1, True), (0.12, False), (0.0502, False)])
+def test_half_the_declared_gain_may_be_that_of_an_electron_multiplier(
+    declared: float, said: bool
+) -> None:
+    fit: Any = SimpleNamespace(gain=0.05, error=0.0002)
+    summary: Any = SimpleNamespace(declared=SimpleNamespace(gain_e_per_adu=declared), step=1.0)
+    sentences = _declared_gain_warnings(fit, summary, declared)
+    assert any("F² = 2" in one for one in sentences) == said

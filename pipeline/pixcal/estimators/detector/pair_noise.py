@@ -25,6 +25,7 @@ _NEARLY = 5.0  # standard deviations below saturation from which a pixel's noise
 # Subtracting the median of n normal numbers lowers the variance of each, and the covariance of each
 # two, by this over n: twice the covariance with the median (1 / n), less its variance π / (2 n).
 _MEDIAN_TAKES = 2 - math.pi / 2
+_FAR = BLOCK // 2  # pixels over which no filter of a camera reaches
 _NO_BLOCKS = np.zeros((0, COLUMNS))
 
 
@@ -71,13 +72,32 @@ def shared_by_blocks(difference: F32, quantum: float) -> float:
     `pair_statistics` removes it with its block means. ``difference``: (y, x) of two frames without
     light, of full blocks; outliers are excluded.
     """
+    blocks = _clipped(difference, quantum).reshape(-1, BLOCK**2)
+    own = float(blocks.var(axis=1, ddof=1).mean()) / BLOCK**2
+    return float(blocks.mean(axis=1).var(ddof=1) - own) / 2
+
+
+def _clipped(difference: F32, quantum: float) -> F64:
+    """Blocks (n, BLOCK, BLOCK) of a difference of frames, less its median; zero for outliers."""
     tiles = difference.reshape(len(difference) // BLOCK, BLOCK, -1, BLOCK)
-    blocks = tiles.swapaxes(1, 2).reshape(-1, BLOCK**2).astype(float)
+    blocks = tiles.swapaxes(1, 2).reshape(-1, BLOCK, BLOCK).astype(float)
     middle, sigma = median_and_sigma(blocks)
     blocks -= middle
     blocks[~(np.abs(blocks) <= _OUT * max(sigma, quantum))] = 0
-    own = float(blocks.var(axis=1, ddof=1).mean()) / BLOCK**2
-    return float(blocks.mean(axis=1).var(ddof=1) - own) / 2
+    return blocks
+
+
+def along_lines(difference: F32, quantum: float) -> F64:
+    """Covariances (2 lines, 2 lags) of pixels along a row, and along a column, next and far (ADU²).
+
+    A line's own noise is the same at both lags; that of a filter ends before the far one.
+    ``difference``: as in `shared_by_blocks`.
+    """
+    blocks = _clipped(difference, quantum)
+    turned = blocks, blocks.swapaxes(1, 2)
+    lags = (1, _FAR)
+    products = [[(b[:, :, :-lag] * b[:, :, lag:]).mean() for lag in lags] for b in turned]
+    return np.array(products) / 2
 
 
 def dark_pair_sums(

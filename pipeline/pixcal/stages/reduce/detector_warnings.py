@@ -10,6 +10,7 @@ from pixcal.kernels.photon_transfer import SHARED
 from pixcal.model.arrays import F64
 from pixcal.report.text import with_error
 from pixcal.stages.reduce.detector_summary import Summary
+from pixcal.stages.reduce.read_noise import Nearby
 
 _ROUGH = 10.0  # reduced chi-square above which a photon-transfer curve is not smooth
 _LINEARITY = 0.02
@@ -21,13 +22,23 @@ _FEWEST, _DRIFT, _SCATTER = 4, 0.01, 0.02
 _OF_STEP = 0.1  # relative tolerance to recognise a gain declared per step of the converter
 
 
-def detector_warnings(summary: Summary, gain: float, saturation: float | None) -> list[str]:
+def detector_warnings(
+    summary: Summary, gain: float, saturation: float | None, nearby: Nearby | None
+) -> list[str]:
     """Warnings on the detector as a whole.
 
     ``gain``: the used gain (e-/ADU). ``saturation``: level at which flats saturate (ADU), if not
-    declared.
+    declared. ``nearby``: noise that neighbours share without light.
     """
     warnings = []
+    filtered = nearby is not None and nearby.filtered
+    if nearby is not None and filtered:
+        along = " and ".join(f"{size:.2g} along {line}s" for line, size in nearby.near.items())
+        warnings.append(
+            f"neighbours share noise in frames without light (correlation {along}): the samples "
+            "were filtered, smoothed or resampled before they were written; gain and noise are "
+            "those of filtered samples and photon transfer does not hold; record raw frames"
+        )
     if saturation is not None:
         warnings.append(
             f"flats saturate at {saturation:.0f} ADU, where their samples pile up: "
@@ -35,7 +46,7 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
             "and linearity; declare detector.saturation_adu if it is another level"
         )
     if summary.gain is not None:
-        warnings += _gain_warnings(summary.gain, summary, gain)
+        warnings += _gain_warnings(summary.gain, summary, gain, filtered)
     if summary.full.any():
         assert summary.well is not None
         warnings.append(
@@ -57,7 +68,7 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
     return warnings
 
 
-def _gain_warnings(fit: GainFit, summary: Summary, used: float) -> list[str]:
+def _gain_warnings(fit: GainFit, summary: Summary, used: float, filtered: bool) -> list[str]:
     warnings = []
     if fit.chi2_reduced > _ROUGH:
         warnings.append(
@@ -79,7 +90,7 @@ def _gain_warnings(fit: GainFit, summary: Summary, used: float) -> list[str]:
             "its black level, or reads dark pixels with another amplifier (dual gain, HDR)"
         )
     clear = [lag for lag, sigmas in fit.neighbours.items() if sigmas > SHARED]
-    if clear:
+    if clear and not filtered:
         lags = ", ".join(f"({y}, {x})" for y, x in clear)
         warnings.append(
             "crosstalk: the noise of neighbours in the flats is correlated at (rows, columns) "
@@ -91,7 +102,7 @@ def _gain_warnings(fit: GainFit, summary: Summary, used: float) -> list[str]:
             "shutter do under a flickering lamp (mains, dimmed LED). This biases gain and "
             "diagnosis; take flats with a steady (DC) lamp, or expose for many flicker periods"
         )
-    if fit.curved:
+    if fit.curved and not filtered:
         warnings.append(
             "the photon-transfer curve is not straight: variance over level changes by "
             f"{100 * fit.curved:+.2g} % up to {fit.levels[1]:.0f} ADU; the gain is "
@@ -190,15 +201,17 @@ def _declared_gain_warnings(fit: GainFit, summary: Summary, used: float) -> list
         return [f"no gain declared: using {used:.4g} ± {error:.2g} e-/ADU, measured from the flats"]
     if abs(value - declared) <= max(3 * error, 0.02 * declared):
         return []
+    causes = [
+        f"samples are multiples of {step:g} ADU, so the gain of one step of the converter must be "
+        f"divided by {step:g}; "
+    ] * (step > 1 and abs(value * step - declared) < _OF_STEP * declared)
+    causes += [
+        "this is half of it, as the excess noise of an electron-multiplying register (F² = 2) "
+        "gives at the right declared gain: if the camera has one, keep the declared gain; else "
+    ] * (abs(2 * value - declared) < max(6 * error, 0.02 * declared))
     return [
         f"photon transfer gives a gain of {value:.4g} ± {error:.2g} e-/ADU, not the "
-        f"{declared:g} of detector.gain_e_per_adu: "
-        + (
-            f"samples are multiples of {step:g} ADU, so the gain of one step of the converter "
-            f"must be divided by {step:g}; "
-            if step > 1 and abs(value * step - declared) < _OF_STEP * declared
-            else ""
-        )
+        f"{declared:g} of detector.gain_e_per_adu: {''.join(causes)}"
         + (
             "correct it or use '--gain measured', unless the diagnosis names an effect that "
             "changes it; the declared value is used now"

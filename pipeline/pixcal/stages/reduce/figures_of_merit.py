@@ -21,6 +21,7 @@ from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.halves import Window, frames_of, middle_of, read_halves
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduce.outputs import outputs_of, report_outputs
+from pixcal.stages.reduce.read_noise import Nearby
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.manifest import write_json
@@ -35,7 +36,13 @@ _WELL = 0.97  # share of the converter's range below which saturation is due to 
 
 
 def characterise(
-    made: Build, source: Ingested, job: Measuring, summary: Summary, facts: Json, runtime: Runtime
+    made: Build,
+    source: Ingested,
+    job: Measuring,
+    summary: Summary,
+    nearby: Nearby | None,
+    facts: Json,
+    runtime: Runtime,
 ) -> Json:
     """Figures of merit, by name; writes their curves to ``figures_of_merit.json``.
 
@@ -57,7 +64,7 @@ def characterise(
         note = report_outputs(outputs, gain[0], facts)
     found: Json = {"conversion_gain": _figure("conversion gain", "e-/ADU", gain, note)}
     noise = _read_noise(found, summary, gain[0], source.quantum)
-    _line_noise(found, dark, gain[0], job.shape)
+    _line_noise(found, dark, gain[0], job.shape, nearby)
     if top is not None:
         _full_well(found, gain, top, reached, noise)
     if facts["linearity"] is not None:
@@ -112,11 +119,14 @@ def _read_noise(found: Json, summary: Summary, gain: float, step: float) -> Meas
     return whole
 
 
-def _line_noise(found: Json, dark: F64, gain: float, shape: tuple[int, int]) -> None:
+def _line_noise(
+    found: Json, dark: F64, gain: float, shape: tuple[int, int], nearby: Nearby | None
+) -> None:
     """Temporal noise common to the pixels of a row, or of a column."""
     lengths = {"row": shape[1], "column": shape[0]}
     for name, (shared, error) in shared_by_lines(dark).items():
-        if shared:
+        # What near pixels alone share is of a filter.
+        if shared and (nearby is None or nearby.lines[name] > shared / 2):
             # Each line of each pair of frames is one sample of it.
             error = math.hypot(error, shared * math.sqrt(2 * lengths[name] / dark[:, 0].sum()))
             noise = math.sqrt(shared)

@@ -1,7 +1,8 @@
 """Noise of frames without light: of samples, of common lines, and of the mean level."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from pixcal.estimators.detector.calibration import usual_rate
 from pixcal.estimators.detector.code_density import step_of
 from pixcal.estimators.detector.emva import Measure
 from pixcal.estimators.detector.missing_codes import missing_codes, noise_before_missing_codes
-from pixcal.estimators.detector.pair_noise import shared_by_blocks
+from pixcal.estimators.detector.pair_noise import LINES, along_lines, shared_by_blocks
 from pixcal.kernels.photon_transfer import BLOCK
 from pixcal.kernels.rounding import SHEPPARD, noise_before_rounding
 from pixcal.model.arrays import F32, F64
@@ -24,15 +25,52 @@ from pixcal.storage.place import Place
 # alike.
 _CUT_OFF, _COARSE_CUT_OFF = 0.006, 0.004
 _LEAST = 0.05  # smallest measurable noise, in steps
+_FILTERED = 0.1  # least correlation of neighbours in filtered samples
+_LINE_ERRORS = 3.0  # errors by which noise common to lines may be larger than it appears
 _PAIRS, _SAMPLES = 16, 1 << 20  # pairs, and samples of each frame, that measure block noise
 
 
 def lost_in_blocks(job: Measuring) -> Measure:
     """Variance (ADU²) that `pair_statistics` removes with the means of its blocks; its error."""
+    found = [shared_by_blocks(pair, job.quantum) for pair in _pairs(job)]
+    if not found:
+        return 0.0, 0.0
+    mean = max(float(np.mean(found)), 0.0)
+    return mean, float(np.std(found, ddof=1)) / math.sqrt(len(found)) if len(found) > 1 else mean
+
+
+@dataclass(frozen=True)
+class Nearby:
+    """Noise that neighbours share in frames without light."""
+
+    near: dict[str, float]  # by line: correlation of next neighbours beyond that of far ones
+    lines: dict[str, float]  # most variance (ADU²) that all pixels of the line share
+
+    @classmethod
+    def of(cls, job: Measuring, variance: float) -> "Nearby | None":
+        """Of the read-noise series, whose samples have a variance (ADU²)."""
+        found = np.array([along_lines(pair, job.quantum) for pair in _pairs(job)])
+        if len(found) < 2 or not variance > 0:
+            return None
+        near, far = np.moveaxis(found.mean(axis=0), 1, 0)
+        error = found[:, :, 1].std(axis=0, ddof=1) / math.sqrt(len(found))
+        return cls(
+            dict(zip(LINES, ((near - far) / variance).tolist(), strict=True)),
+            dict(zip(LINES, (far + _LINE_ERRORS * error).tolist(), strict=True)),
+        )
+
+    @property
+    def filtered(self) -> bool:
+        """Whether samples were filtered before they were written."""
+        return max(self.near.values()) > _FILTERED
+
+
+def _pairs(job: Measuring) -> Iterator[F32]:
+    """Differences (y, x), of full blocks, of successive frames of the read-noise series."""
     series = job.read_series
     ny, nx = (n // BLOCK * BLOCK for n in job.shape)
     if series is None or min(ny, nx) < 2 * BLOCK:
-        return 0.0, 0.0
+        return
     reader = job.frames[series.array]
     apart = BLOCK * max(ny * nx // _SAMPLES, 1)
 
@@ -42,10 +80,8 @@ def lost_in_blocks(job: Measuring) -> Measure:
         ]
         return np.asarray(np.concatenate(parts, axis=1)[0], np.float32)
 
-    pairs = list(zip(series.frames[::2], series.frames[1::2], strict=False))[:_PAIRS]
-    found = [shared_by_blocks(sample(a) - sample(b), job.quantum) for a, b in pairs]
-    mean = max(float(np.mean(found)), 0.0)
-    return mean, float(np.std(found, ddof=1)) / math.sqrt(len(found)) if len(found) > 1 else mean
+    for a, b in list(zip(series.frames[::2], series.frames[1::2], strict=False))[:_PAIRS]:
+        yield sample(a) - sample(b)
 
 
 def dark_rate(folder: Place, job: Measuring) -> float:

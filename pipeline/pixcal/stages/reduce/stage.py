@@ -35,6 +35,7 @@ from pixcal.stages.reduce.frame_statistics import (
 )
 from pixcal.stages.reduce.fringe_sets import Bounds, set_warnings, share_at_mean, write_set
 from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.reduce.read_noise import Nearby
 from pixcal.stages.reduce.subtracted import subtracted_rate, subtracted_warnings
 from pixcal.stages.tiles import STRIP, indices, span, strips
 from pixcal.storage.artefact import Build, Workspace
@@ -234,7 +235,8 @@ def _report(
     piled = source.saturation_found if source.detector.saturation_adu is None else None
     warnings = [*source.exposures.warnings, *cut_off_warnings(source.cut_off)]
     warnings += subtracted_warnings(job.subtracted, found.gain)
-    warnings += detector_warnings(summary, found.gain, piled)
+    nearby = summary.read_noise and Nearby.of(job, summary.read_noise[0] ** 2)
+    warnings += detector_warnings(summary, found.gain, piled, nearby)
     if source.survey is not None and source.exposures.known:
         light = source.survey.levels
         warnings += lamp_warnings([(g.exptime, light[list(g.frames)]) for g in job.flat])
@@ -265,7 +267,7 @@ def _report(
         "sets": sets,
         "warnings": warnings,
     }
-    report["figures_of_merit"] = characterise(made, source, job, summary, report, runtime)
+    report["figures_of_merit"] = characterise(made, source, job, summary, nearby, report, runtime)
     write_json(made.folder / "reduce.json", report)
     made.summary.update({key: report[key] for key in ("gain_e_per_adu", "flags", "warnings")})
 
