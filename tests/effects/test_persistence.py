@@ -1,5 +1,6 @@
 """Charge that comes out of traps in frames without light: found again, and simulated so."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.recording import recordings
+from pixcal.stages.advice import size_of
 from pixcal.stages.diagnose.frames import in_series
 
 BIAS, READ_NOISE, SHAPE = 300.0, 6.0, (37, 41)
@@ -77,6 +79,14 @@ def test_traps_are_found_again_by_frames_or_by_time(
     assert isinstance(estimate.effect, Lag)
     assert (estimate.effect.decay_s > 0) == in_seconds
     assert estimate.significance > 20
+    # What is told names the share and the decay.
+    told = size_of({"size": estimate.size})
+    words = re.fullmatch(r"(\S+) ± \S+ % of the signal, decays over (\S+) (\w+)", told)
+    assert words is not None, told
+    share, decays, unit = words.groups()
+    assert float(share) == pytest.approx(100 * found.share, rel=0.01)
+    assert float(decays) == pytest.approx(found.decay, rel=0.05)
+    assert unit == ("s" if in_seconds else "frames")
 
 
 def test_a_camera_without_traps_has_none() -> None:

@@ -25,7 +25,7 @@ from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench, SimulatedDetector
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
-from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.effect import NONZERO, Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 TAIL = 1e-3  # truncated tail of the release, added to the last frame; share of the charge left
@@ -278,7 +278,7 @@ class Lag(Effect):
                 before = "a clear; a shutter or lamp that gives the first frame less light looks "
                 before += "the same: take darks at once after flats"
                 before += ", and three flats per level" if pairs else ""
-            return Estimate(
+            return _estimate(
                 cls(float(np.clip(share, 0, 0.5)), 0.0, 0.0, carried=carried),
                 {"share": error},
                 share / error,
@@ -305,7 +305,7 @@ class Lag(Effect):
         whole, of_level = _by_level(part, whole) if sure else (whole, {})
         quiet, quiet_error = _quiet(part, whole) if sure else (0.0, 1.0)
         decay = whole.decay_frames if whole.capacity_e else min(common.decay_frames, MAX_DECAY)
-        return Estimate(
+        return _estimate(
             replace(whole, decay_frames=decay, spread=min(spread, 1.0), quiet=quiet),
             {
                 "share": common.share_error,
@@ -324,7 +324,7 @@ class Lag(Effect):
         share = float(np.clip(found.share, 0, 0.5))
         lag = cls(share, 0.0 if found.in_seconds else found.decay, 0.0, carried=1.0)
         lag = replace(lag, decay_s=found.decay) if found.in_seconds else lag
-        return Estimate(
+        return _estimate(
             lag,
             {
                 "share": found.share_error,
@@ -339,6 +339,18 @@ class Lag(Effect):
         """Frames without a lag, and the shares that appear 1, 2, ... frames later."""
         lag = cls(share, decay_frames)
         return lag.restored(frames), share * lag.releases
+
+
+def _estimate(lag: Lag, errors: dict[str, float], sigmas: float, why: str) -> Estimate:
+    """An estimate whose size tells the share, and the decay where it is known."""
+    of, decays = "of the signal", {"decay_s": (lag.decay_s, "s")}
+    if not lag.later:
+        decays["decay_frames"] = lag.decay_frames, "frames"
+    for name, (decay, unit) in decays.items():
+        if decay > NONZERO * errors.get(name, np.inf):
+            of += f", decays over {float(f'{decay:.2g}'):g} {unit}"
+    size = {"value": lag.share, "error": errors["share"], "unit": "", "of": of}
+    return Estimate(lag, errors, sigmas, why, size=size if lag.share else {})
 
 
 @lru_cache(maxsize=4)
