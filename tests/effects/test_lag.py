@@ -84,14 +84,71 @@ def test_pixels_differ_by_the_spread(make_effect_bench: Callable[..., Bench]) ->
     assert shares.std() == pytest.approx(0.03, rel=4 / np.sqrt(2 * shares.size))
 
 
-def test_long_lag_does_not_depend_on_where_one_begins(
+@pytest.mark.parametrize(
+    "lag",
+    [
+        Lag(0.05, 1.2, 0.1, carried=0.7),
+        Lag(0.05, 0.3, 0.1, quiet=0.4),
+        Lag(0.05, later=(0.5, 0.3, 0.2), carried=1.0),
+        Lag(0.05, 0.8, 0.2, capacity_e=300.0, carried=1.0),
+        Lag(0.05, carried=1.0, decay_s=2.0),
+    ],
+)
+def test_frames_depend_neither_on_their_order_nor_on_where_one_begins(
+    make_effect_bench: Callable[..., Bench], lag: Lag
+) -> None:
+    bench = make_effect_bench(SMALL)
+    flat, fringes = of_kind(bench, "flat"), of_kind(bench, "fringes")
+    fringes = replace(fringes, before=replace(flat, count=9))
+    whole = frames_of(bench, fringes, [lag])
+    order = [31, 30, 39, 2, 35, 36, 3, 0, 12]
+    for n, samples in Camera(bench, (5, 18), [lag]).expose(fringes, order):
+        assert np.array_equal(samples, whole[n, 5:18])
+    camera, again = Camera(bench, (0, 23), [lag]), []
+    for recording in (fringes.before, fringes, fringes.before):
+        again += [samples.copy() for _, samples in camera.expose(recording, range(9))]
+    assert np.array_equal(again[9:18], whole[:9])
+    assert np.array_equal(again[18:], again[:9])
+
+
+def test_released_charge_is_lost_once_and_stays_white(
     make_effect_bench: Callable[..., Bench],
 ) -> None:
-    bench, lag = make_effect_bench(SMALL), Lag(0.05, 2.5, 0.1)
-    fringes = of_kind(bench, "fringes")
-    whole = frames_of(bench, fringes, [lag])
-    for n, samples in Camera(bench, (5, 18), [lag]).expose(fringes, range(31, 35)):
-        assert np.array_equal(samples, whole[n, 5:18])
+    """Frames in the dark share what a bright one left: in all, no more than that."""
+    changes = {"detector.read_noise_e": 0.0, "detector.dark_e_s": 0.0, "detector.prnu_rms": 0.0}
+    bench = make_effect_bench({**FLATS, **changes})
+    flat, dark = of_kind(bench, "flat"), of_kind(bench, "dark")
+    lag = Lag(0.1, 2.0, 0.0, carried=1.0)
+    after = replace(dark, before=replace(flat, count=1), count=12)
+    plain = frames_of(bench, after)
+    late = frames_of(bench, after, [lag])[:, plain[0] == bench.detector.bias_adu].astype(float)
+    late -= bench.detector.bias_adu  # without hot pixels
+    n = late.shape[1]
+    of_all = flat.electrons * 0.1 * (1 - np.exp(-12 / 2))
+    assert late.sum(axis=0).mean() == pytest.approx(of_all, abs=5 * np.sqrt(of_all / n))
+    # Released by chance, electron by electron: counts of different frames are independent.
+    variance, mean = late.var(axis=1)[:5], late.mean(axis=1)[:5]
+    np.testing.assert_allclose(variance, mean, rtol=5 * np.sqrt(2 / n))
+    correlated = np.corrcoef(late[:5])[np.triu_indices(5, 1)]
+    np.testing.assert_allclose(correlated, 0, atol=5 / np.sqrt(n))
+
+
+def test_a_frame_of_long_lag_is_computed_once(
+    make_effect_bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the order of time, each frame is one step, over all recordings."""
+    bench, lag = make_effect_bench(SMALL), Lag(0.05, carried=1.0, decay_s=20.0)
+    flat, fringes = of_kind(bench, "flat"), of_kind(bench, "fringes")
+    fringes, made = replace(fringes, before=flat), []
+    counted = Lag.carry
+    monkeypatch.setattr(
+        Lag, "carry", lambda self, *args: (made.append(args[2].frame), counted(self, *args))[1]
+    )
+    camera = Camera(bench, (0, 23), [lag])
+    for recording in (flat, fringes):
+        for _ in camera.expose(recording, range(recording.count)):
+            pass
+    assert len(made) == flat.count + fringes.count
 
 
 def test_noise_is_drawn_once_for_a_frame_wherever_one_begins(
@@ -106,10 +163,11 @@ def test_noise_is_drawn_once_for_a_frame_wherever_one_begins(
         return pixel_normals(key, frame, rows, columns)
 
     monkeypatch.setattr(exposure, "pixel_normals", counted)
-    for _ in Camera(bench, (5, 18), [lag]).expose(fringes, range(20, 35)):
+    for _ in Camera(bench, (5, 18), [lag]).expose(fringes, range(33, 38)):
         pass
     own = sorted(frame for key, frame in drawn if key == fringes.effect_key(lag.name))
-    assert own == list(range(20 - lag.frames_back, 35))
+    assert lag.memory.block == 32
+    assert own == list(range(32 - lag.frames_back, 38))
 
 
 FULL = Lag(0.03, 0.0, 0.0, (2.0, 1.2, 0.8, 0.3), 40_000.0, (0.6, 0.3, 0.1))

@@ -1,6 +1,5 @@
 """Charge that stays behind in the pixel and comes out with later frames."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -26,10 +25,11 @@ from pixcal.model.bench import Bench, SimulatedDetector
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import NONZERO, Effect, Estimate, Stage
+from pixcal.simulation.memory import Memory
 from pixcal.simulation.shot import Shot
 
-TAIL = 1e-3  # truncated tail of the release, added to the last frame; share of the charge left
-MOST_BACK = 60  # frames from which charge is released over seconds
+TAIL = 1e-4  # share of the charge left whose release is neglected
+MOST_BACK = 256  # preceding frames that count if the release is over seconds
 _TELL_LAMP = 3  # fewest flats per level to distinguish a warming lamp from lag
 
 
@@ -127,18 +127,23 @@ class Lag(Effect):
     @property
     def releases(self) -> F64:
         """Shares of the charge left that appear 1, 2, ... frames later; their sum is one."""
-        if sum(self.later) > 0 and not self.capacity_e:
+        if self._by_frame:
             return np.array(self.later) / sum(self.later)
-        if not self.decay_frames:
-            return np.ones(1)
-        keep = self._keep
-        count = int(np.ceil(np.log(TAIL) / np.log(keep)))
-        releases = (1 - keep) * keep ** np.arange(count, dtype=float)
+        count = int(np.ceil(np.log(TAIL) / np.log(self._keep))) if self._keep else 1
+        releases = (1 - self._keep) * self._keep ** np.arange(count, dtype=float)
         return np.asarray(releases / releases.sum())
 
     @property
-    def frames_back(self) -> int:
-        return MOST_BACK if self.decay_s else len(self.releases)
+    def memory(self) -> Memory:
+        """As in `ForwardModel.memory`."""
+        fades = bool(self.decay_s) or (bool(self._keep) and not self._by_frame)
+        frames = MOST_BACK if self.decay_s else len(self.releases)
+        return Memory(frames, fades, cleared=not self.carried)
+
+    @property
+    def _by_frame(self) -> bool:
+        """Whether each of the next frames gets a part of its own."""
+        return sum(self.later) > 0 and not (self.capacity_e or self.decay_s)
 
     @property
     def _keep(self) -> float:
@@ -153,65 +158,49 @@ class Lag(Effect):
                 "instead, or remove capacity_e"
             )
 
-    def charge(self, charge: F32, shot: Shot) -> F32:
+    def carry(self, charge: F32, state: F32 | None, shot: Shot) -> tuple[F32, F32]:
+        """As in `ForwardModel.carry`; the state (part, y, x) is the charge held, e-.
+
+        One part, or what each of the frames before left, from the last one on.
+        """
+        releases = self.releases if self._by_frame else np.array([1 - self._kept(shot)])
+        held = np.zeros((len(releases), *charge.shape), np.float32) if state is None else state
+        if state is not None and shot.frame == 0:
+            held = np.float32(self._since_last(shot)) * held
+        released = self._released(held, releases, shot)
+        left = self._left_behind(charge, shot)
+        stays = self._left_behind(charge, shot, 1 - self.quiet) if self.quiet else left
+        if self._by_frame:
+            return charge - left + released, np.concatenate([stays[None], held[:-1]])
+        rest = held[0] - released
         if self.capacity_e:
-            return self._with_traps(charge, shot)
-        found = charge - self._left_behind(charge, shot, shot.frame)
-        drawn = np.zeros_like(charge)
-        for back, release in enumerate(self._released(shot), start=1):
-            before = self._charge_before(shot, back)
-            if before is None:
-                break
-            stayed = self._left_behind(before, shot, shot.frame - back, 1 - self.quiet)
-            found += np.float32(release) * stayed
-            drawn += np.float32(release * (1 - release)) * stayed
+            room = _shares(self, shot.bench.detector, shot.rows) / np.float32(self.share)
+            room = np.maximum(room * np.float32(self.capacity_e) - rest, 0)
+            left, stays = np.minimum(left, room), np.minimum(stays, room)
+        return charge - left + released, (rest + stays)[None]
+
+    def _kept(self, shot: Shot) -> float:
+        """Share of the held charge that a frame does not release."""
+        if not self.decay_s:
+            return self._keep
+        return float(np.exp((shot.time_s - shot.end_of(shot.frame)) / self.decay_s))
+
+    def _since_last(self, shot: Shot) -> float:
+        """Share of the held charge that is left when a recording begins."""
+        pause = max(shot.time_s - shot.end_of(-1), 0.0) if self.decay_s else 0.0
+        return self.carried * float(np.exp(-pause / self.decay_s)) if pause else self.carried
+
+    def _released(self, held: F32, releases: F64, shot: Shot) -> F32:
+        """Charge (y, x) that a frame gets; each electron is released by chance."""
+        found: F32 = np.zeros_like(held[0])
+        drawn = np.zeros_like(found)
+        for release, part in zip(releases, held, strict=True):
+            found += np.float32(release) * part
+            drawn += np.float32(release * (1 - release)) * part
         if shot.bench.shot_noise and self.quiet < 1 and drawn.any():
-            # Each electron is released in a frame by chance.
             normals = shot.normals(f"{self.name} release")
             found += np.sqrt(np.float32(1 - self.quiet) * np.maximum(drawn, 0)) * normals
         return found
-
-    def _released(self, shot: Shot) -> Iterator[float]:
-        """Shares of the charge left by the frames before, from the last one on, in this frame."""
-        if not self.decay_s:
-            yield from self.releases
-            return
-        begin, end = shot.start_of(shot.frame), shot.end_of(shot.frame)
-        for back in range(1, MOST_BACK + 1):
-            if shot.charge(shot.frame - back) is None:
-                return
-            left_at = min(shot.end_of(shot.frame - back), begin)
-            held = np.exp(-(begin - left_at) / self.decay_s)
-            if held < TAIL:
-                return
-            yield float(held - np.exp(-(end - left_at) / self.decay_s))
-
-    def _charge_before(self, shot: Shot, back: int) -> F32 | None:
-        """Charge of an earlier frame, if carried over; None if there is none."""
-        if back <= shot.frame:
-            return shot.charge(shot.frame - back)
-        charge = shot.charge(shot.frame - back) if self.carried else None
-        return None if charge is None else np.float32(self.carried) * charge
-
-    def _with_traps(self, charge: F32, shot: Shot) -> F32:
-        """A frame minus the charge that traps capture, plus charge released from earlier frames."""
-        scale = _shares(self, shot.bench.detector, shot.rows) / np.float32(self.share)
-        held = np.zeros_like(charge)
-        for back in range(self.frames_back, 0, -1):
-            before = self._charge_before(shot, back)
-            if before is not None:
-                held = self._held(held, before, scale, shot, shot.frame - back, 1 - self.quiet)
-        return np.asarray(charge + held - self._held(held, charge, scale, shot, shot.frame))
-
-    def _held(
-        self, held: F32, charge: F32, scale: F32, shot: Shot, frame: int, noisy: float = 1.0
-    ) -> F32:
-        """Charge in the traps after a frame, e-; electrons are captured independently."""
-        taken = scale * self._left(np.maximum(charge, 0))
-        if shot.bench.shot_noise and noisy > 0:
-            taken += np.sqrt(np.float32(noisy) * taken) * shot.normals(self.name, frame)
-        full = np.float32(self._keep) * held + np.maximum(taken, 0)
-        return np.asarray(np.minimum(full, scale * np.float32(self.capacity_e)))
 
     def lost(self, charge: F32) -> tuple[F32, F32]:
         """Mean net loss of frames, and charge released from earlier ones; both (t, ...), e-.
@@ -219,19 +208,19 @@ class Lag(Effect):
         ``charge``: (t, ...) e-, in the order of time without gaps; the first one after darkness.
         """
         taken = self._left(charge)
-        if self.capacity_e:
-            return fill_traps(taken, self._keep, self.capacity_e)
+        if not self._by_frame:
+            return fill_traps(taken, self._keep, self.capacity_e or np.inf)
         released = np.zeros_like(taken)
         for back, release in enumerate(self.releases, start=1):
             released[back:] += np.float32(release) * taken[:-back]
         return taken - released, released
 
-    def _left_behind(self, charge: F32, shot: Shot, frame: int, noisy: float = 1.0) -> F32:
+    def _left_behind(self, charge: F32, shot: Shot, noisy: float = 1.0) -> F32:
         """Electrons of a frame that stay, each independently, so that noise stays white."""
         share = _shares(self, shot.bench.detector, shot.rows)
         noise = np.zeros_like(charge)
         if shot.bench.shot_noise and noisy > 0:
-            noise = shot.normals(self.name, frame) * np.float32(np.sqrt(noisy))
+            noise = shot.normals(self.name) * np.float32(np.sqrt(noisy))
         return left_behind(charge, share, *_bands(self), noise)
 
     def _left(self, charge: F32) -> F32:

@@ -27,6 +27,7 @@ from pixcal.kernels.scene import (
 from pixcal.model.arrays import F32, U16
 from pixcal.model.bench import Bench
 from pixcal.simulation.forward import ForwardModel
+from pixcal.simulation.memory import Carried
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.shot import Shot
 
@@ -57,6 +58,7 @@ class Camera:
         self.maps = detector_maps(bench.detector, self.rows) if maps is None else maps.on(self.rows)
         for effect in self.effects:
             self.maps = effect.detector(self.maps, bench, self.rows)
+        self.carried = {n: Carried(e, n) for n, e in enumerate(self.effects) if e.memory}
 
     def expose(self, recording: Recording, frames: Iterable[int]) -> Iterator[tuple[int, U16]]:
         """Frames of these numbers as read out: number and samples, ADU (array reused)."""
@@ -103,7 +105,7 @@ class _Chain:
         d = camera.bench.detector
         self.dark = camera.maps.dark_rate * np.float32(recording.exptime_s)
         self.well = np.inf if d.full_well_e is None else d.full_well_e
-        back = [1 + e.frames_back for e in self.effects if e.frames_back]
+        back = [e.frames_kept for e in self.effects if e.frames_kept]
         # Of a frame and preceding ones, each before and after the effect that uses them.
         self._charges = _Latest[tuple[int, int]](2 * max(back, default=1))
         self._kept_normals = _Latest[tuple[int, str]](sum(back))
@@ -185,6 +187,9 @@ class _Chain:
         shot = self._normals(frame)[0]
         synthesis.collect(light, self.dark, shot, bench.shot_noise, self.well, charge)
         for at, effect in enumerate(self.effects[:upto]):
+            if at in self.camera.carried:
+                charge = self.camera.carried[at].charge(charge, self, frame)
+                continue
             if effect.frames_back:
                 self._charges.keep((frame, at), charge)
             charge = effect.charge(charge, Shot(self, frame, at))

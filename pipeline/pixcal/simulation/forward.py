@@ -18,6 +18,7 @@ from pixcal.kernels.beams import Light, LightMaps
 from pixcal.kernels.scene import DetectorMaps, FrameStates, Rows
 from pixcal.model.arrays import F32
 from pixcal.model.bench import Bench
+from pixcal.simulation.memory import KEPT, Memory
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.shot import Shot
 
@@ -107,7 +108,19 @@ class ForwardModel(Scalable):
     @property
     def frames_back(self) -> int:
         """Number of preceding frames on whose charge a frame depends."""
-        return 0
+        return 0 if self.memory is None else self.memory.frames
+
+    @property
+    def frames_kept(self) -> int:
+        """Number of frames whose charge or state a simulation keeps for it."""
+        if self.memory is not None:
+            return KEPT
+        return 1 + self.frames_back if self.frames_back else 0
+
+    @property
+    def memory(self) -> Memory | None:
+        """How a frame depends on the ones before it, if `carry` tells; None: it does not."""
+        return None
 
     # Its action on the frames.
 
@@ -142,6 +155,13 @@ class ForwardModel(Scalable):
         The argument is kept for later frames: return another array, or the same unchanged.
         """
         return charge
+
+    def carry(self, charge: F32, state: F32 | None, shot: Shot) -> tuple[F32, F32]:
+        """As `charge`, for effects with a `memory`: also the state left to the next frame.
+
+        ``state``: what the frame before left; None if nothing is known before it.
+        """
+        raise NotImplementedError
 
     def signal(self, signal: F32, shot: Shot) -> F32:
         """Signal (y, x) at the amplifiers, in electrons."""

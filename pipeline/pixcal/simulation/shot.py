@@ -106,6 +106,6 @@ class Shot:
         """
         chain, frame = self._chain.of(self.frame if frame is None else frame)
         own = chain.effects[self._at]
-        again = own.frames_back > 0 and effect == own.name
+        again = own.frames_back > 0 and effect.startswith(own.name)
         normals: F32 = chain.normals(effect, frame, keep=again)
         return normals

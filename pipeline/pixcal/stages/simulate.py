@@ -125,7 +125,7 @@ def _fitting(
 ) -> Runtime:
     """The runtime with as many workers as fit the memory."""
     ny, nx = bench.detector.shape
-    back = sum(1 + e.frames_back for e in effects if e.frames_back)
+    back = sum(e.frames_kept for e in effects)
     need = min(ny, synthesis.BLOCK_ROWS) * nx * (_BYTES_PER_PIXEL + _BYTES_PER_FRAME_BACK * back)
     for recording in recorded:
         if recording.folder in bench.frames.compress:
@@ -139,15 +139,17 @@ def _write_frames(
 ) -> None:
     batches: list[list[Span]] = [[]]
     ready: list[Callable[[], Path]] = []
+    # A task computes the memory of its first frame anew.
+    most = max([FRAMES_PER_TASK, *(e.memory.block for e in effects if e.memory)])
     for recording in recorded:
         files = _create_files(bench, recording, folder)
         packed = recording.folder in bench.frames.compress
         ready += [file.finish_compressed if packed else file.finish for file in files]
-        for first in range(0, recording.count, FRAMES_PER_TASK):
-            frames = range(first, min(first + FRAMES_PER_TASK, recording.count))
+        for first in range(0, recording.count, most):
+            frames = range(first, min(first + most, recording.count))
             used = {n // bench.frames.per_file for n in frames}
-            # Short spans together, so that a task has about `FRAMES_PER_TASK` frames.
-            if sum(len(s[1]) for s in batches[-1]) + len(frames) > FRAMES_PER_TASK:
+            # Short spans together, so that a task has about as many frames.
+            if sum(len(s[1]) for s in batches[-1]) + len(frames) > most:
                 batches.append([])
             batches[-1].append((recording, frames, {n: files[n] for n in used}))
     pieces = list(product(row_blocks(bench), filter(None, batches)))
