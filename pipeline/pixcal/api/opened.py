@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from pixcal.storage.products import read_map
 from pixcal.storage.stage import read_acquisition, require
 
 DETECTOR_MAPS = ("bias", "dark_rate", "flat", "read_noise", "mask")
+T = TypeVar("T")
 SERIES = ("time", "B", "A", "phi", "dkx", "dky")
 
 
@@ -228,6 +229,13 @@ class Run:
         return self.path / "products" / "report.html"
 
 
+class Stored(cached_property[T]):
+    """An array of a `FringeSet`, of its own name: read on first use and kept."""
+
+    def __init__(self) -> None:
+        super().__init__(lambda fringes: fringes._array(self.attrname))
+
+
 @dataclass(frozen=True)
 class FringeSet:
     """One fringe set as fitted. Arrays are read on first use and kept.
@@ -236,6 +244,16 @@ class FringeSet:
     ----------
     name : str
     run : Run
+    delta, sigma : (y, x) float32
+        Offset along the set's fringe axis and its 1-sigma error, px; NaN where masked.
+    iota, alpha : (y, x) float32
+        Mean level, and amplitude of the fringes, e-.
+    chi2 : (y, x) float32
+        Reduced chi-square.
+    mask : (y, x) uint8
+        Bits of `pixcal.PixelFlag`.
+    batch_delta, batch_sigma : (batch, y, x) float32
+        Offsets from each batch of frames alone, relative to the whole run's, and their errors, px.
     """
 
     name: str
@@ -251,49 +269,14 @@ class FringeSet:
         """Its entry in ``allan.json``: the Allan deviation against averaging length."""
         return dict(self.run.allan["sets"][self.name])
 
-    def _array(self, name: str) -> NDArray[Any]:
-        with damage_noted(self.run.path):
-            return ArrayReader(self.run.path / "fit" / "fit.zarr" / self.name / name).read()
-
-    @cached_property
-    def delta(self) -> F32:
-        """(y, x): offset along the set's fringe axis, px; NaN where masked."""
-        return self._array("delta")
-
-    @cached_property
-    def sigma(self) -> F32:
-        """(y, x): 1-sigma error of ``delta``, px."""
-        return self._array("sigma")
-
-    @cached_property
-    def iota(self) -> F32:
-        """(y, x): mean level, e-."""
-        return self._array("iota")
-
-    @cached_property
-    def alpha(self) -> F32:
-        """(y, x): amplitude of the fringes, e-."""
-        return self._array("alpha")
-
-    @cached_property
-    def chi2(self) -> F32:
-        """(y, x): reduced chi-square."""
-        return self._array("chi2")
-
-    @cached_property
-    def mask(self) -> U8:
-        """(y, x): bits of `pixcal.PixelFlag`."""
-        return self._array("mask")
-
-    @cached_property
-    def batch_delta(self) -> F32:
-        """(batch, y, x): offsets from each batch of frames alone, relative to the whole run's."""
-        return self._array("batch_delta")
-
-    @cached_property
-    def batch_sigma(self) -> F32:
-        """(batch, y, x): errors of ``batch_delta``, px."""
-        return self._array("batch_sigma")
+    delta = Stored[F32]()
+    sigma = Stored[F32]()
+    iota = Stored[F32]()
+    alpha = Stored[F32]()
+    chi2 = Stored[F32]()
+    mask = Stored[U8]()
+    batch_delta = Stored[F32]()
+    batch_sigma = Stored[F32]()
 
     @cached_property
     def series(self) -> dict[str, F64]:
@@ -303,6 +286,10 @@ class FringeSet:
         ``dky`` (change of the fringe vector, rad/px).
         """
         return {name: self._array(name).astype(np.float64) for name in SERIES}
+
+    def _array(self, name: str) -> NDArray[Any]:
+        with damage_noted(self.run.path):
+            return ArrayReader(self.run.path / "fit" / "fit.zarr" / self.name / name).read()
 
     def allan_picture(self) -> Picture:
         """The Allan deviation beside the square-root law, as the report shows it."""
