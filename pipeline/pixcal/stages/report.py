@@ -1,6 +1,7 @@
 """Report: one HTML page on the whole run."""
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Mapping
 from functools import partial
 from operator import call
 from pathlib import Path
@@ -13,7 +14,6 @@ from pixcal.effects import effects
 from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.test_statistics.gap import FALSE_ALARM_RATE, sigmas_among, sigmas_of
-from pixcal.model.arrays import Source
 from pixcal.model.config import result_options
 from pixcal.model.options import Report as Config
 from pixcal.report.contents import (
@@ -71,29 +71,24 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime) -> Contents:
     facts = _optional_json(run_dir / "reduce" / "reduce.json")
     fit = read_json(run_dir / "fit" / "fit.json") if "fit" in manifests else None
-    allan = read_json(run_dir / "allan" / "allan.json") if "allan" in manifests else {}
-    used = maps_to_use(run_dir) if fit is not None else {}
-    corrected = [name for name, path in used.items() if path.stem != name]
-    results = _summaries(_jobs(run_dir, fit, corrected), runtime)
-    summary = advice(run_dir)
+    arrays, summary = _arrays(run_dir, manifests), advice(run_dir)
+    columns = max((a["shape"][1] for a in arrays.values() if "shape" in a), default=0)
+    made = _summaries(_jobs(run_dir, fit, "allan" in manifests), columns, runtime)
     return Contents(
         acquisition=read_json(run_dir / "ingest" / "acquisition.json"),
         stages=tuple(map(vars, manifests.values())),
-        arrays=_arrays(run_dir, manifests),
+        arrays=arrays,
         detector=DetectorContents(
             facts,
-            {n: results[f"detector/{n}"] for n in DETECTOR_MAPS if f"detector/{n}" in results},
+            made["detector"],
             _optional_json(run_dir / "reduce" / "figures_of_merit.json"),
-            results.get("flags/detector"),
+            made["flags"].get("detector"),
         ),
         fit=fit,
-        offsets=tuple(_offset(name, results) for name in (fit["outputs"] if fit else ())),
-        corrected=tuple(_offset(f"corrected/{name}", results) for name in corrected),
-        sets=tuple(
-            _set(run_dir / "fit" / "fit.zarr", name, of_set, allan.get("sets", {}), results)
-            for name, of_set in (fit["sets"].items() if fit else ())
-        ),
-        flags=results.get("flags/products"),
+        offsets=tuple(made["offsets"].values()),
+        corrected=tuple(made["corrected"].values()),
+        sets=tuple(made["set"].values()),
+        flags=made["flags"].get("products"),
         diagnosis=(
             _diagnosis(run_dir / "diagnose", nothing_to_do=summary.nothing_to_do)
             if "diagnose" in manifests
@@ -108,62 +103,66 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
 # Maps
 
 
-def _jobs(
-    run_dir: Path, fit: Mapping[str, Any] | None, corrected: Sequence[str]
-) -> dict[str, partial[Any]]:
-    """Every summary of a map that the page shows, by name."""
+Jobs = dict[tuple[str, str], partial[Any]]  # by kind and name
+
+
+def _jobs(run_dir: Path, fit: Mapping[str, Any] | None, with_allan: bool) -> Jobs:
+    """What is to be read of the maps that the page shows."""
     calibration, group = run_dir / "reduce" / "calibration.zarr", run_dir / "fit" / "fit.zarr"
-    corrected_zarr = run_dir / "corrected" / "corrected.zarr"
-    there = [name for name in (*DETECTOR_MAPS, "mask") if (calibration / name / INDEX).exists()]
-    maps: dict[str, Source] = {f"detector/{n}": ArrayReader(calibration / n) for n in there}
-    masks = {"detector": maps.pop("detector/mask")} if "mask" in there else {}
-    jobs: dict[str, partial[Any]] = {}
+    masks = {"detector": calibration / "mask"}
+    jobs: Jobs = {}
+    for name in DETECTOR_MAPS:
+        if (calibration / name / INDEX).exists():
+            jobs["detector", name] = partial(summarise, ArrayReader(calibration / name))
     if fit is not None:
-        outputs = {name: group / name for name in fit["outputs"]}
-        outputs |= {f"corrected/{name}": corrected_zarr / name for name in corrected}
-        for key, path in outputs.items():
-            both = ArrayReader(path), ArrayReader(path.with_name(f"{path.name}_sigma"))
-            maps |= {f"{key}/delta": both[0], f"{key}/sigma": both[1]}
-            jobs[f"{key}/detail"] = partial(detail, *both)
-            if path.parent == group:
-                jobs[f"{key}/spectrum"] = partial(spectrum, *both)
-        masks["products"] = ArrayReader(group / "mask")
-        for name in fit["sets"]:
-            columns = ("iota", "alpha", "chi2", "mask")
-            iota, alpha, chi2, mask = (ArrayReader(group / name / n) for n in columns)
-            maps |= {f"set/{name}/iota": iota, f"set/{name}/chi2": chi2}
-            maps[f"set/{name}/visibility"] = RatioSource(alpha, iota)
-            masks[f"set/{name}"] = mask
-    jobs |= {name: partial(summarise, source) for name, source in maps.items()}
-    return jobs | {f"flags/{n}": partial(summarise_flags, source) for n, source in masks.items()}
+        masks["products"] = group / "mask"
+        for name, product in maps_to_use(run_dir).items():
+            jobs["offsets", name] = partial(_offsets, group / name, spectral=True)
+            if product.stem != name:
+                corrected = run_dir / "corrected" / "corrected.zarr" / name
+                jobs["corrected", name] = partial(_offsets, corrected, spectral=False)
+        allan = read_json(run_dir / "allan" / "allan.json")["sets"] if with_allan else {}
+        for name, facts in fit["sets"].items():
+            jobs["set", name] = partial(_set, group / name, facts, allan.get(name))
+    for name, mask in masks.items():
+        if (mask / INDEX).exists():
+            jobs["flags", name] = partial(summarise_flags, ArrayReader(mask))
+    return jobs
 
 
-def _summaries(jobs: Mapping[str, partial[Any]], runtime: Runtime) -> dict[str, Any]:
-    if not jobs:
-        return {}
-    columns = max(job.args[0].shape[1] for job in jobs.values())
+def _summaries(jobs: Jobs, columns: int, runtime: Runtime) -> dict[str, dict[str, Any]]:
+    """Results by kind and name."""
     # A band and some copies of it in float64; windows of the spectrum; the sample.
     per_task = 64 * BAND_ROWS * columns + 128 * SEGMENT**2 + 8 * SAMPLE
     runtime = within_memory("the report", per_task, FIGURE_BYTES, runtime)
     results = run_tasks(call, list(jobs.values()), runtime, label="report maps")
-    return dict(zip(jobs, results, strict=True))
+    found: dict[str, dict[str, Any]] = defaultdict(dict)
+    for (kind, name), result in zip(jobs, results, strict=True):
+        found[kind][name] = result
+    return found
 
 
-def _offset(key: str, results: Mapping[str, Any]) -> MapContents:
-    name, delta = key.rpartition("/")[2], results[f"{key}/delta"]
+def _offsets(path: Path, *, spectral: bool) -> MapContents:
+    both = ArrayReader(path), ArrayReader(path.with_name(f"{path.name}_sigma"))
+    delta, sigma = map(summarise, both)
     # Pixel by pixel is the whole map already where no blocks were averaged.
-    part = results[f"{key}/detail"] if delta.block > 1 and min(delta.shape) > DETAIL else None
-    return MapContents(name, delta, results[f"{key}/sigma"], results.get(f"{key}/spectrum"), part)
+    part = detail(*both) if delta.block > 1 and min(delta.shape) > DETAIL else None
+    return MapContents(path.name, delta, sigma, spectrum(*both) if spectral else None, part)
 
 
-def _set(
-    group: Path, name: str, facts: dict[str, Any], allan: Mapping[str, Any], results: dict[str, Any]
-) -> SetContents:
-    maps = {of: results[f"set/{name}/{of}"] for of in ("iota", "visibility", "chi2")}
+def _set(folder: Path, facts: dict[str, Any], allan: dict[str, Any] | None) -> SetContents:
+    iota, alpha, chi2 = (ArrayReader(folder / name) for name in ("iota", "alpha", "chi2"))
     columns = ("time", "B", "A", "phi", "dkx", "dky")
-    series = {n: ArrayReader(group / name / n).read().astype(float) for n in columns}
-    flags = results[f"flags/set/{name}"]
-    return SetContents(name, facts, **maps, flags=flags, series=series, allan=allan.get(name))
+    return SetContents(
+        folder.name,
+        facts,
+        summarise(iota),
+        summarise(RatioSource(alpha, iota)),
+        summarise(chi2),
+        summarise_flags(ArrayReader(folder / "mask")),
+        {n: ArrayReader(folder / n).read().astype(float) for n in columns},
+        allan,
+    )
 
 
 # The diagnosis
