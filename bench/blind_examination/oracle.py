@@ -25,6 +25,7 @@ from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.stages import ingest, reduce
+from pixcal.stages.diagnose.candidates import Considered
 from pixcal.stages.diagnose.comparison import Trial, differing, shrinkage
 from pixcal.stages.diagnose.diagnosis_input import prepare_input
 from pixcal.stages.diagnose.search import CONFIRM_SIMULATIONS
@@ -55,7 +56,7 @@ def ask_oracle(
         ingest.run(acquisition, scratch / "run", ingest.Config(), runtime)
         reduce.run(scratch / "run", reduce.Config(), runtime)
         signatures = _signatures(diagnosed)
-        inputs = prepare_input(scratch / "run", runtime, signatures=signatures)
+        inputs = prepare_input(scratch / "run", runtime, Considered(signatures=signatures))
         trials = Trials(inputs.windows, scratch, inputs.runtime, signatures)
         true = effects_of(truth, bench)
         (nominal,) = trials.curves([()], REFERENCES, "nominal bench")

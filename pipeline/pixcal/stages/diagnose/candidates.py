@@ -1,7 +1,7 @@
 """Candidates of a search for causes: effects estimated on the fitted frames; and its result."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -82,24 +82,46 @@ class Candidate:
         return self.estimate.by_law
 
 
-def estimated(
-    evidence: Evidence,
-    unseen: Evidence,
-    kinds: Mapping[str, type[Effect]],
-    base: Effects,
-    runtime: Runtime,
-) -> dict[str, Candidate]:
-    """Every effect beyond the ``base``, measured on the evidence; replays are of the unseen one."""
-    there = {effect.name for effect in base}
-    tried = {name: kind for name, kind in kinds.items() if name not in there}
-    found = each_of(tried, partial(estimate, evidence), runtime, "estimate effects")
-    candidates = {}
-    for name, one in found.items():
-        if isinstance(one, Estimate):
-            candidates[name] = Candidate(name, one, one.refused, replay=_replayed(one, unseen))
-        else:
-            candidates[name] = Candidate(name, None, one or "")
-    return candidates
+@dataclass(frozen=True)
+class Considered:
+    """Effects that a diagnosis considers, and what the fitted frames say of them."""
+
+    kinds: Mapping[str, type[Effect]] = field(default_factory=dict)  # that may be causes, by name
+    base: Effects = ()  # that the nominal bench includes; they are no candidates
+    signatures: tuple[Signature, ...] = ()  # whose estimates are test statistics
+    candidates: Mapping[str, Candidate] = field(default_factory=dict)  # by name
+
+    def estimated(self, evidence: Evidence, unseen: Evidence, runtime: Runtime) -> "Considered":
+        """The same, with candidates measured on evidence; replays are of the unseen one."""
+        there = {effect.name for effect in self.base}
+        tried = {name: kind for name, kind in self.kinds.items() if name not in there}
+        found = each_of(tried, partial(estimate, evidence), runtime, "estimate effects")
+        candidates = {}
+        for name, one in found.items():
+            if isinstance(one, Estimate):
+                candidates[name] = Candidate(name, one, one.refused, replay=_replayed(one, unseen))
+            else:
+                candidates[name] = Candidate(name, None, one or "")
+        more = marginal_candidates(candidates, self.kinds, fringes=bool(evidence.fringes))
+        return replace(self, signatures=(*self.signatures, *more), candidates=candidates)
+
+    def note_missing(self, facts: FramesUsed) -> None:
+        """Give candidates without an estimate the frames that they need, and the reason."""
+        for name, candidate in self.candidates.items():
+            if candidate.estimate is None and not candidate.reason:
+                candidate.needs = _needs(self.kinds[name], facts)
+                candidate.reason = (
+                    f"cannot be estimated from these frames; record {' or '.join(candidate.needs)}"
+                )
+
+    @property
+    def estimates(self) -> dict[str, Estimate]:
+        """Estimates of the candidates that have one."""
+        every = self.candidates.items()
+        return {name: one.estimate for name, one in every if one.estimate is not None}
+
+
+NO_EFFECTS = Considered()
 
 
 def _replayed(found: Estimate, unseen: Evidence) -> Effect | None:
@@ -113,18 +135,6 @@ def _replayed(found: Estimate, unseen: Evidence) -> Effect | None:
     except (InputError, np.linalg.LinAlgError, ValueError, ArithmeticError):
         return None
     return None if replay is None or replay.is_null else replay
-
-
-def note_missing(
-    candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]], facts: FramesUsed
-) -> None:
-    """Give candidates without an estimate the frames that they need, and the reason."""
-    for name, candidate in candidates.items():
-        if candidate.estimate is None and not candidate.reason:
-            candidate.needs = _needs(kinds[name], facts)
-            candidate.reason = (
-                f"cannot be estimated from these frames; record {' or '.join(candidate.needs)}"
-            )
 
 
 def _needs(kind: type[Effect], facts: FramesUsed) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """Input of a diagnosis: windows of a reduced run, their nominal bench, their statistics."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,8 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
-from pixcal.simulation.effect import Effect
 from pixcal.stages import reduce
-from pixcal.stages.diagnose.candidates import (
-    Candidate,
-    estimated,
-    marginal_candidates,
-    note_missing,
-)
+from pixcal.stages.diagnose.candidates import NO_EFFECTS, Considered
 from pixcal.stages.diagnose.frames import (
     FramesUsed,
     Split,
@@ -30,14 +24,7 @@ from pixcal.stages.diagnose.frames import (
 )
 from pixcal.stages.diagnose.measure_nominal import nominal_bench
 from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, RunFrames, evidence_of, take
-from pixcal.stages.diagnose.trial import (
-    Curves,
-    Effects,
-    Signature,
-    Window,
-    averaged,
-    measured_curves,
-)
+from pixcal.stages.diagnose.trial import Curves, Window, averaged, measured_curves
 from pixcal.stages.diagnose.windows import chosen_windows
 from pixcal.stages.evidence import Part
 from pixcal.stages.reduce.black_cut_off import Black
@@ -66,9 +53,8 @@ class DiagnosisInput:
     runtime: Runtime
     few: Runtime
     # whether memory suffices to run estimates in this process in parallel with simulations
-    room: bool = False
-    candidates: dict[str, Candidate] = field(default_factory=dict)  # by name of the effect
-    signatures: tuple[Signature, ...] = ()  # effects whose estimates are statistics too
+    room: bool
+    effects: Considered
 
     @cached_property
     def measured(self) -> Curves:
@@ -77,27 +63,20 @@ class DiagnosisInput:
 
 
 def prepare_input(
-    run_dir: Path,
-    runtime: Runtime,
-    kinds: Mapping[str, type[Effect]] | None = None,
-    base: Effects = (),
-    signatures: Sequence[Signature] = (),
+    run_dir: Path, runtime: Runtime, effects: Considered = NO_EFFECTS
 ) -> DiagnosisInput:
     """Select the parts of a reduced run to analyse; measure nominal bench, statistics and effects.
 
-    ``kinds``: effects that may be causes; ``base``: those that the nominal bench includes;
-    ``signatures``: those whose estimates are statistics in any case. Raises InputError: too few
-    frames, or a part cannot be fitted.
+    Raises InputError: too few frames, or a part cannot be fitted.
     """
     ingested, reduced = Ingested(run_dir / "ingest"), read_json(run_dir / "reduce" / "reduce.json")
-    frames, shape, kinds = _run_frames(run_dir, ingested, reduced), ingested.shape, kinds or {}
+    frames, shape = _run_frames(run_dir, ingested, reduced), ingested.shape
     tables, fringes = frames.tables, bool(frames.acquisition.frames.fringes)
     first, parts = chosen_windows(shape, 0 if fringes else frames_of_half(tables))
     pixels = (first[0][1] - first[0][0]) * (first[1][1] - first[1][0])
     own = split(tables, pixels, reduced["saturation_adu"].get("full_frames", ()))
     _enough(own.test)
     runtime, few, room = _memory(own.test, pixels, runtime)
-    candidates: dict[str, Candidate] = {}
     windows: list[Window] = []
     left_out: list[dict[str, Any]] = []
     measured: list[Curves] = []
@@ -119,20 +98,15 @@ def prepare_input(
         full = halves[0].saturated | halves[1].saturated
         halves = [replace(half, full=full) for half in halves]
         if not windows:
-            candidates = estimated(halves[0], halves[1], kinds, base, few)
-            marginal = marginal_candidates(candidates, kinds, fringes=fringes)
-            signatures = (*signatures, *marginal)
+            effects = effects.estimated(halves[0], halves[1], few)
         bench = nominal_bench(frames, halves, (own.learn, own.test), shape)
         windows.append(Window(part, bench, own.learn, own.test, shape, seed, full))
         if part in parts:
-            measured.append(measured_curves(halves[1], signatures))
+            measured.append(measured_curves(halves[1], effects.signatures))
     tried = tuple(w for w in windows if w.part in parts)
     facts = _frames_used(frames, own, windows[0], tried, left_out)
-    note_missing(candidates, kinds, facts)
-    each, signatures = tuple(measured), tuple(signatures)
-    return DiagnosisInput(
-        windows[0], tried, each, facts, runtime, few, room, candidates, signatures
-    )
+    effects.note_missing(facts)
+    return DiagnosisInput(windows[0], tried, tuple(measured), facts, runtime, few, room, effects)
 
 
 def _run_frames(run_dir: Path, ingested: Ingested, reduced: Mapping[str, Any]) -> RunFrames:

@@ -13,7 +13,6 @@ from pixcal.estimators.test_statistics.gap import Difference, compare, flagged
 from pixcal.model.arrays import F64
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
-from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.candidates import SearchResult
 from pixcal.stages.diagnose.diagnosis_input import DiagnosisInput
 from pixcal.stages.diagnose.result import by_domain
@@ -34,7 +33,6 @@ LEARN_SEED = 900_000
 class SearchRun:
     """A search and its inputs."""
 
-    base: Effects  # effects that the nominal bench includes
     inputs: DiagnosisInput
     trials: Trials
     reference: Reference
@@ -42,36 +40,31 @@ class SearchRun:
     found: SearchResult
 
 
-def run_search(
-    inputs: DiagnosisInput, kinds: Mapping[str, type[Effect]], base: Effects, scratch: Path
-) -> SearchRun:
+def run_search(inputs: DiagnosisInput, scratch: Path) -> SearchRun:
     """Simulate the nominal bench, and search for causes among the candidates.
 
-    ``base``: effects that the nominal bench includes. ``scratch``: keeps simulations to resume.
-    Raises InputError if the nominal bench cannot be simulated.
+    ``scratch``: keeps simulations to resume. Raises InputError if the nominal bench cannot be
+    simulated.
     """
-    candidates, signatures = inputs.candidates, inputs.signatures
-    estimates = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
-    quick = tuple(s for s in signatures if kinds[s.name].quick)
+    effects = inputs.effects
+    quick = tuple(s for s in effects.signatures if effects.kinds[s.name].quick)
 
-    def simulated(own: Sequence[Signature]) -> tuple[Trials, Reference, dict[Key, F64]]:
+    def simulated(own: tuple[Signature, ...]) -> tuple[Trials, Reference, dict[Key, F64]]:
         """Null distribution from the nominal bench, and the curves of the data on its scales."""
-        trials = Trials(
-            inputs.windows, scratch, inputs.runtime, tuple(own), estimates, SCREEN_SIMULATIONS
-        )
-        (nominal,) = trials.curves([base], REFERENCES, "nominal bench")
+        known, exact = effects.estimates, SCREEN_SIMULATIONS
+        trials = Trials(inputs.windows, scratch, inputs.runtime, own, known, exact)
+        (nominal,) = trials.curves([effects.base], REFERENCES, "nominal bench")
         if isinstance(nominal, str):
             raise InputError(nominal)
         reference = Reference.of(nominal)
         return trials, reference, reference.on_scale(inputs.measured)
 
     trials, reference, data = simulated(quick)
-    if needs_slow(signatures, quick, compare(data, expect_nominal(reference))):
-        trials, reference, data = simulated(signatures)
-    services = _SearchServices(inputs, base, kinds, trials)
-    most = affordable(trials.samples)
-    found = Search(reference, data, services.simulate, services.again, most).run(candidates)
-    return SearchRun(base, inputs, trials, reference, data, found)
+    if needs_slow(effects.signatures, quick, compare(data, expect_nominal(reference))):
+        trials, reference, data = simulated(effects.signatures)
+    services, most = _SearchServices(inputs, trials), affordable(trials.samples)
+    search = Search(reference, data, services.simulate, services.again, most)
+    return SearchRun(inputs, trials, reference, data, search.run(effects.candidates))
 
 
 @dataclass(frozen=True)
@@ -79,8 +72,6 @@ class _SearchServices:
     """Services for a search: simulations, and estimates on simulations of the fitted frames."""
 
     inputs: DiagnosisInput
-    base: Effects
-    kinds: Mapping[str, type[Effect]]
     trials: Trials
     # significances that were computed in parallel with simulations
     answers: dict[tuple[Effects, tuple[str, ...]], dict[str, float]] = field(default_factory=dict)
@@ -95,7 +86,8 @@ class _SearchServices:
             self.answers[benches[0], tuple(asked)] = self._estimated(benches[0], asked, one)
 
         beside = answer if asked and self.inputs.room else None
-        return self.trials.curves([(*self.base, *b) for b in benches], seeds, label, beside)
+        with_base = [(*self.inputs.effects.base, *bench) for bench in benches]
+        return self.trials.curves(with_base, seeds, label, beside)
 
     def again(self, on: Effects, names: Sequence[str]) -> dict[str, float]:
         """Significance of candidates on simulations of the fitted frames with given effects."""
@@ -103,32 +95,32 @@ class _SearchServices:
         return self._estimated(on, names, self.inputs.few) if answer is None else answer
 
     def _estimated(self, on: Effects, names: Sequence[str], few: Runtime) -> dict[str, float]:
-        window, candidates = self.inputs.first, self.inputs.candidates
-        measured = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
-        laws = {r: one.effect for n, one in measured.items() if (r := candidates[n].replay)}
+        window, effects = self.inputs.first, self.inputs.effects
+        known = effects.estimates
+        laws = {c.replay: known[n].effect for n, c in effects.candidates.items() if c.replay}
         try:
             by_law = tuple(laws.get(effect, effect) for effect in on)
-            evidence = window.evidence(window.learn, (*self.base, *by_law), LEARN_SEED)
+            evidence = window.evidence(window.learn, (*effects.base, *by_law), LEARN_SEED)
         except InputError:
             return {}  # These frames cannot show how the effects appear.
-        asked = {n: measured[n].again or self.kinds[n] for n in names}
+        asked = {n: known[n].again or effects.kinds[n] for n in names}
         found = each_of(asked, partial(detect, evidence), few, "estimate again")
         return {name: size for name, size in found.items() if size is not None}
 
 
 def places(made: SearchRun) -> list[dict[str, Any]]:
     """Deviations of each window alone; empty if one window covers the detector."""
-    inputs, trials = made.inputs, made.trials
+    inputs, trials, base = made.inputs, made.trials, made.inputs.effects.base
     if len(inputs.windows) == 1 and inputs.windows[0].part == whole_of(inputs.windows[0].whole):
         return []
     places = []
     for number, window in enumerate(inputs.windows):
-        own = Reference.of(trials.of_window(number, made.base, REFERENCES))
+        own = Reference.of(trials.of_window(number, base, REFERENCES))
         data = own.on_scale(inputs.each[number])
         nominal = compare(data, expect_nominal(own))
         final = nominal
         if made.found.accepted:
-            bench = (*made.base, *made.found.final.effects)
+            bench = (*base, *made.found.final.effects)
             final = compare(
                 data, expect_with(own, trials.of_window(number, bench, CONFIRM_SIMULATIONS))
             )

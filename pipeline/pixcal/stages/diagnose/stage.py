@@ -23,6 +23,7 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError, naming
 from pixcal.model.options import Diagnose as Config
 from pixcal.simulation.effect import Effect
+from pixcal.stages.diagnose.candidates import Considered
 from pixcal.stages.diagnose.diagnosis_input import prepare_input
 from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.result import Description, rounded
@@ -57,9 +58,9 @@ def _diagnose(
 ) -> None:
     made.scratch.mkdir(exist_ok=True)
     keep_arrays()
-    inputs = prepare_input(run_dir, runtime, kinds, base)
+    inputs = prepare_input(run_dir, runtime, Considered(kinds, base))
     with naming("--nominal" if base else f"{run_dir}: the nominal simulation failed"):
-        own = run_search(inputs, kinds, base, made.scratch)
+        own = run_search(inputs, made.scratch)
     found = Description(own.found, own.data, inputs.measured, own.reference, inputs.facts)
     diagnosis = found.diagnosis(places(own))
     named = {effect.name: effect for effect in own.found.final.effects}
