@@ -117,16 +117,10 @@ def unhelpful(
     where = comparison.gap_of(current)
     left = comparison.residual_size(current, where)
     gains = {n: comparison.residual_size(trial, where) - left for n, trial in without.items()}
+    if left > MAX_RESIDUAL_GAP and min(gains.values(), default=0.0) > 0:
+        alone = {n: trial for n in gains if (trial := candidates[n].alone) is not None}
+        gains = {n: 1 - comparison.residual_size(trial, where) for n, trial in alone.items()}
     least = min(gains, key=lambda n: gains[n], default=None)
-    if least is not None and gains[least] > 0 and left > MAX_RESIDUAL_GAP:
-        alone = {n: candidates[n].alone for n in gains}
-        closed = {
-            n: 1 - comparison.residual_size(trial, where)
-            for n, trial in alone.items()
-            if trial is not None
-        }
-        gains = {n: one for n, one in closed.items() if one <= 0}
-        least = min(gains, key=lambda n: gains[n], default=None)
     if least is None or gains[least] > 0:
         return None
     return least, "it does not reduce the differences; it may be a proxy for an unknown cause"
