@@ -69,13 +69,11 @@ def _step(stage: str) -> Callable[..., Run]:
 
 def _compare(runs: Sequence[StrPath], out: StrPath, options: of.Compare, runtime: Runtime) -> Json:
     _call("compare", [Path(one) for one in runs], Path(out), options, runtime)
-    contents: Json = read_json(Path(out) / "compare.json")
-    return contents
+    return dict(read_json(Path(out) / "compare.json"))
 
 
 def _budget(bench: StrPath, options: of.Budget, out: StrPath | None) -> Json:
-    plan: Json = _call("budget", Path(bench), options, None if out is None else Path(out))
-    return plan
+    return dict(_call("budget", Path(bench), options, None if out is None else Path(out)))
 
 
 def _simulate(bench: StrPath, out: StrPath, options: of.Simulate, runtime: Runtime) -> Path:
@@ -139,8 +137,7 @@ def _with_json(kind: type, file: str, fails: str) -> Callable[..., Json]:
 
     def body(run: StrPath, options: Any, runtime: Runtime) -> Json:
         _call(stage, Path(run), options, runtime)
-        contents: Json = read_json(Path(run) / stage / file)
-        return contents
+        return dict(read_json(Path(run) / stage / file))
 
     return function_of(kind, body, fails, f"dict\n    Contents of ``{file}``.")
 

@@ -125,8 +125,7 @@ class Run:
 
     def _read(self, stage: str, file: str | None = None) -> dict[str, Any]:
         require(self.path, stage)
-        contents: dict[str, Any] = read_json(self.path / stage / f"{file or stage}.json")
-        return contents
+        return dict(read_json(self.path / stage / f"{file or stage}.json"))
 
     @cached_property
     def acquisition(self) -> Acquisition:

@@ -81,8 +81,7 @@ def _artefact(run_dir: Path, stage: str, file: str) -> Json:
     if not (run_dir / stage / MANIFEST).exists():
         return NOTHING
     require(run_dir, stage)
-    contents: Json = read_json(run_dir / stage / file)
-    return contents
+    return dict(read_json(run_dir / stage / file))
 
 
 def _correction(run_dir: Path) -> Json:

@@ -183,8 +183,7 @@ def _diagnosis(folder: Path, *, nothing_to_do: bool) -> DiagnosisContents:
 
 
 def _optional_json(path: Path) -> dict[str, Any]:
-    contents: dict[str, Any] = read_json(path) if path.exists() else {}
-    return contents
+    return dict(read_json(path)) if path.exists() else {}
 
 
 def _warnings(manifests: Mapping[str, Manifest], facts: Mapping[str, Any]) -> tuple[str, ...]:
