@@ -1,7 +1,7 @@
 """Crosstalk: closed forms, an independent kernel, its measurement three ways, and its undoing."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import galsim
 import numpy as np
@@ -41,30 +41,6 @@ FOUR_SETS = NO_DARKS | {
 }
 
 
-def of_kernel(kernel: np.ndarray, **period: int) -> Ipc:
-    """What the pixels around one at the centre of a kernel receive of it."""
-    y, x = (n // 2 for n in kernel.shape)
-    return Ipc(
-        tuple(
-            Coupling(int(v) - y, int(u) - x, float(kernel[v, u]), **period)
-            for v, u in np.argwhere(kernel)
-            if (v, u) != (y, x)
-        )
-    )
-
-
-def of_rows(kernels: Sequence[np.ndarray]) -> Ipc:
-    """A kernel for the pixels of each of n rows, which repeat."""
-    own = (of_kernel(k, every_rows=len(kernels), row=n) for n, k in enumerate(kernels))
-    return Ipc(tuple(coupling for one in own for coupling in one.couplings))
-
-
-def nearest(share: float, diagonal: float = 0.0) -> Ipc:
-    """Equal shares to the four nearest pixels, and others to the diagonal ones."""
-    corner = [diagonal, share, diagonal]
-    return of_kernel(np.array([corner, [share, 0, share], corner]))
-
-
 def shares(couplings: tuple[Coupling, ...], period: int = 8) -> dict[tuple[int, int, int], float]:
     """Share by (dy, dx, row), whatever period it is written with."""
     found: dict[tuple[int, int, int], float] = {}
@@ -102,7 +78,7 @@ def test_a_single_pixel_gives_what_the_kernel_says_and_loses_it() -> None:
     np.testing.assert_allclose(couple(charge[3:], kernel.couplings, (3, 0)), expected[3:])
 
 
-@pytest.mark.parametrize("effect", [Ipc(), nearest(0.01, 0.002), Ipc().scaled(3.0)])
+@pytest.mark.parametrize("effect", [Ipc(), Ipc.nearest(0.01, 0.002), Ipc().scaled(3.0)])
 def test_the_signal_is_conserved_and_found_again(effect: Ipc) -> None:
     charge = 1e4 + 3e3 * np.random.default_rng(1).standard_normal((23, 17))
     read = couple(charge, effect.couplings)
@@ -112,7 +88,7 @@ def test_the_signal_is_conserved_and_found_again(effect: Ipc) -> None:
 
 def test_a_symmetric_kernel_leaves_a_flat_flat_and_one_of_rows_does_not() -> None:
     flat = np.full((24, 24), 2e4)
-    np.testing.assert_allclose(couple(flat, nearest(0.02).couplings), flat)
+    np.testing.assert_allclose(couple(flat, Ipc.nearest(0.02).couplings), flat)
     rows = couple(flat, Ipc().couplings)[8:16, 8:-8].mean(axis=1) / 2e4
     np.testing.assert_allclose(rows[:4], rows[4:])
     assert np.ptp(rows) > 0.02
@@ -127,7 +103,7 @@ def test_as_galsim_applies_it(share: float) -> None:
     reads[1, 1] = 1 - weights.sum()
     image = galsim.Image(charge.copy())
     image.applyIPC(galsim.Image(reads), edge_treatment="crop")
-    own = couple(charge, of_kernel(weights).couplings)
+    own = couple(charge, Ipc.of_kernel(weights).couplings)
     np.testing.assert_allclose(own[2:-2, 2:-2], image.array[2:-2, 2:-2], rtol=1e-12)
 
 
@@ -135,11 +111,11 @@ def test_a_kernel_for_each_of_three_rows_is_that_kernel_on_its_rows() -> None:
     rng = np.random.default_rng(3)
     kernels = [0.01 * rng.random((5, 3)) for _ in range(3)]
     charge = rng.uniform(0, 1e4, (19, 14))
-    together = couple(charge, of_rows(kernels).couplings)
+    together = couple(charge, Ipc.of_rows(kernels).couplings)
     apart = charge.copy()
     for row, kernel in enumerate(kernels):
         only = np.where(np.arange(19)[:, None] % 3 == row, charge, 0.0)
-        apart += couple(only, of_kernel(kernel).couplings) - only
+        apart += couple(only, Ipc.of_kernel(kernel).couplings) - only
     np.testing.assert_allclose(together, apart, rtol=1e-12)
 
 
@@ -166,7 +142,7 @@ def test_noise_of_neighbours_becomes_alike_as_computed(make_effect_bench: MakeBe
     """cov = (k + k') (1 - outflow) D for symmetric nearest neighbours, to second order."""
     bench = make_effect_bench({"detector.read_noise_e": 0.0, "detector.prnu_rms": 0.0})
     flat = next(r for r in recordings(bench) if r.kind == "flat")
-    frames = frames_of(bench, flat, [nearest(0.02)]).astype(float)[:, 1:-1, 1:-1]
+    frames = frames_of(bench, flat, [Ipc.nearest(0.02)]).astype(float)[:, 1:-1, 1:-1]
     rest = frames - frames.mean(axis=0)
     count = rest[0].size * (len(frames) - 1)
     charge = frames.mean() - bench.detector.bias_adu
@@ -177,7 +153,7 @@ def test_noise_of_neighbours_becomes_alike_as_computed(make_effect_bench: MakeBe
     ):
         found = (pair[0] * pair[1]).sum() / count / charge * rest[0].size / pair[0][0].size
         assert found == pytest.approx(expected, abs=4 * np.sqrt(2 / count))
-    shot, _ = noise_shares(nearest(0.02).couplings, (9, 9))
+    shot, _ = noise_shares(Ipc.nearest(0.02).couplings, (9, 9))
     assert shot[4, 4] == pytest.approx(0.92**2 + 4 * 0.02**2)
 
 
@@ -203,12 +179,14 @@ def test_a_kernel_that_leaves_a_pixel_too_little_is_refused() -> None:
     many = tuple(Coupling(dy, dx, 0.1) for dy in (-1, 0, 1) for dx in (-1, 1))
     with pytest.raises(InputError, match=r"lose 0\.60 of their signal"):
         Ipc(many)
+    with pytest.raises(InputError, match="odd numbers of rows and columns, not 2 x 3"):
+        Ipc.of_kernel(np.ones((2, 3)))
 
 
 def test_a_kernel_is_written_and_read() -> None:
-    effect = of_rows([0.01 * np.eye(3), np.zeros((3, 3))])
+    effect = Ipc.of_rows([0.01 * np.eye(3), np.zeros((3, 3))])
     assert parse(Ipc, to_plain(effect), "file") == effect
-    assert nearest(0.01).scaled(0.5) == nearest(0.005)
+    assert Ipc.nearest(0.01).scaled(0.5) == Ipc.nearest(0.005)
     assert Ipc(()).is_null
 
 
@@ -300,7 +278,7 @@ def test_level_dependent_shares_are_undone_too() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(
     "truth",
-    [Ipc(), Ipc().scaled(0.3), nearest(0.005)],
+    [Ipc(), Ipc().scaled(0.3), Ipc.nearest(0.005)],
     ids=["four rows", "weak", "nearest neighbours"],
 )
 def test_a_kernel_is_found_with_its_period_and_nothing_else(acquired: Acquired, truth: Ipc) -> None:
@@ -381,7 +359,7 @@ def test_detector_frames_alone_are_enough(acquired: Acquired) -> None:
 
 @pytest.mark.long
 def test_a_share_that_falls_with_the_signal_is_noticed(acquired: Acquired) -> None:
-    couplings = tuple(dataclasses.replace(c, per_ke=-0.008) for c in nearest(0.03).couplings)
+    couplings = tuple(dataclasses.replace(c, per_ke=-0.008) for c in Ipc.nearest(0.03).couplings)
     changes = {"detector.hot_fraction": 0.01, "detector.hot_rate_e_s": 3.5e4}
     found = Ipc.estimate(acquired(changes, {"ipc": to_plain(Ipc(couplings))}))
     assert found is not None
@@ -396,7 +374,7 @@ def test_noise_of_neighbours_tells_shares_that_fall_from_a_bent_response(
     acquired: Acquired,
 ) -> None:
     """Without darks: the covariance falls with the signal, in one case as the variance does."""
-    share = nearest(0.015)
+    share = Ipc.nearest(0.015)
     falling = tuple(dataclasses.replace(c, per_ke=-0.01) for c in share.couplings)
     found = Ipc.estimate(acquired(NO_DARKS, {"ipc": to_plain(Ipc(falling))}))
     assert found is not None

@@ -7,6 +7,7 @@ acts on collected charge, shot noise included, so the noise of neighbours become
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -86,6 +87,35 @@ class Ipc(Effect):
             raise InputError(
                 f"couplings: some pixels lose {most:.2f} of their signal; the limit is 0.5"
             )
+
+    @classmethod
+    def nearest(cls, share: float, diagonal: float = 0.0) -> Self:
+        """Equal shares to the four nearest pixels, and another share to the diagonal ones."""
+        corners = [diagonal, share, diagonal]
+        return cls.of_kernel(np.array([corners, [share, 0, share], corners]))
+
+    @classmethod
+    def of_kernel(cls, kernel: F64, **sources: int) -> Self:
+        """A dense kernel of odd size, the same for all pixels or for some ``sources``.
+
+        ``kernel[c + dy, c + dx]`` is the share that the pixel at (dy, dx) receives. The centre is
+        not used: a pixel keeps the rest.
+        """
+        kernel = np.asarray(kernel, float)
+        y, x = (n // 2 for n in kernel.shape)
+        if kernel.shape != (2 * y + 1, 2 * x + 1):
+            rows, columns = kernel.shape
+            raise InputError(
+                f"a kernel needs odd numbers of rows and columns, not {rows} x {columns}"
+            )
+        others = [(int(v), int(u)) for v, u in np.argwhere(kernel) if (v, u) != (y, x)]
+        return cls(tuple(Coupling(v - y, u - x, float(kernel[v, u]), **sources) for v, u in others))
+
+    @classmethod
+    def of_rows(cls, kernels: Sequence[F64]) -> Self:
+        """A dense kernel, as in `of_kernel`, for sources in each of n rows, which repeat."""
+        rows = [cls.of_kernel(k, every_rows=len(kernels), row=n) for n, k in enumerate(kernels)]
+        return cls(tuple(coupling for own in rows for coupling in own.couplings))
 
     @property
     def halo(self) -> int:
