@@ -47,12 +47,7 @@ _KEY, _RUN = 1000, 2000  # first keys of the walks' random numbers; no recording
 
 @dataclass(frozen=True)
 class BiasDrift(Effect):
-    """A bias common to all pixels of a frame, which varies; time starts at the first frame.
-
-    A ramp, a settling after power-on, a random walk that goes on through all frames, and a ramp or
-    walk that begins anew with each run of fringes. ``tracks`` are offsets of fringe runs as
-    measured, in place of the laws. The fit takes up by B as much of an offset as looks like light.
-    """
+    """A bias common to all pixels of a frame, which varies; time starts at the first frame."""
 
     name = "bias_drift"
     title = "bias that varies from frame to frame"

@@ -31,11 +31,7 @@ _TURNS = 4  # iterations of the inverse; each cuts the error to a few per cent
 
 @dataclass(frozen=True)
 class BrighterFatter(Effect):
-    """Pixel boundaries shift with the charge around them (`pixcal.kernels.boundaries`).
-
-    It is not linear in the intensity, so maps alone cannot show it; `undo_samples` corrects the
-    frames.
-    """
+    """Pixel boundaries shift with the charge around them (`pixcal.kernels.boundaries`)."""
 
     name = "brighter_fatter"
     title = "brighter-fatter effect"
@@ -97,12 +93,7 @@ class BrighterFatter(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """From the covariance of neighbours and the second harmonic of the fringes.
-
-        Only the noise distinguishes it from a nonlinear response; the second harmonic, which
-        depends on fringe spacing and direction, is far more precise, and is used unless it
-        contradicts the noise. If it explains all harmonics, no nonlinearity is assumed in addition.
-        """
+        """From the covariance of neighbours and the second harmonic of the fringes."""
         evidence = central_crop(evidence)
         explaining = _explaining(evidence, cls().falloff_px) if evidence.fringes else None
         falloff = cls().falloff_px if explaining is None else explaining.falloff_px

@@ -17,12 +17,7 @@ from pixcal.simulation.track import Track, at
 
 @dataclass(frozen=True)
 class ContrastNoise(Effect):
-    """The fringe amplitude A varies from frame to frame; the intensity B does not.
-
-    A resonance smears the fringes of a frame by ``exp(-e vibration_rad² / 2)``, e exponential of
-    mean 1, white. Polarisations turn slowly: a factor ``1 + polarisation u``, u a damped random
-    walk over ``polarisation_s``. Two fibres cannot interfere by more than all of their light.
-    """
+    """The fringe amplitude A varies from frame to frame; the intensity B does not."""
 
     name = "contrast_noise"
     title = "visibility that varies from frame to frame"

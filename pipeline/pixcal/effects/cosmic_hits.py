@@ -55,12 +55,7 @@ _FEWEST = 1e-6
 
 @dataclass(frozen=True)
 class CosmicHits(Effect):
-    """Straight tracks of particles through the sensitive layer, in proportion to the exposure time.
-
-    A frame that waits to be read out is hit as well. A track leaves charge in proportion to its
-    length, with the fluctuations of thin layers, and the charge spreads before it is collected.
-    Samples that are hit have to be left out: maps cannot be mended.
-    """
+    """Straight tracks of particles through the sensitive layer, as many as the exposure is long."""
 
     name = "cosmic_hits"
     title = "hits by cosmic-ray particles"
@@ -142,11 +137,7 @@ class CosmicHits(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Upward outliers in single frames, less downward ones, in all frames.
-
-        Repeatedly hit pixels are excluded as noisy. Simulated tracks give the fraction hidden by
-        noise; frames of several exposure times separate hits during readout.
-        """
+        """Upward outliers in single frames, less downward ones, in all frames."""
         searches = list(_searches(evidence))
         if not searches:
             return None

@@ -53,9 +53,7 @@ _PARABOLA = 2
 class FlatError(Effect):
     """The response in the fringe frames differs from that in the flats.
 
-    Mean and fringe of a pixel change by the same factor, in the same pixels in all sets; the
-    offsets do not move. The pattern belongs to the chip, so maps do not hold what `predict` would
-    need.
+    The pattern belongs to the chip, so maps do not hold what `predict` would need.
     """
 
     name = "flat_error"
@@ -107,12 +105,7 @@ class FlatError(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """What iota and alpha share, divided by flats, beyond their light's shape.
-
-        iota is of some frames over some flats, alpha of the others over the others, and of another
-        set where there is one: their product holds no noise. The part that neighbours
-        share is smooth; a parabola is removed first, because beams cause one as well.
-        """
+        """What iota and alpha share, divided by flats, beyond their light's shape."""
         flats = _two_flats(evidence)
         sets = [f for f in evidence.fringes.values() if len(f.g) >= _MIN_FRAMES]
         good = evidence.good & np.all([f.good for f in sets], axis=0)

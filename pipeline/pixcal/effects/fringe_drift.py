@@ -19,12 +19,7 @@ TRACKS = ("along_x", "along_y")
 
 @dataclass(frozen=True)
 class FringeDrift(Effect):
-    """Slow drift of the fringe vector: a ramp, a decay, a random walk.
-
-    The time of each fringe set runs from its first frame: fibres are moved between sets. A slow
-    change of the phase has no parameter, since every frame has a free phase; the fit leaves the
-    vector free in each frame where it moves, and `vector_change` gives it where a fit holds it.
-    """
+    """Slow drift of the fringe vector: a ramp, a decay, a random walk."""
 
     name = "fringe_drift"
     title = "fringe vector that drifts"

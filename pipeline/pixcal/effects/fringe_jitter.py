@@ -16,13 +16,7 @@ from pixcal.simulation.track import Track, moved, vector_tracks
 
 @dataclass(frozen=True)
 class FringeJitter(Effect):
-    """White noise of the fringe vector from frame to frame along x and y, and a vibration.
-
-    Two fibre tips that move against each other by d change the vector by ``2 pi pitch d /
-    (wavelength distance)``, whatever the baseline and the window: 1.1e-4 rad/px a micrometre on the
-    paper's bench. The phase at the window's centre stays; the fit leaves the vector free where it
-    moves.
-    """
+    """White noise of the fringe vector from frame to frame along x and y, and a vibration."""
 
     name = "fringe_jitter"
     title = "fringe vector that varies from frame to frame"

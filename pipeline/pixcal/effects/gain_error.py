@@ -33,12 +33,7 @@ _STEP = 1e-4  # step of the deviations of a response, for derivatives
 
 @dataclass(frozen=True)
 class GainError(Effect):
-    """The true gain (e-/ADU) differs from the one used; the samples in ADU do not change.
-
-    Light and dark signal in ADU stay, and stand for other numbers of electrons: only their shot
-    noise in ADU changes, by ``1 / sqrt(1 + relative)``. Read noise is known in ADU. Maps neither
-    show it nor need correction; only SIGMA depends on the gain.
-    """
+    """The true gain (e-/ADU) differs from the one used; the samples in ADU do not change."""
 
     name = "gain_error"
     title = "gain that differs from the declared value"
@@ -81,13 +76,7 @@ class GainError(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Ratio of signal-dependent noise to its expected value, in fringes and in flats.
-
-        Covariances of neighbours up to `STEPS` are added to the variances: crosstalk and
-        brighter-fatter move noise from one to the other and keep the sum (the diagnosis allows for
-        the rest by simulation). Noise that does not depend on the level is left out. In the
-        fringes, any misfit adds to the noise: if the two disagree, only the flats are used.
-        """
+        """Ratio of signal-dependent noise to its expected value, in fringes and in flats."""
         ways = {
             "fringes": shot_share(
                 s for f in evidence.fringes.values() if (s := _of_fringes(f)) is not None

@@ -69,14 +69,7 @@ class GhostWave(Scalable):
 
 @dataclass(frozen=True)
 class GhostFringes(Effect):
-    """A weak reflection of one fibre interferes with the two direct beams.
-
-    With its parent it makes a pattern that stands still: the mean light gains ``2 share I
-    cos(beat·r + phase_rad)``, I the parent's intensity. With the other fibre it makes fringes that
-    follow the modulator: the phasor is multiplied by ``1 + share exp(±i (beat·r + phase_rad))``,
-    plus for the modulated fibre, minus for the fixed one; not where the polarisations are crossed.
-    ``waves`` are ghosts as measured, set by set, with amplitudes that nothing ties.
-    """
+    """A weak reflection of one fibre interferes with the two direct beams."""
 
     name = "ghost_fringes"
     title = "ghost fringes from a parasitic reflection"

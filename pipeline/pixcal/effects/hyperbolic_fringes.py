@@ -31,13 +31,7 @@ class FibrePair:
 
 @dataclass(frozen=True)
 class HyperbolicFringes(Effect):
-    """Difference between the exact phase of two fibre tips and its paraxial limit.
-
-    To leading order the curvature is ``-K·q q² / (2 D²)``, q from the foot of the fibres' centre:
-    in pixels it does not depend on the baseline, but its shape gives the offset of the fibre pair
-    and the difference in height of the tips. ``pairs`` has the positions of fibre pairs that differ
-    between sets. ``fit --model hyperbolic`` absorbs it.
-    """
+    """Difference between the exact phase of two fibre tips and its paraxial limit."""
 
     name = "hyperbolic_fringes"
     title = "hyperbolic fringes"

@@ -21,12 +21,7 @@ MAX_AMBIENT = 0.3
 
 @dataclass(frozen=True)
 class IntensityNoise(Effect):
-    """Intensity B and amplitude A of each frame vary by the same factor.
-
-    White from frame to frame, or correlated over ``correlation_s`` (a damped random walk), and a
-    line of one frequency. Where each fibre's power changes by itself, the contrast changes a little
-    too. The fit leaves every frame its own intensity.
-    """
+    """Intensity B and amplitude A of each frame vary by the same factor."""
 
     name = "intensity_noise"
     title = "intensity that varies from frame to frame"

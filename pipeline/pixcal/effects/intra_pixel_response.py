@@ -33,8 +33,7 @@ _SQUARE = 1e-4  # the same of its square, px²
 class IntraPixelResponse(Effect):
     """Each pixel responds uniformly over a width along x and y, which differs from pixel to pixel.
 
-    The fringe's amplitude is multiplied by ``sin(u) / u`` with ``u = K width / 2`` along each axis;
-    mean light and offsets stay. `predict` and `undo` take the mean width.
+    `predict` and `undo` take the mean width.
     """
 
     name = "intra_pixel_response"
@@ -84,13 +83,7 @@ class IntraPixelResponse(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Width, the same along both axes, from the visibility of sets of other fringe spacing.
-
-        The laser's visibility is taken to be the same in all sets, to `REPEAT`. The scatter of the
-        width is what two halves of the frames share in the visibility of single pixels, beyond what
-        neighbours, rows and columns share, as it grows with the fourth power of the fringe vector.
-        It is refused where fringes of crossed directions share most of it.
-        """
+        """Width, the same along both axes, from the visibility of sets of other fringe spacing."""
         sets = [f for f in evidence.fringes.values() if np.count_nonzero(f.good) > _MIN_PIXELS]
         spacing = [np.hypot(*f.k) for f in sets]
         if not sets or max(spacing) < _APART * min(spacing):

@@ -1,8 +1,4 @@
-"""Crosstalk between pixels: part of a pixel's signal is read at others, near or a few away.
-
-Capacitance between pixels (inter-pixel capacitance, IPC) or coupling in the read-out circuit. It
-acts on collected charge, shot noise included, so the noise of neighbours becomes alike.
-"""
+"""Crosstalk between pixels: part of a pixel's signal is read at others, near or a few away."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -52,11 +48,7 @@ FOUR_ROWS = (
 
 @dataclass(frozen=True)
 class Ipc(Effect):
-    """Couplings between pixels: any kernel, sparse or dense, of any period of rows and columns.
-
-    What a pixel gives it loses: the total signal stays, and a flat keeps its level (its pixels only
-    where every pixel gets what it gives). Nothing passes the edge of the window.
-    """
+    """Couplings between pixels: any kernel, sparse or dense, of any period of rows and columns."""
 
     name = "ipc"
     title = "crosstalk between pixels"
@@ -127,11 +119,7 @@ class Ipc(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Kernel from hot pixels in darks, the noise of flats and fringes, and the maps, joined.
-
-        Couplings, their periods (up to 8 rows by 8 columns) and their reach (up to 5 pixels) are
-        found by evidence.
-        """
+        """Kernel from hot pixels in darks, the noise of flats and fringes, and the maps, joined."""
         kernel = measure(evidence)
         if kernel is None:
             return None

@@ -50,11 +50,7 @@ class CurvePoint(Scalable):
 
 @dataclass(frozen=True)
 class Nonlinearity(Effect):
-    """Signal ``S (1 + quadratic u + cubic u²)`` of a charge S, with ``u = S / level_e``.
-
-    ``bends`` are points of a measured response, added to the polynomial as a natural spline.
-    Offsets hardly change and maps do not show it; `linearised` corrects samples.
-    """
+    """Signal ``S (1 + quadratic u + cubic u²)`` of a charge S, with ``u = S / level_e``."""
 
     name = "nonlinearity"
     title = "nonlinear response"
@@ -138,11 +134,7 @@ class Nonlinearity(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Second and third harmonic of the phase in the residuals; without fringes, flats.
-
-        Moving boundaries (brighter-fatter) make a second harmonic too: they are fitted beside, as
-        the noise that neighbours share says where all fringes have the same spacing.
-        """
+        """Second and third harmonic of the phase in the residuals; without fringes, flats."""
         found = _polynomial(evidence)
         if found is None:
             return None

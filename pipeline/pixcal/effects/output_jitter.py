@@ -1,8 +1,4 @@
-"""Levels of the outputs that read parts of the detector: each varies from frame to frame.
-
-Beside an edge between two outputs, the means of some rows (columns) on either side differ anew in
-every frame; noise of rows, white or 1/f, does so alike at all places.
-"""
+"""Levels of the outputs that read parts of the detector: each varies from frame to frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,10 +36,7 @@ _LEAST = 1e-9  # least noise of a level, e-², as frames may be equal
 
 @dataclass(frozen=True)
 class OutputJitter(Effect):
-    """Each of several outputs, which read rectangles of pixels, has a level that varies by itself.
-
-    White noise and a random walk, independent in each; what all have in common is `bias_drift`.
-    """
+    """Each of several outputs, which read rectangles of pixels, has a level that varies alone."""
 
     name = "output_jitter"
     title = "output offsets that vary from frame to frame"

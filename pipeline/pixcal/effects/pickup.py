@@ -1,8 +1,7 @@
 """Tones that the electronics pick up while a frame is read, of another phase in each frame.
 
-The differences of two frames hold no fixed pattern. Tones stand out of the mean periodogram's
-surroundings, which noise of any smooth spectrum fills evenly. The strongest are taken off, and the
-rest is searched again (CLEAN: Högbom 1974, A&AS 15, 417).
+The strongest are taken off the differences of frames, and the rest is searched again (CLEAN:
+Högbom 1974, A&AS 15, 417).
 """
 
 from dataclasses import dataclass
@@ -43,13 +42,7 @@ _DRIFTS, _STEPS = 4, 24
 
 @dataclass(frozen=True)
 class Pickup(Effect):
-    """Other signals that reach the amplifier: supplies, clocks, cables.
-
-    A signal of one frequency makes a wave along the order in which pixels are read: a tone along
-    rows and columns. It does not keep step with the frames, so its phase differs in each and no
-    bias map holds it. A signal of some bandwidth is several tones.
-    Mains hum has hardly any cycles per column.
-    """
+    """Other signals that reach the amplifier: supplies, clocks, cables."""
 
     name = "pickup"
     title = "electrical pick-up during readout"

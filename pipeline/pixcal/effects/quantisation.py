@@ -39,15 +39,7 @@ _OTHER_GAIN = (
 
 @dataclass(frozen=True)
 class Quantisation(Effect):
-    """A converter with coarse steps, or with codes of uneven width.
-
-    One converter, or one ramp, for all columns. Displacements that are independent leave the
-    response straight: codes differ in width, by chance and by a ripple, and one of no width is
-    missing. A bit whose weight is off makes codes wide or narrow wherever the bit changes, and
-    bends the response. ``widths`` holds the widths as measured, whatever the converter. The
-    round-off itself is no more than noise of step²/12 as long as the noise before it spans half a
-    step; so maps do not show it, unless read noise is lower than that.
-    """
+    """A converter with coarse steps, or with codes of uneven width."""
 
     name = "quantisation"
     title = "coarse or uneven ADC steps"
@@ -190,9 +182,7 @@ class Quantisation(Effect):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Step by the codes that never come, widths by how often the others do.
 
-        None where samples are no whole numbers, or too few. Where the noise is below one step the
-        light is no smooth function of the code: then fringes tell, or flats, from where shot noise
-        is as large as a step.
+        None where samples are no whole numbers, or too few.
         """
         found = _by_law(evidence, far=True)
         if found is None:

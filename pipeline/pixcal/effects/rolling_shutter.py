@@ -32,13 +32,7 @@ _MODEL = 0.01
 
 @dataclass(frozen=True)
 class RollingShutter(Effect):
-    """Each row is exposed later than the one before.
-
-    The modulator steps ``delay_us`` after the first row's exposure ends: rows still exposed hold a
-    share of the next frame's light; after nearly a frame, the first rows one of the last frame's. A
-    modulator that settles while rows are read turns their phase by a share of its step
-    (``settling``). `undo` takes off maps what these leave in them, with the phases as fitted.
-    """
+    """Each row is exposed later than the one before."""
 
     name = "rolling_shutter"
     title = "rolling shutter"
@@ -210,11 +204,7 @@ class RollingShutter(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Share of the next frame's model in the residuals, growing with the row.
-
-        A share that all rows have goes into the frame's own phase and amplitude, so it is free; lag
-        does not look alike. Phases in equal steps tell nothing.
-        """
+        """Share of the next frame's model in the residuals, growing with the row."""
         many = [RowSums.of(f) for f in evidence.fringes.values() if enough_frames(f)]
         if not many:
             return None

@@ -1,8 +1,7 @@
 """Readout noise common to all pixels of a row or a column.
 
-Each row is cut into blocks, and only products of blocks that are not neighbours count: noise that
-pixels have of their own, or share with pixels near them, drops out. The products are taken mode by
-mode of the Fourier transform across the rows, without the frame's own level.
+Products of blocks of a row that are no neighbours, mode by mode of the Fourier transform across
+the rows.
 """
 
 from collections.abc import Sequence
@@ -34,14 +33,7 @@ _ROUNDS = 4
 
 @dataclass(frozen=True)
 class RowNoise(Effect):
-    """Noise of the reference or of the readout that all pixels of a row or a column share.
-
-    White and flicker noise from row to row; alternate rows read by two amplifiers whose levels vary
-    independently, or each of which keeps half of the noise of the row that it read before; and
-    columns, white from column to column and frame to frame. Noise of the whole frame is
-    `bias_drift`: flicker noise is given without its mean. It averages out in time, so maps do not
-    show it; subtracting it needs dark or overscan pixels, since shot noise hides it in the fringes.
-    """
+    """Noise of the reference or of the readout that all pixels of a row or a column share."""
 
     name = "row_noise"
     title = "row and column noise"
@@ -101,11 +93,7 @@ class RowNoise(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Covariance of distant pixels of a row, by frequency across the rows; columns likewise.
-
-        From frames without light where there are any. Else from the residuals of those fringes
-        that run across the rows (columns), which is much worse.
-        """
+        """Covariance of distant pixels of a row, by frequency across the rows; columns likewise."""
         dark = [
             ((s.adu - s.adu.mean(axis=0)) * np.float32(evidence.gain), evidence.good, 1)
             for s in evidence.stacks

@@ -56,12 +56,7 @@ class StrayPattern(Scalable):
 
 @dataclass(frozen=True)
 class Straylight(Effect):
-    """Incoherent light in the fringe frames, relative to the light of the fibres.
-
-    The mean light becomes ``1 + share + slope·r`` times what it was, and more where a bump or a
-    measured pattern says so, never less; the fringe stays. An even share, and one that varies as
-    two unequal Gaussian beams do, cannot be told from those beams.
-    """
+    """Incoherent light in the fringe frames, relative to the light of the fibres."""
 
     name = "straylight"
     title = "scattered light that does not interfere"

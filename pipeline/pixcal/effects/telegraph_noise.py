@@ -53,12 +53,7 @@ class MeasuredPixels:
 
 @dataclass(frozen=True)
 class TelegraphNoise(Effect):
-    """Some pixels jump between two levels, as a trap fills and empties.
-
-    Both states are equally likely unless ``upper`` says otherwise; the mean level does not change.
-    Amplitudes have a gamma distribution, by default an exponential one, but for pixels measured by
-    themselves. The pixels are those that `reduce` flags as noisy.
-    """
+    """Some pixels jump between two levels, as a trap fills and empties."""
 
     name = "telegraph_noise"
     title = "pixels that jump between two levels"
@@ -126,13 +121,7 @@ class TelegraphNoise(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Pixels noisier than the rest whose noise is telegraph noise by its shape.
-
-        How many and how strong from the pixels' variances; that they jump, from a flat top,
-        outliers that come back, and neighbouring frames that resemble each other, each summed over
-        the noisy pixels. By bias and dark frames, else residuals of fringes, which also tell how
-        long pixels stay.
-        """
+        """Pixels noisier than the rest whose noise is telegraph noise by its shape."""
         series = tuple(_series(evidence))
         if not series:
             return None

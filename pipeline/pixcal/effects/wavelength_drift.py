@@ -25,12 +25,7 @@ CALM = 2.0  # significance of a walk up to which the levels are constant
 
 @dataclass(frozen=True)
 class WavelengthDrift(Effect):
-    """The wavelength changes by a ramp, a random walk, or hops to another laser mode and back.
-
-    A change by epsilon takes ``epsilon K / (1 + epsilon)`` off the fringe vector K of every set;
-    the refractive index of air, or the distance to the detector, does the same. The time of each
-    set runs from its first frame; the fit leaves the vector free where it moves.
-    """
+    """The wavelength changes by a ramp, a random walk, or hops to another laser mode and back."""
 
     name = "wavelength_drift"
     title = "wavelength that drifts or hops between laser modes"
