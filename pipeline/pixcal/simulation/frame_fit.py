@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from scipy.special import log_ndtr
 
-from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.fringe_motion import motion_part, ramps, ramps_and_colour
+from pixcal.estimators.diagnosis.evidence import Evidence, cached_on_evidence
+from pixcal.estimators.frame_series.fringe_motion import motion_part, ramps
 from pixcal.estimators.frame_series.light import LIGHT_PARTS
 from pixcal.estimators.frame_series.profiled import Profiled, best_shape
 from pixcal.estimators.frame_series.series import assemble
@@ -190,6 +190,9 @@ class FrameBasis:
         return float(np.sqrt(more)) / square if more > ROUGH * normal else 0.0
 
 
+_changes_of = cached_on_evidence(FrameChanges)
+
+
 def _names(changes: FrameChanges, every: Sequence[AffectedSeries]) -> list[str]:
     kinds = {w.channels is LIGHT for w in every}
     motion = MOTION_PARTS if changes.crossed else MOTION_PARTS[:-1]
@@ -211,9 +214,7 @@ def _nuisance_parts(changes: FrameChanges, name: str, every: Sequence[AffectedSe
 
 def _nuisance_shapes(changes: FrameChanges, of: AffectedSeries) -> F64:
     """Steady changes (t, 2, q) of a series by nuisances."""
-    if of.channels is LIGHT:
-        return np.zeros((len(of.series), 2, 3 if changes.crossed else 2))
-    return ramps_and_colour(of.series) if changes.crossed else ramps(of.series)
+    return ramps(of.series, colour=changes.crossed) * (of.channels is not LIGHT)
 
 
 @dataclass(frozen=True)
@@ -232,7 +233,7 @@ def fit_frames(
     kind: type[ForwardModel], evidence: Evidence, leave: Sequence[str] = ()
 ) -> FrameFit | None:
     """Parameters of a model of whole frames, except ``leave``; None without evidence."""
-    changes = evidence.once("changes of frames", make=lambda: FrameChanges(evidence))
+    changes = _changes_of(evidence)
     every = changes.series(kind())
     strengths = strengths_of(every, kind(), leave)
     if not strengths:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, cached_on_evidence
 from pixcal.estimators.maps.map_fit import (
     MapFit,
     MapPart,
@@ -89,7 +89,7 @@ class LightFit:
 
 def fit_light(starts: Sequence[LightStart], evidence: Evidence, degree: int) -> LightFit | None:
     """Best fit over the starts, those with fewer numbers first; None with too few pixels."""
-    lit = evidence.once("light of the pixels", make=lambda: _lit(evidence))
+    lit = _lit(evidence)
     best: LightFit | None = None
     for start in starts if lit else ():
         found = _fitted(start, lit, degree)
@@ -191,6 +191,7 @@ def _bent(turn: C128) -> F64:
     return np.asarray(np.angle(turn * np.exp(-1j * np.angle(turn.mean()))))
 
 
+@cached_on_evidence
 def _lit(evidence: Evidence) -> list[_Lit]:
     recordings = set_recordings(evidence)
     large = {

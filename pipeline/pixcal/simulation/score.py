@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.special import log_ndtr
 
-from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence, cached_on_evidence
 from pixcal.estimators.frame_series.variance_components import log_chance, log_chance_of_any, sigmas
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.significance import root_with_error
@@ -84,8 +84,7 @@ def score_again(
     return float(fit.together([template])[2])
 
 
-def _changes(evidence: Evidence) -> Changes:
-    return evidence.once("changes by forward models", make=lambda: Changes(evidence))
+_changes = cached_on_evidence(Changes)
 
 
 @dataclass(frozen=True)

@@ -105,16 +105,11 @@ def _around(modes: F64, low: float, high: float, beside: int = 0) -> tuple[F64, 
     return (sums[last] - sums[first]) / count, count
 
 
-def ramps(series: FrameSeries) -> F64:
-    """Shapes (t, 2, 2): a ramp of the vector along x and one along y, rad/px/s."""
+def ramps(series: FrameSeries, *, colour: bool) -> F64:
+    """Shapes (t, 2, q): ramps of the vector along x and y, rad/px/s, and of the wavelength, 1/s."""
     time = series.time_s - series.time_s.mean()
-    return np.asarray(time[:, None, None] * np.eye(2))
-
-
-def ramps_and_colour(series: FrameSeries) -> F64:
-    """Shapes (t, 2, 3): as `ramps`, and one of the relative wavelength, 1/s."""
-    colour = -(series.time_s - series.time_s.mean())[:, None] * np.array(series.k)
-    return np.concatenate([ramps(series), colour[..., None]], axis=2)
+    along = [[1.0, 0.0], [0.0, 1.0], *([[-k for k in series.k]] if colour else [])]
+    return np.asarray(time[:, None, None] * np.array(along).T)
 
 
 def colour_of(series: FrameSeries) -> F64:
