@@ -22,6 +22,7 @@ from pixcal.estimators.test_statistics.expectation import (
     statistic_named,
     straight_significance,
 )
+from pixcal.kernels.significance import log_of_any
 from pixcal.model.arrays import F64
 
 ALLOWED = 2.0  # standard deviations of a value that do not count as a gap
@@ -66,21 +67,16 @@ def compare(data: Mapping[Key, F64], expected: Expectation) -> dict[Key, Differe
         tails = np.log(stdtr(expected.dof, -np.abs(off) / error))
     sigmas = -ndtri_exp(np.minimum(tails, -1e-300)) * np.sign(off)
     least = np.minimum.reduceat(tails, starts) + np.log(2)
-    any_of = _any_of(least, np.array([expected.independent[key] for key in keys]))
     beyond = np.maximum(np.abs(off) - ALLOWED * error, 0) ** 2
     excess = np.add.reduceat(beyond / noise, starts)
     return {
-        key: Difference(sigmas[first : first + size], float(chance), float(more))
-        for key, first, size, chance, more in zip(keys, starts, sizes, any_of, excess, strict=True)
+        key: Difference(
+            sigmas[first : first + size],
+            log_of_any(min(float(chance), -1e-15), expected.independent[key]),
+            float(more),
+        )
+        for key, first, size, chance, more in zip(keys, starts, sizes, least, excess, strict=True)
     }
-
-
-def _any_of(log_chance: F64, count: F64) -> F64:
-    """Logarithm of the probability that the least of ``count`` p-values is as small."""
-    none = count * np.log1p(-np.minimum(np.exp(log_chance), 1 - 1e-15))
-    tiny = log_chance < -30
-    many = np.log(-np.expm1(np.where(tiny, -1.0, none)))
-    return np.asarray(np.where(tiny, log_chance + np.log(count), many))
 
 
 def flagged(differences: Mapping[Key, Difference]) -> set[Key]:
