@@ -265,7 +265,7 @@ def _steps_of(source: Ingested, levels: F64, usable: Mask, rate: float) -> list[
     if source.survey is None or not source.exposures.known:
         return []
     table = source.tables["flat"]
-    stamped = np.equal(table["time_source"], "header")
+    stamped = np.not_equal(table["time_source"], "number")
     seconds = np.where(stamped, np.array(table["time_s"], float), np.nan)
     steps = zip(source.exposures.flat, levels, usable, strict=True)
     return [
