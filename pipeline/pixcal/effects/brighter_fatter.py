@@ -20,6 +20,7 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 _DISAGREE = 4.0
+_LAW_ERROR = 0.1  # of the shift: what one falloff leaves between near noise and far harmonics
 # significance, with a free response, above which it may explain all harmonics
 _HINTED = 1.5
 _NEEDED = 12.0  # chi-square of three terms above which they are needed: one in 130 by chance
@@ -156,7 +157,8 @@ def _beside_noise(found: Boundaries, evidence: Evidence) -> Boundaries | None:
     if noise is None:
         return None
     apart = abs(found.shift * (1 + found.along_y) / 2 - noise.size)
-    return found if apart < _DISAGREE * np.hypot(found.shift_error, noise.variance**0.5) else None
+    errors = found.shift_error, noise.variance**0.5, _LAW_ERROR * noise.size
+    return found if apart < _DISAGREE * float(np.linalg.norm(errors)) else None
 
 
 def _errors(found: Boundaries) -> tuple[dict[str, float], tuple[dict[str, float], ...]]:

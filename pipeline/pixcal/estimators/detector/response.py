@@ -20,7 +20,7 @@ from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F32, F64
 
 UNIT = 1e-7  # unit of the fitted shift of boundaries (px per electron)
-# Within `REACH` there are six distances: shifts of any falloff are a sum of these.
+# Shifts of any falloff between the first and the last are a sum of these, to 10⁻⁵ within `REACH`.
 FALLOFFS_PX = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
 _FINE_PX = np.geomspace(FALLOFFS_PX[0], FALLOFFS_PX[-1], 61)
 _BESIDE = 5  # half-width of the parabola about the best falloff, fine steps
