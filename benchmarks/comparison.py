@@ -9,8 +9,6 @@ fringes as straight: from some 400 pixels on (``--size``), their curvature adds 
 
 import argparse
 import json
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from comparators.measure import METHODS, PIXCAL
+from comparators.measure import METHODS, PIXCAL, Task, cost_apart
 from pixcal.engine.run import Runtime
 from pixcal.model.acquisition import load_acquisition
 from pixcal.model.bench import load_bench
@@ -27,7 +25,7 @@ from pixcal.storage.products import read_map
 from reproduction.lab import Scene
 from truth import PLANE, Truth
 
-HERE = Path(__file__).parent
+ROOT = Path(__file__).parents[1]
 NAME = "vertical"
 MOVING = {"contrast_noise": {"vibration_rad": 0.0, "polarisation": 0.03, "polarisation_s": 0.0}}
 TILT_RAD = 0.01  # rms, edge to edge, along each axis
@@ -57,7 +55,7 @@ error: rms over the bound, less the seven modes that such data leave open; good 
 
 def bench(folder: Path, scenario: str, size: int, frames: int) -> Path:
     """Bench file of a scenario on a square window."""
-    config = yaml.safe_load((HERE.parent / "configs" / "precision.yaml").read_text())
+    config = yaml.safe_load((ROOT / "configs" / "precision.yaml").read_text())
     detector, optics, effects = SCENARIOS[scenario]
     config["detector"] |= {"shape": [size, size], **detector}
     config["optics"] |= {"visibility": 0.95, **optics}
@@ -74,19 +72,13 @@ def measure(
     method: str, folder: Path, truth: Truth, options: argparse.Namespace
 ) -> dict[str, float]:
     """What a method costs, in a process of its own, and how far it is from the truth."""
-    described = load_acquisition(folder / "acq")
-    phase = folder / f"{method}.npy"
-    command = [sys.executable, "-m", "comparators.measure", method, str(folder / "run"), NAME]
-    command += ["--vector", *(str(k) for k in nominal_vector(described, NAME))]
-    command += ["--read-noise", str(described.detector.read_noise_e)]
-    command += ["--pixels", str(options.pixels), "--repeat", str(options.repeat)]
-    command += ["--phase", str(phase)]
-    done = subprocess.run(command, cwd=HERE, check=True, stdout=subprocess.PIPE, text=True)
-    cost: dict[str, float] = json.loads(done.stdout)
-    if phase.exists():
-        offsets = truth.offsets(np.load(phase))
+    described, run = load_acquisition(folder / "acq"), folder / "run"
+    vector, noise = nominal_vector(described, NAME), described.detector.read_noise_e
+    cost, phase = cost_apart(method, Task(run, NAME, vector, noise, options.pixels), options.repeat)
+    if phase is not None:
+        offsets = truth.offsets(phase)
     else:
-        offsets = read_map(folder / "run" / "products" / "delta_fringe.fits")[0].astype(float)
+        offsets = read_map(run / "products" / "delta_fringe.fits")[0].astype(float)
     return cost | {
         "pixels": int(np.isfinite(offsets).sum()),
         "error_over_bound": truth.error(offsets) / truth.bound,

@@ -1,17 +1,13 @@
-"""One method on one reduced cube, in a process of its own: ``python -m comparators.measure``.
+"""What a method costs on one reduced cube, in a process of its own."""
 
-Prints what it cost as JSON, and leaves its map of phases in a file where the run's products do not
-have it.
-"""
-
-import argparse
-import json
 import re
 import shutil
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -115,35 +111,27 @@ def memory(field: str) -> int:
     return int(kibibytes) * 1024
 
 
-def main() -> None:
-    """Run a method once for its memory and to warm up, then as often as asked for its time."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("method", choices=METHODS)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("name")
-    parser.add_argument("--vector", type=float, nargs=2, required=True)
-    parser.add_argument("--read-noise", type=float, required=True)
-    parser.add_argument("--pixels", type=int, required=True)
-    parser.add_argument("--repeat", type=int, required=True)
-    parser.add_argument("--phase", type=Path, required=True, help="file for the map, .npy")
-    options = parser.parse_args()
-    method, vector = METHODS[options.method], (options.vector[0], options.vector[1])
-    task = Task(options.run, options.name, vector, options.read_noise, options.pixels)
+def cost(method: str, task: Task, repeat: int) -> tuple[dict[str, float], F64 | None]:
+    """What a method costs, and its map of phases where the run's products do not have it.
+
+    It runs once for its memory and to warm up, then ``repeat`` times for its time.
+    """
+    run = METHODS[method]
     start = memory("VmRSS")
-    first = method(task)
+    first = run(task)
     peak = memory("VmHWM")
-    best = min((method(task) for _ in range(options.repeat)), key=lambda result: result.seconds)
-    if first.phase is not None:
-        np.save(options.phase, first.phase)
-    cost = {
+    best = min((run(task) for _ in range(repeat)), key=lambda result: result.seconds)
+    told = {
         "seconds": best.seconds,
         "reading_seconds": best.reading,
         "first_seconds": first.seconds,
         "memory_bytes": peak - start,
         "imports_bytes": start,
     }
-    print(json.dumps(cost))
+    return told, first.phase
 
 
-if __name__ == "__main__":
-    main()
+def cost_apart(method: str, task: Task, repeat: int) -> tuple[dict[str, float], F64 | None]:
+    """`cost`, in a new process."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(cost, method, task, repeat).result()

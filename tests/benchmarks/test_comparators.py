@@ -1,8 +1,5 @@
 """What pixcal is compared with does what it is known for, and no less; the yardstick is right."""
 
-import json
-import subprocess
-import sys
 from argparse import Namespace
 from collections.abc import Callable
 from dataclasses import replace
@@ -253,21 +250,15 @@ def test_each_method_reaches_a_bound_that_it_cannot_beat(
 
 
 @pytest.mark.long
-def test_a_method_in_a_process_of_its_own(
-    task: tuple[measure.Task, SimpleNamespace], tmp_path: Path
-) -> None:
+def test_a_method_in_a_process_of_its_own(task: tuple[measure.Task, SimpleNamespace]) -> None:
     given, bench = task
-    phase = tmp_path / "phase.npy"
-    command = [sys.executable, "-m", "comparators.measure", "advanced iterative", str(given.run)]
-    command += [given.name, "--vector", str(given.vector[0]), "0", "--read-noise", "16"]
-    command += ["--pixels", "10", "--repeat", "2", "--phase", str(phase)]
-    done = subprocess.run(command, cwd=comparison.HERE, check=True, capture_output=True, text=True)
-    cost = json.loads(done.stdout)
+    cost, phase = measure.cost_apart("advanced iterative", given, 2)
     assert 0 < cost["reading_seconds"] < cost["seconds"]
     # The cube in float64 at least, and not much beside it.
     cube = 8 * bench.frames * bench.shape[0] * bench.shape[1]
     assert cube < cost["memory_bytes"] < 3 * cube + 2**25
-    assert np.load(phase).shape == bench.shape
+    assert phase is not None
+    assert phase.shape == bench.shape
 
 
 @pytest.mark.long
