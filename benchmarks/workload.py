@@ -1,15 +1,14 @@
 """Acquisitions to measure speed on, and how time and memory are measured."""
 
-import json
 import os
 import shutil
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,10 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from pixcal.engine import plan
 from pixcal.engine.run import Runtime
 from pixcal.kernels.bilinear import GOES_ON, N_SUMS, sweep_batches
-from pixcal.stages import fit, ingest, reduce, simulate
+from pixcal.stages import allan, fit, ingest, reduce, report, simulate
 from pixcal.stages.reduced_set import ReducedSet
 
 ROOT = Path(__file__).parents[1]
@@ -175,35 +175,31 @@ class Workload:
                         os.posix_fadvise(handle.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
-MEASURE = """
-import json, sys
-from pathlib import Path
-from pixcal.engine import plan
-from pixcal.engine.run import Runtime
-from pixcal.stages import allan, fit, ingest, reduce, report
-import time
-planned = []
-of = plan.Plan.total.fget
-plan.Plan.total = property(lambda self: planned.append(of(self)) or planned[-1])
-stage, run = sys.argv[1], Path(sys.argv[2])
-begin = time.perf_counter()
-if stage == "ingest":
-    ingest.run(run.parent / "acq", run, ingest.Config(), Runtime())
-else:
-    module = {"reduce": reduce, "fit": fit, "allan": allan, "report": report}[stage]
-    module.run(run, module.Config(), Runtime())
-took = time.perf_counter() - begin
-status = Path("/proc/self/status").read_text()
-peak = int(status.partition("VmHWM:")[2].split()[0]) * 1024
-# Plans that were too large for the memory allowed were made again with fewer workers.
-planned = max(p for p in planned if p <= Runtime().memory)
-print(json.dumps({"planned": planned, "peak": peak, "seconds": took}))
-"""
-
-
-def memory(stage: str, run: Path) -> dict[str, Any]:
+def memory(stage: str, run: Path) -> dict[str, float]:
     """Peak of a stage in a process of its own (bytes), the largest it planned, and seconds."""
-    done = subprocess.run(
-        [sys.executable, "-c", MEASURE, stage, str(run)], check=True, capture_output=True, text=True
-    )
-    return dict(json.loads(done.stdout))
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(_memory, stage, run).result()
+
+
+def _memory(stage: str, run: Path) -> dict[str, float]:
+    planned: list[int] = []
+    of = plan.Plan.total.fget
+
+    def noted(self: plan.Plan) -> int:
+        planned.append(of(self))
+        return planned[-1]
+
+    plan.Plan.total = property(noted)
+    if stage == "ingest":
+        took = seconds(lambda: ingest.run(run.parent / "acq", run, ingest.Config(), Runtime()))
+    else:
+        module = {"reduce": reduce, "fit": fit, "allan": allan, "report": report}[stage]
+        took = seconds(lambda: module.run(run, module.Config(), Runtime()))
+    status = Path("/proc/self/status").read_text()
+    peak = int(status.partition("VmHWM:")[2].split()[0]) * 1024
+    # Plans that were too large for the memory allowed were made again with fewer workers.
+    return {
+        "planned": max(p for p in planned if p <= Runtime().memory),
+        "peak": peak,
+        "seconds": took,
+    }
