@@ -90,17 +90,9 @@ def make_bench(folder: Path, seed: int) -> Bench:
     return Bench(folder, acquisition, run, seconds, seed)
 
 
-def parts_of(stages: tuple[str, ...]) -> list[str]:
-    """Folders of a run that stages write."""
-    parts = list(stages)
-    if "fit" in stages:
-        parts += ["sweep", "products"]
-    return parts
-
-
 def differences(one: Path, other: Path, *stages: str) -> list[str]:
     """Files of some stages that are not the same in two runs; none may be left half-done."""
-    parts = parts_of(stages)
+    parts = [*stages, *(["sweep", "products"] if "fit" in stages else [])]
     left = [f.name for f in other.glob(".partial/*") if f.name.rpartition("-")[0] in parts]
     assert not left, left
     found: list[str] = []

@@ -19,13 +19,13 @@ def sloping_harmonics(shape: tuple[int, int], vector: tuple[float, float]) -> F6
     return np.asarray((slopes[:, None] * waves).reshape(-1, *shape))
 
 
-def teeth(values: F64, period: int, edge: int = 2) -> F64:
-    """Mean (period,) of rows that are whole periods apart, less the mean of all.
+def teeth(values: F64, period: int) -> F64:
+    """Mean (period,) of rows (y, x) that are whole periods apart, less the mean of all.
 
-    ``values``: (y, x). ``edge``: rows and columns at the window's edges that are left out.
+    Two rows and columns at the window's edges are left out.
     """
-    inner = values[edge:-edge, edge:-edge]
-    row = (np.arange(len(inner)) + edge) % period
+    inner = values[2:-2, 2:-2]
+    row = (np.arange(len(inner)) + 2) % period
     means = np.array([np.nanmean(inner[row == n]) for n in range(period)])
     return np.asarray(means - means.mean())
 
