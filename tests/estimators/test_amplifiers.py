@@ -53,6 +53,16 @@ Y, X = np.indices((96, 150))
 LAYOUTS = {
     "halves": (1.03 ** (X >= 70), ["columns up to 69", "columns from 70"]),
     "alternate": (1.03 ** (X % 2), ["even columns", "odd columns"]),
+    "halves that differ in one half": (
+        np.where(
+            X >= 70, 1.03 * 0.98 ** np.where(Y >= 40, 1, -1), 1.005 ** np.where(Y >= 40, 1, -1)
+        ),
+        [
+            f"rows {r}, columns {c}"
+            for r in ("up to 39", "from 40")
+            for c in ("up to 69", "from 70")
+        ],
+    ),
     "quadrants": (
         1.03 ** (X >= 70) * 0.98 ** (Y >= 40) * 1.005 ** ((X >= 70) & (Y >= 40)),
         [

@@ -77,12 +77,17 @@ def differing_outputs(
         return None
     ratio /= np.nanmean(ratio)
     found = [_parts(response, ratio, axis) for axis in (0, 1)]
+    for axis, other in ((0, 1), (1, 0)):
+        # The outputs of one half may differ more than the means of both.
+        label = _alike(found[other])[1]
+        for each in set(label.tolist()) if not found[axis] else ():
+            maps = [np.compress(label == each, v, axis=other) for v in (response, ratio)]
+            found[axis] = max(found[axis], _parts(maps[0], maps[1], axis), key=len)
     if not any(found):
         return None
     labels, names = [], []
     for axis, patterns in enumerate(found):
-        own = np.array([np.zeros(flat.shape[axis], np.bool_), *patterns])
-        _, at, label = np.unique(own, axis=1, return_index=True, return_inverse=True)
+        at, label = _alike(patterns) if patterns else ([0], np.zeros(flat.shape[axis], int))
         labels.append(label)
         names.append([_name(patterns, place, first[axis], ("row", "column")[axis]) for place in at])
     cell = labels[0][:, None] * len(names[1]) + labels[1]
@@ -112,6 +117,14 @@ def _parts(response: F64, ratio: F64, axis: int) -> list[Mask]:
     there = (abs(size) > SIGNIFICANT * error) & (abs(seen) > CERTAIN * noise)
     alike = abs(seen - size) < np.maximum(CERTAIN / 2 * noise, abs(size) / 2)
     return [pattern for pattern, kept in zip(patterns, there & alike, strict=True) if kept]
+
+
+def _alike(patterns: Sequence[Mask]) -> tuple[list[int], I64]:
+    """First place of each combination of patterns (place,), and the combination of each place."""
+    if not patterns:
+        return [], np.zeros(0, np.int64)
+    _, at, label = np.unique(patterns, axis=1, return_index=True, return_inverse=True)
+    return at.tolist(), label
 
 
 def _name(patterns: Sequence[Mask], place: int, first: int, line: str) -> str:
