@@ -144,3 +144,11 @@ def test_levels_out_of_order_are_not_bent_by_a_drift() -> None:
     response = lambda e: e * (1 + 0.006 * e / 4e4)  # noqa: E731
     assert judged(STAMPS, STAMPS, response=response).lamp
     assert not judged(STAMPS, STAMPS, response=response, order=(4, 0, 2, 5, 1, 3)).lamp
+
+
+def test_levels_of_one_exposure_time_and_a_drifting_lamp_lie_on_no_line() -> None:
+    drifting = np.linspace(1.0, 1.002, 8)
+    levels = [
+        Level(2.0, mean, True, mean * drifting, np.arange(8.0)) for mean in (1e3, 2e3, 4e3, 8e3)
+    ]
+    assert straightness(levels, np.empty((0, 3)), np.nan) is None

@@ -221,10 +221,10 @@ def linearity(exptimes: F64, levels: F64, used: Mask) -> Linearity | None:
     """Line of least squared relative distances through the levels of flats.
 
     ``exptimes, levels``: (step,) s, and ADU above bias and dark; ``used``: (step,) those without
-    saturation. None with fewer than `MIN_STEPS` levels.
+    saturation. None with fewer than `MIN_STEPS` levels, or one exposure time.
     """
     used = used & (levels > 0)
-    if used.sum() < MIN_STEPS:
+    if used.sum() < MIN_STEPS or np.ptp(exptimes[used]) == 0:
         return None
     weight = 1 / levels[used]
     design = np.stack([exptimes[used], np.ones(used.sum())], axis=1)
