@@ -402,3 +402,34 @@ def test_half_the_declared_gain_may_be_that_of_an_electron_multiplier(
     summary: Any = SimpleNamespace(declared=SimpleNamespace(gain_e_per_adu=declared), step=1.0)
     sentences = _declared_gain_warnings(fit, summary, declared)
     assert any("F² = 2" in one for one in sentences) == said
+
+
+@pytest.mark.parametrize("multiplied", [True, False])
+def test_dark_signal_in_outliers_is_told(multiplied: bool, tmp_path: Path) -> None:
+    rng = np.random.default_rng(9)
+    (tmp_path / "acq").mkdir()
+    rate, shape = 0.02, (96, 96)
+    for name, count, seconds in (("bias", 16, 0.0), ("dark0", 12, 2.0), ("dark1", 12, 10.0)):
+        charge = rng.poisson(rate * seconds, (count, *shape)).astype(float)
+        if multiplied:
+            charge = rng.gamma(np.maximum(charge, 1e-9))
+        # Of 0.01 e-/ADU: the read noise is 0.1 or 5 e-.
+        samples = (
+            500 + 100 * charge + (10 if multiplied else 500) * rng.standard_normal(charge.shape)
+        )
+        header = fits.Header({"EXPTIME": seconds})
+        samples = (samples + 4000).clip(0, 65535).round().astype(np.uint16)
+        fits.writeto(tmp_path / "acq" / f"{name}.fits", samples, header)
+    listed = {
+        "schema": "pixcal/acquisition/1",
+        "detector": {"pitch_um": 5.5, "read_noise_e": 0.1, "gain_e_per_adu": 0.01},
+        "frames": {"bias": ["bias.fits"], "dark": ["dark*.fits"]},
+    }
+    (tmp_path / "acq" / "acquisition.yaml").write_text(yaml.safe_dump(listed))
+    reduced = pixcal.reduce(pixcal.ingest(tmp_path / "acq", tmp_path / "run")).reduction
+    note = reduced["figures_of_merit"]["dark_current"]["note"]
+    assert ("outliers that are left out hold" in note) == multiplied
+    if multiplied:
+        value = reduced["figures_of_merit"]["dark_current"]["value"]
+        # Pixels with many outliers are flagged as noisy: they are in neither.
+        assert 0.7 * rate < value + float(note.partition("hold ")[2].split()[0]) < 1.05 * rate

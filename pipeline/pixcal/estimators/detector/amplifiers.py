@@ -19,7 +19,7 @@ MAX_BOUNDARIES = 7  # most boundaries along each axis
 NARROWEST = 8  # fewest rows or columns of an amplifier
 SIGNIFICANT = 6.0  # standard deviations of a step of the flat
 SMOOTH = 2  # degree of the lamp's variation
-CERTAIN = 6.0  # the same of a step of the noise, to name the outputs
+CERTAIN = 4.0  # the same of a step of the noise, to name the outputs
 _TILE = 32  # side (px) of the blocks to which a trend is fitted
 
 

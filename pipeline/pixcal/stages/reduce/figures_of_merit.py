@@ -5,7 +5,6 @@ in the middle of the detector (at most `SIDE` pixels); the rest comes from earli
 """
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,22 +15,18 @@ from pixcal.estimators.detector.emva import Measure, Nonuniformity
 from pixcal.estimators.detector.pair_noise import shared_by_lines
 from pixcal.model.arrays import F64, Mask
 from pixcal.report.text import with_error
+from pixcal.stages.reduce.dark_current import dark_current
 from pixcal.stages.reduce.detector_summary import Summary, pair_sums
 from pixcal.stages.reduce.frame_statistics import Measuring
-from pixcal.stages.reduce.halves import Window, frames_of, middle_of, read_halves
+from pixcal.stages.reduce.halves import middle_of, read_halves
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduce.outputs import outputs_of, report_outputs
 from pixcal.stages.reduce.read_noise import Nearby
 from pixcal.storage.artefact import Build
-from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.manifest import write_json
 
 Json = dict[str, Any]
 
-_NO_ERROR = 1e-9  # ADU/s: below it all samples have one code
-# relative error of the change of dark current by correcting noise that is cut off: it is not known
-# which distribution the noise had
-_OF_CORRECTION = 0.5
 _WELL = 0.97  # share of the converter's range below which saturation is due to full wells
 
 
@@ -83,7 +78,9 @@ def characterise(
         percent = np.stack([100 * emva.without_trend(half, halves.good) for half in light])
         facts["warnings"] += _spread(found, curves, "prnu", "%", percent, halves.good)
     scale = gain[0] / entry["used"]
-    _dark_current(found, made, source, job, scale, middle)
+    rate = dark_current(made, source, job, gain, scale, middle)
+    if rate is not None:
+        found["dark_current"] = _figure("dark current", rate.unit, rate.measure, rate.note)
     for name, figure in found.items():
         by_gain = figure["unit"].startswith("e-") and name != "conversion_gain"
         if by_gain and figure["error"] is not None:
@@ -229,73 +226,3 @@ def _listed(columns: Any, names: tuple[str, ...]) -> Json:
         name: [float(f"{v:.5g}") for v in column]
         for name, column in zip(names, columns, strict=True)
     }
-
-
-# Dark current
-
-
-def _dark_current(
-    found: Json, made: Build, source: Ingested, job: Measuring, scale: float, middle: Window
-) -> None:
-    """Mean dark signal of good pixels; its error is from frames, bias drift included."""
-    if not source.exposures.has_rate:
-        return
-    folder = made.folder / "calibration.zarr"
-    good = ArrayReader(folder / "mask").read(*middle) == 0
-    if not good.any():
-        return
-    rates = scale * ArrayReader(folder / "dark_rate").read(*middle)
-    gain = found["conversion_gain"]["value"]
-    rows = _middle_rows(middle)
-    slope = emva.dark_slope(*_dark_means(source, middle, good))
-    error = gain * slope[1] if slope is not None and slope[1] > _NO_ERROR else None
-    if error is not None and slope is not None and source.cut_off:
-        corrected = rates[rows][good[rows]].mean(dtype=float)
-        error = math.hypot(error, _OF_CORRECTION * (corrected - gain * slope[0]))
-    note, rate = _temperature(source.tables), float(rates[good].mean(dtype=float))
-    subtracted, off = job.subtracted
-    if subtracted:
-        # A variance in electrons goes with the square of the gain; that was found by a rough one.
-        better = gain / job.gain
-        rate = better * (rate + gain * subtracted)
-        of_gain = (found["conversion_gain"]["error"] or 0.0) / gain
-        error = math.hypot(better * gain * off, rate * of_gain)
-        note = f"by the noise of dark frames: the camera subtracts it from their level; {note}"
-    timed = any(source.tables["dark"]["exptime_s"])
-    unit = "e-/s" if timed else "e-/exposure"
-    found["dark_current"] = _figure("dark current", unit, (rate, error), note)
-
-
-def _dark_means(source: Ingested, middle: Window, good: Mask) -> tuple[F64, F64]:
-    """Exposure time (s) and mean (ADU) of each frame without light, in the window's middle rows."""
-    (y0, _), columns = middle
-    rows = _middle_rows(middle)
-    window = (y0 + rows.start, y0 + rows.stop), columns
-    pixels = good[rows]
-    times, means = [], []
-    for group in source.exposures.dark if pixels.any() else ():
-        for samples in frames_of(source, group.array, group.frames, window):
-            times.append(group.exptime)
-            means.append(float(samples[pixels].mean(dtype=float)))
-    return np.array(times), np.array(means)
-
-
-def _middle_rows(middle: Window) -> slice:
-    """Rows of a chunk in the middle of a window, from its first row on."""
-    height = middle[0][1] - middle[0][0]
-    first = height // CHUNK[1] // 2 * CHUNK[1]
-    return slice(first, min(first + CHUNK[1], height))
-
-
-def _temperature(tables: Mapping[str, Mapping[str, Any]]) -> str:
-    """Temperature of the frames without light, if in their headers."""
-    known = [
-        t
-        for kind in ("dark", "bias")
-        for t in tables.get(kind, {}).get("temperature_c", ())
-        if t is not None
-    ]
-    if not known:
-        return "temperature not in the headers"
-    low, high = min(known), max(known)
-    return f"at {low:.1f} °C" if high - low < 0.05 else f"at {low:.1f} to {high:.1f} °C"

@@ -32,15 +32,15 @@ def report_outputs(found: Outputs, gain: float, facts: dict[str, Any]) -> str:
     each = zip(found.names, gain * found.gain, gain * found.gain * found.error, strict=True)
     entries: list[dict[str, Any]] = []
     entries += [{"where": n, "gain": float(g), "error": float(e)} for n, g, e in each if g > 0]
-    said = [f"{e['where']} {with_error(e['gain'], e['error'])}" for e in entries]
+    said = [f"{e['where']}: {with_error(e['gain'], e['error'])}" for e in entries]
     if len(said) > _NAMED:
         order = sorted(entries, key=lambda entry: float(entry["gain"]))
         ends = [f"{e['gain']:.4g} ({e['where']})" for e in (order[0], order[-1])]
         said = [" to ".join(ends)]
-    words = ", ".join(said) + " e-/ADU"
+    words = "; ".join(said) + " e-/ADU"
     facts["gain_e_per_adu"]["outputs"] = entries
     facts["warnings"].append(
-        f"the gain differs between outputs: {words}; electrons are counted by one gain for all, "
-        "and the flat map removes the steps"
+        f"the gain differs between outputs ({words}): electrons are counted by one gain for "
+        "all, and the flat map removes the steps"
     )
     return f"of all outputs together: {words}"

@@ -1,0 +1,111 @@
+"""Mean dark signal of a detector, and what the clipping of outliers leaves out of it."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pixcal.estimators.detector import emva
+from pixcal.model.arrays import F64, Mask
+from pixcal.stages.reduce.frame_statistics import Measuring
+from pixcal.stages.reduce.halves import Window, frames_of
+from pixcal.stages.reduce.ingested import Ingested
+from pixcal.storage.artefact import Build
+from pixcal.storage.cube import CHUNK, ArrayReader
+
+_NO_ERROR = 1e-9  # ADU/s: below it all samples have one code
+# relative error of the change of dark current by correcting noise that is cut off: it is not known
+# which distribution the noise had
+_OF_CORRECTION = 0.5
+# least signal in outliers that is reported: errors, and share of the whole
+_SURE, _NOTABLE = 5.0, 0.05
+
+
+class DarkCurrent(NamedTuple):
+    """Mean dark signal of good pixels."""
+
+    measure: tuple[float, float | None]
+    unit: str
+    note: str
+
+
+def dark_current(
+    made: Build,
+    source: Ingested,
+    job: Measuring,
+    conversion: tuple[float, float | None],
+    scale: float,
+    middle: Window,
+) -> DarkCurrent | None:
+    """The dark current; its error is from frames, bias drift included. None if it is unknown.
+
+    ``conversion``: gain with its error (e-/ADU); ``scale``: over the gain used for the maps.
+    """
+    if not source.exposures.has_rate:
+        return None
+    folder = made.folder / "calibration.zarr"
+    good = ArrayReader(folder / "mask").read(*middle) == 0
+    if not good.any():
+        return None
+    rates = scale * ArrayReader(folder / "dark_rate").read(*middle)
+    gain, of_gain = conversion[0], (conversion[1] or 0.0) / conversion[0]
+    rows = _middle_rows(middle)
+    slope = emva.dark_slope(*_dark_means(source, middle, good))
+    error = gain * slope[1] if slope is not None and slope[1] > _NO_ERROR else None
+    timed = any(source.tables["dark"]["exptime_s"])
+    unit = "e-/s" if timed else "e-/exposure"
+    notes = []
+    if error is not None and slope is not None:
+        left_out = gain * slope[0] - float(rates[rows][good[rows]].mean(dtype=float))
+        if source.cut_off:
+            error = math.hypot(error, _OF_CORRECTION * left_out)
+        elif not job.subtracted[0] and left_out > max(_SURE * error, _NOTABLE * gain * slope[0]):
+            notes.append(
+                f"outliers that are left out hold {left_out:.2g} {unit} more: particles, or charge "
+                "that an electron multiplier spreads widely"
+            )
+    note, rate = _temperature(source.tables), float(rates[good].mean(dtype=float))
+    subtracted, off = job.subtracted
+    if subtracted:
+        # A variance in electrons goes with the square of the gain; that was found by a rough one.
+        better = gain / job.gain
+        rate = better * (rate + gain * subtracted)
+        error = math.hypot(better * gain * off, rate * of_gain)
+        note = f"by the noise of dark frames: the camera subtracts it from their level; {note}"
+    return DarkCurrent((rate, error), unit, "; ".join([note, *notes]))
+
+
+def _dark_means(source: Ingested, middle: Window, good: Mask) -> tuple[F64, F64]:
+    """Exposure time (s) and mean (ADU) of each frame without light, in the window's middle rows."""
+    (y0, _), columns = middle
+    rows = _middle_rows(middle)
+    window = (y0 + rows.start, y0 + rows.stop), columns
+    pixels = good[rows]
+    times, means = [], []
+    for group in source.exposures.dark if pixels.any() else ():
+        for samples in frames_of(source, group.array, group.frames, window):
+            times.append(group.exptime)
+            means.append(float(samples[pixels].mean(dtype=float)))
+    return np.array(times), np.array(means)
+
+
+def _middle_rows(middle: Window) -> slice:
+    """Rows of a chunk in the middle of a window, from its first row on."""
+    height = middle[0][1] - middle[0][0]
+    first = height // CHUNK[1] // 2 * CHUNK[1]
+    return slice(first, min(first + CHUNK[1], height))
+
+
+def _temperature(tables: Mapping[str, Mapping[str, Any]]) -> str:
+    """Temperature of the frames without light, if in their headers."""
+    known = [
+        t
+        for kind in ("dark", "bias")
+        for t in tables.get(kind, {}).get("temperature_c", ())
+        if t is not None
+    ]
+    if not known:
+        return "temperature not in the headers"
+    low, high = min(known), max(known)
+    return f"at {low:.1f} °C" if high - low < 0.05 else f"at {low:.1f} to {high:.1f} °C"
