@@ -113,6 +113,10 @@ def _parts(response: F64, ratio: F64, axis: int) -> list[Mask]:
     odd = place % 2 == 1
     even_out = along - _sizes(along, [odd])[0][0] * odd
     patterns = [odd, *(place >= at for at in _boundaries(even_out))]
+    # Steps too small for the noise to have them, as of the lamp, would blur the others.
+    sizes, errors = _sizes(along, patterns)[0], _sizes(in_noise, patterns)[1]
+    told = abs(sizes) > CERTAIN / 2 * errors
+    patterns = [pattern for pattern, one in zip(patterns, told, strict=True) if one]
     (size, error), (seen, noise) = (_sizes(one, patterns) for one in (along, in_noise))
     there = (abs(size) > SIGNIFICANT * error) & (abs(seen) > CERTAIN * noise)
     alike = abs(seen - size) < np.maximum(CERTAIN / 2 * noise, abs(size) / 2)
