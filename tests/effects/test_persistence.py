@@ -3,19 +3,26 @@
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 from all_frames import frames_of
 
 from pixcal.effects.lag import Lag
+from pixcal.estimators.detector.emva import dark_slope
 from pixcal.estimators.detector.persistence import persistence
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.model.arrays import F32
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.recording import recordings
 from pixcal.stages.advice import size_of
 from pixcal.stages.diagnose.frames import in_series
+from pixcal.stages.reduce.dark_levels import DarkLevels, LateRate, late_rate
+from pixcal.stages.reduce.exposures import group_exposures
+from pixcal.stages.reduce.ingested import Ingested
 
 BIAS, READ_NOISE, SHAPE = 300.0, 6.0, (37, 41)
 DEAD_S = 1.5  # between frames
@@ -87,6 +94,48 @@ def test_traps_are_found_again_by_frames_or_by_time(
     assert float(share) == pytest.approx(100 * found.share, rel=0.01)
     assert float(decays) == pytest.approx(found.decay, rel=0.05)
     assert unit == ("s" if in_seconds else "frames")
+
+
+class Samples:
+    """Frames (t, y, x) in memory, read as from a store."""
+
+    def __init__(self, frames: F32) -> None:
+        self.frames = frames
+
+    def read(self, numbers: tuple[int, int], y: tuple[int, int], x: tuple[int, int]) -> F32:
+        return self.frames[slice(*numbers), slice(*y), slice(*x)]
+
+
+def dark_signal(evidence: Evidence) -> tuple[tuple[float, float], LateRate | None]:
+    """Of frames as the reduction reads them, e-/s: with late charge and its error; that charge."""
+    tables, arrays = {}, {}
+    for kind in ("bias", "dark", "flat"):
+        own = [s for s in evidence.stacks if s.kind == kind]
+        time = np.concatenate([s.start_s + s.time_s for s in own])
+        tables[kind] = {
+            "exptime_s": np.concatenate([[s.exptime_s] * len(s.adu) for s in own]).tolist(),
+            "time_s": (time - time[0]).tolist(),
+            "mjd": (60_000 + time / 86400).tolist(),
+        }
+        arrays[kind] = Samples(np.concatenate([s.adu for s in own]))
+    exposures = group_exposures(tables)
+    source = cast(Ingested, SimpleNamespace(tables=tables, arrays=arrays, exposures=exposures))
+    levels = DarkLevels.of(source, ((0, SHAPE[0]), (0, SHAPE[1])), evidence.good)
+    slope = dark_slope(levels.times, levels.means)
+    assert slope is not None
+    return slope, late_rate(source, levels, 1.0, READ_NOISE)
+
+
+@pytest.mark.parametrize("decay", [15.0, 50.0])
+def test_dark_signal_of_darks_after_light_is_given_without_what_that_left(decay: float) -> None:
+    """The camera has no dark signal: all that the darks hold is late."""
+    (slope, _), late = dark_signal(recorded(0.01, lambda t: float(np.exp(-t / decay))))
+    assert late is not None
+    assert abs(slope - late.rate) < 4 * late.error < 0.1 * slope
+    assert f"decays over {decay:.0f} s" in late.warning
+    clean, none = dark_signal(recorded(0.0, lambda _: 0.0))
+    assert none is None
+    assert abs(clean[0]) < 4 * clean[1]
 
 
 def test_a_camera_without_traps_has_none() -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack, soon_after
 from pixcal.kernels.sample_sums import frame_means
 from pixcal.model.arrays import F64, Indices
 
@@ -17,6 +17,10 @@ _SHORTEST = 0.1
 _OF_MODEL = 2e-3  # least relative error: the light of a series is not quite steady
 _ROUNDS = 3  # of the fit, each with the light that the last one gives
 _STEP = 0.01  # relative, for derivatives by the decay
+
+
+# series of frames, and the mean above bias of each frame, e-
+Levels = Sequence[tuple[Stack, F64]]
 
 
 @dataclass(frozen=True)
@@ -61,23 +65,37 @@ class _Sequence:
 
 
 def persistence(evidence: Evidence) -> Persistence | None:
+    """As `released_late`, of the frames of a part of the window."""
+    means = [frame_means(s.adu, evidence.good) for s in evidence.stacks]
+    bias = evidence.bias[evidence.good].mean()
+    levels = [
+        (s, (own - bias) * evidence.gain) for s, own in zip(evidence.stacks, means, strict=True)
+    ]
+    found = released_late(levels, evidence.read_noise**2 / evidence.good.sum())
+    return None if found is None else found[0]
+
+
+def released_late(levels: Levels, least: float) -> tuple[Persistence, list[F64]] | None:
     """Fit to the level of dark frames soon after light; None if nothing significant is released.
 
-    The flats decide whether the release follows time or the number of frames.
+    The flats decide whether the release follows time or the number of frames. Also the mean charge
+    released in the frames of each series, e-. ``least``: smallest variance of a frame's mean, e-².
     """
-    sequence = _sequence(evidence)
+    sequence = _sequence(levels)
     if sequence is None:
         return None
+    light = np.concatenate(
+        [np.zeros(0), *(s.start_s + s.time_s for s, _ in levels if s.kind == "flat")]
+    )
     lit = [(at, m, 1 / m.mean()) for s, at, m in sequence.places if s.kind == "flat" and m.all()]
     dark = [
         (at, means, 1.0)
         for stack, at, means in sequence.places
-        if stack.kind != "flat" and evidence.soon_after_light(stack)
+        if stack.kind != "flat" and soon_after(light, stack)
     ]
     freedom = sum(len(at) - 1 for at, _, _ in dark) - _PARAMETERS
     if freedom < 1:
         return None
-    least = evidence.read_noise**2 / evidence.good.sum()
     found = [_fit(sequence, dark, mode, freedom, least) for mode in (False, True)]
     left = np.array([[_misfit(sequence, of, one) for of in (dark, lit)] for one in found])
     scale = np.maximum(left.min(axis=0), [freedom * least, 1e-12])
@@ -85,18 +103,23 @@ def persistence(evidence: Evidence) -> Persistence | None:
     best = found[int(np.argmin((left / scale) @ count))]
     for _ in range(_ROUNDS):
         best = _fit(sequence.of_light(best), dark, best.in_seconds, freedom, least)
-    return best if best.share > _SURE * best.share_error else None
+    if best.share <= _SURE * best.share_error:
+        return None
+    late = best.share * sequence.of_light(best).released(best.decay, best.in_seconds)
+    places = {id(stack): at for stack, at, _ in sequence.places}
+    return best, [late[places[id(stack)]] for stack, _ in levels]
 
 
 Series = Sequence[tuple[Indices, F64, float]]
 
 
-def _sequence(evidence: Evidence) -> _Sequence | None:
+def _sequence(levels: Levels) -> _Sequence | None:
     """Frames in order of time, those of the other half at the level of their series.
 
     None where time stamps are unknown, or series alternate.
     """
-    stacks = sorted(evidence.stacks, key=lambda s: (s.start_s + s.time_s[0], s.frame[-1]))
+    levels = sorted(levels, key=lambda one: (one[0].start_s + one[0].time_s[0], one[0].frame[-1]))
+    stacks = [stack for stack, _ in levels]
     begin = [float(s.start_s + s.time_s[0]) for s in stacks]
     end = [float(s.start_s + s.time_s[-1]) for s in stacks]
     if not stacks or not np.isfinite([*begin, *end]).all():
@@ -107,14 +130,14 @@ def _sequence(evidence: Evidence) -> _Sequence | None:
     period: list[float] = []
     pause: list[float] = []
     places = []
-    for stack, first, last, following in zip(stacks, begin, end, [*begin[1:], 0], strict=True):
+    for (stack, means), first, last, following in zip(
+        levels, begin, end, [*begin[1:], 0], strict=True
+    ):
         number = stack.frame - stack.frame[0]
         # Time stamps may be whole seconds: the period is that of the whole series.
         span = (last - first) / number[-1] if number[-1] else stack.exptime_s
         span = float(span) if np.isfinite(span) and span > 0 else _SHORTEST
         count = int(max(stack.last, stack.frame[-1]) - stack.frame[0]) + 1
-        means = frame_means(stack.adu, evidence.good) - evidence.bias[evidence.good].mean()
-        means = means * evidence.gain
         places.append((stack, len(charge) + number, means))
         charge += [max(float(means.mean()), 0.0)] * count
         period += [span] * count

@@ -139,6 +139,12 @@ class Stack:
         return self.kind, *self.level
 
 
+def soon_after(light: F64, stack: Stack) -> bool:
+    """Whether a series begins so soon after one of the lit frames, s, that traps may release."""
+    since = stack.start_s + stack.time_s[0] - light
+    return bool(((since > 0) & (since < SOON_S)).any())
+
+
 @dataclass(frozen=True)
 class Evidence:
     """A part of the window of an acquisition that was reduced and fitted."""
@@ -239,8 +245,7 @@ class Evidence:
         """Whether a series begins so soon after light that traps may still release charge."""
         flats = [s.start_s + s.time_s for s in self.of_kind("flat")]
         lit = np.concatenate([*flats, *(f.start_s + f.time_s for f in self.fringes.values()), []])
-        since = stack.start_s + stack.time_s[0] - lit
-        return bool(((since > 0) & (since < SOON_S)).any())
+        return soon_after(lit, stack)
 
     def of_kind(self, kind: str) -> tuple[Stack, ...]:
         """Stacks of a kind, by exposure time."""

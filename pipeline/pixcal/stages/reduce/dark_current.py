@@ -4,15 +4,13 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from pixcal.estimators.detector import emva
-from pixcal.model.arrays import F64, Mask
+from pixcal.stages.reduce.dark_levels import DarkLevels, late_rate, middle_rows
 from pixcal.stages.reduce.frame_statistics import Measuring
-from pixcal.stages.reduce.halves import Window, frames_of
+from pixcal.stages.reduce.halves import Window
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.artefact import Build
-from pixcal.storage.cube import CHUNK, ArrayReader
+from pixcal.storage.cube import ArrayReader
 
 _NO_ERROR = 1e-9  # ADU/s: below it all samples have one code
 # relative error of the change of dark current by correcting noise that is cut off: it is not known
@@ -28,6 +26,7 @@ class DarkCurrent(NamedTuple):
     measure: tuple[float, float | None]
     unit: str
     note: str
+    warnings: tuple[str, ...]
 
 
 def dark_current(
@@ -40,6 +39,7 @@ def dark_current(
 ) -> DarkCurrent | None:
     """The dark current; its error is from frames, bias drift included. None if it is unknown.
 
+    Without charge that light before the darks left, of which a warning tells.
     ``conversion``: gain with its error (e-/ADU); ``scale``: over the gain used for the maps.
     """
     if not source.exposures.has_rate:
@@ -50,8 +50,9 @@ def dark_current(
         return None
     rates = scale * ArrayReader(folder / "dark_rate").read(*middle)
     gain, of_gain = conversion[0], (conversion[1] or 0.0) / conversion[0]
-    rows = _middle_rows(middle)
-    slope = emva.dark_slope(*_dark_means(source, middle, good))
+    rows = middle_rows(middle)
+    levels = DarkLevels.of(source, middle, good)
+    slope = emva.dark_slope(levels.times, levels.means)
     error = gain * slope[1] if slope is not None and slope[1] > _NO_ERROR else None
     timed = any(source.tables["dark"]["exptime_s"])
     unit = "e-/s" if timed else "e-/exposure"
@@ -73,28 +74,12 @@ def dark_current(
         rate = better * (rate + gain * subtracted)
         error = math.hypot(better * gain * off, rate * of_gain)
         note = f"by the noise of dark frames: the camera subtracts it from their level; {note}"
-    return DarkCurrent((rate, error), unit, "; ".join([note, *notes]))
-
-
-def _dark_means(source: Ingested, middle: Window, good: Mask) -> tuple[F64, F64]:
-    """Exposure time (s) and mean (ADU) of each frame without light, in the window's middle rows."""
-    (y0, _), columns = middle
-    rows = _middle_rows(middle)
-    window = (y0 + rows.start, y0 + rows.stop), columns
-    pixels = good[rows]
-    times, means = [], []
-    for group in source.exposures.dark if pixels.any() else ():
-        for samples in frames_of(source, group.array, group.frames, window):
-            times.append(group.exptime)
-            means.append(float(samples[pixels].mean(dtype=float)))
-    return np.array(times), np.array(means)
-
-
-def _middle_rows(middle: Window) -> slice:
-    """Rows of a chunk in the middle of a window, from its first row on."""
-    height = middle[0][1] - middle[0][0]
-    first = height // CHUNK[1] // 2 * CHUNK[1]
-    return slice(first, min(first + CHUNK[1], height))
+    late = late_rate(source, levels, gain, gain * job.read_noise)
+    if late is not None and not (subtracted or source.cut_off):
+        rate, error = rate - late.rate, late.error
+        notes.append(f"without {late.rate:.2g} {unit} that light before the darks left")
+    warnings = () if late is None else (late.warning,)
+    return DarkCurrent((rate, error), unit, "; ".join([note, *notes]), warnings)
 
 
 def _temperature(tables: Mapping[str, Mapping[str, Any]]) -> str:

@@ -81,6 +81,7 @@ def characterise(
     rate = dark_current(made, source, job, gain, scale, middle)
     if rate is not None:
         found["dark_current"] = _figure("dark current", rate.unit, rate.measure, rate.note)
+        facts["warnings"] += rate.warnings
     for name, figure in found.items():
         by_gain = figure["unit"].startswith("e-") and name != "conversion_gain"
         if by_gain and figure["error"] is not None:

@@ -1,0 +1,133 @@
+"""Levels of single frames without light, and the charge that light before them left there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pixcal.estimators.detector.emva import dark_slope
+from pixcal.estimators.detector.persistence import Persistence, released_late
+from pixcal.estimators.diagnosis.evidence import Stack
+from pixcal.model.arrays import F64, Mask
+from pixcal.report.text import number
+from pixcal.stages.reduce.exposures import Group
+from pixcal.stages.reduce.halves import Window, frames_of
+from pixcal.stages.reduce.ingested import Ingested
+from pixcal.storage.cube import CHUNK
+
+_DAY_S = 86400.0
+_GONE = 5  # decays after which hardly any charge is left
+_NO_SAMPLES = np.zeros((0, 0, 0), np.float32)
+
+
+@dataclass(frozen=True)
+class DarkLevels:
+    """Series of frames without light, and flats, in the middle rows of a window."""
+
+    groups: tuple[Group, ...]
+    levels: tuple[F64, ...]  # mean (ADU) of each frame of each group
+    pixels: int  # that a mean is of
+
+    @classmethod
+    def of(cls, source: Ingested, middle: Window, good: Mask) -> "DarkLevels":
+        """Read the frames; ``good``: (y, x) pixels of the window that count."""
+        (y0, _), columns = middle
+        rows = middle_rows(middle)
+        window, pixels = ((y0 + rows.start, y0 + rows.stop), columns), good[rows]
+        flats = source.exposures.flat if _follows_light(source) else []
+        groups = (*source.exposures.dark, *flats) if pixels.any() else ()
+        levels = [
+            np.array(
+                [s[pixels].mean(dtype=float) for s in frames_of(source, g.array, g.frames, window)]
+            )
+            for g in groups
+        ]
+        return cls(groups, tuple(levels), int(pixels.sum()))
+
+    @property
+    def times(self) -> F64:
+        """Exposure time of each frame without light, s."""
+        dark = [[g.exptime] * len(g.frames) for g in self.groups if g.array != "flat"]
+        return np.concatenate([*dark, []])
+
+    @property
+    def means(self) -> F64:
+        """Mean of each frame without light, ADU."""
+        pairs = zip(self.groups, self.levels, strict=True)
+        return np.concatenate([*(own for g, own in pairs if g.array != "flat"), []])
+
+
+def middle_rows(middle: Window) -> slice:
+    """Rows of a chunk in the middle of a window, from its first row on."""
+    height = middle[0][1] - middle[0][0]
+    first = height // CHUNK[1] // 2 * CHUNK[1]
+    return slice(first, min(first + CHUNK[1], height))
+
+
+@dataclass(frozen=True)
+class LateRate:
+    """Charge in dark frames that light before them left, as if it were dark signal."""
+
+    rate: float  # e-/s
+    error: float  # of the dark signal without it, e-/s
+    lag: Persistence
+
+    @property
+    def warning(self) -> str:
+        """What it means for the map of the dark signal."""
+        decay, unit = self.lag.decay, "s" if self.lag.in_seconds else "frames"
+        return (
+            "the darks hold charge that light before them left, which decays over "
+            f"{number(decay, 2)} {unit}: the map of the dark signal holds {number(self.rate, 2)} "
+            f"e-/s of it on average; record darks {number(_GONE * decay, 2)} {unit} or more after "
+            "light"
+        )
+
+
+def late_rate(
+    source: Ingested, levels: DarkLevels, gain: float, read_noise: float
+) -> LateRate | None:
+    """Charge that light left in the darks, by the fit of the diagnosis; None if insignificant.
+
+    ``gain``: e-/ADU; ``read_noise``: e-. Not where fringes are among the light.
+    """
+    if not any(g.array == "flat" for g in levels.groups) or len(levels.times) < 3:
+        return None
+    unlit = levels.means[levels.times == levels.times.min()].mean()
+    series = []
+    for group, own in zip(levels.groups, levels.levels, strict=True):
+        frames, start = np.array(group.frames), _starts(source)[group.array]
+        time = np.array(source.tables[group.array]["time_s"], float)[frames]
+        stack = Stack(group.array, group.exptime, frames, time, _NO_SAMPLES, start)
+        series.append((stack, gain * (own - unlit)))
+    found = released_late(series, read_noise**2 / levels.pixels)
+    if found is None:
+        return None
+    lag, late = found
+    pairs = zip(levels.groups, late, strict=True)
+    dark = np.concatenate([own for g, own in pairs if g.array != "flat"])
+    slope = dark_slope(levels.times, gain * levels.means - dark)
+    of_late = dark_slope(levels.times, dark)
+    if slope is None or of_late is None:
+        return None
+    error = float(np.hypot(slope[1], of_late[0] * lag.share_error / lag.share))
+    return LateRate(of_late[0], error, lag)
+
+
+def _starts(source: Ingested) -> dict[str, float]:
+    """Time of the first frame of each array after the first of all, s; NaN where unknown."""
+    days = {}
+    for name, table in source.tables.items():
+        stamps = np.array(table["mjd"], float) - np.array(table["time_s"], float) / _DAY_S
+        # Later planes of a cube may have none.
+        days[name] = float(next((day for day in stamps if np.isfinite(day)), np.nan))
+    first = min(days.values())
+    return {name: (day - first) * _DAY_S for name, day in days.items()}
+
+
+def _follows_light(source: Ingested) -> bool:
+    """Whether darks follow flats, which are all the light there is."""
+    starts = _starts(source)
+    if not {"dark", "flat"} <= set(starts) or source.exposures.fringes:
+        return False
+    last = starts["dark"] + float(np.max(np.array(source.tables["dark"]["time_s"], float)))
+    return bool(np.isfinite([*starts.values()]).all() and starts["flat"] < last)
