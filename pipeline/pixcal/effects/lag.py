@@ -13,13 +13,13 @@ from pixcal.estimators.detector.frame_lag import (
     lag_of_flats,
     seen_share,
 )
-from pixcal.estimators.detector.lag_by_level import BANDS, LossFit, in_bands
+from pixcal.estimators.detector.lag_by_level import BANDS, by_level, in_bands
 from pixcal.estimators.detector.noiseless_charge import missing_noise
-from pixcal.estimators.detector.persistence import LONGEST, Persistence, persistence
-from pixcal.estimators.diagnosis.evidence import MAX_SAMPLES, Evidence, FringeEvidence, central_crop
+from pixcal.estimators.detector.persistence import LONGEST, persistence
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, central_crop
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import sigmas_of_best
-from pixcal.kernels.transfer import fill_traps, left_behind
+from pixcal.kernels.transfer import fill_traps, left_behind, released_by_frame
 from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench, SimulatedDetector
 from pixcal.model.config import quantity
@@ -40,8 +40,8 @@ class Lag(Effect):
     Before the first frame of a recording the pixels were empty, or held what earlier recordings
     left (`carried`). A barrier may hold back another share of each band of the
     level; traps take charge as long as they have room (`capacity_e`). Maps show nothing of it: the
-    frame before is a sum of the same maps. `restored` undoes one share, without traps, on frames;
-    it and `lost` take the release by frames (`decay_frames`, `later`), not by `decay_s`.
+    frame before is a sum of the same maps. `lost` takes the release by frames (`decay_frames`,
+    `later`), not by `decay_s`.
     """
 
     name = "lag"
@@ -208,12 +208,9 @@ class Lag(Effect):
         ``charge``: (t, ...) e-, in the order of time without gaps; the first one after darkness.
         """
         taken = self._left(charge)
-        if not self._by_frame:
-            return fill_traps(taken, self._keep, self.capacity_e or np.inf)
-        released = np.zeros_like(taken)
-        for back, release in enumerate(self.releases, start=1):
-            released[back:] += np.float32(release) * taken[:-back]
-        return taken - released, released
+        if self._by_frame:
+            return released_by_frame(taken, self.releases)
+        return fill_traps(taken, self._keep, self.capacity_e or np.inf)
 
     def _left_behind(self, charge: F32, shot: Shot, noisy: float = 1.0) -> F32:
         """Electrons of a frame that stay, each independently, so that noise stays white."""
@@ -233,19 +230,6 @@ class Lag(Effect):
             share * sum(np.float32(w) * p for w, p in zip(self.bands, parts, strict=True))
         )
 
-    def restored(self, frames: F32) -> F32:
-        """Frames (t, y, x) without a lag of one share for all pixels and levels, e-.
-
-        ``frames``: (t, y, x) e-, in the order of time without gaps; the first one after darkness.
-        """
-        found = np.empty_like(frames)
-        for n, frame in enumerate(frames):
-            late = np.zeros_like(frame)
-            for back, release in enumerate(self.releases[:n], start=1):
-                late += np.float32(release) * self._left(found[n - back])
-            found[n] = (frame - late) / np.float32(1 - self.share)
-        return found
-
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Contrast of a frame by the step of the phase since the one before; pixels that differ.
@@ -255,28 +239,9 @@ class Lag(Effect):
         fringes the level of darks after light tells, or else the first flat of each level.
         """
         if not evidence.fringes:
-            if (slow := persistence(evidence)) is not None:
-                return cls._of_persistence(slow)
-            found = lag_of_flats(evidence)
-            if found is None:
-                return None
-            share, error, carried = found
-            before = "charge of the frame before"
-            if not carried:
-                pairs = all(len(s.adu) < _TELL_LAMP for s in evidence.ladder)
-                before = "a clear; a shutter or lamp that gives the first frame less light looks "
-                before += "the same: take darks at once after flats"
-                before += ", and three flats per level" if pairs else ""
-            return _estimate(
-                cls(float(np.clip(share, 0, 0.5)), 0.0, 0.0, carried=carried),
-                {"share": error},
-                share / error,
-                f"the first flat of each level is fainter, as after {before}",
-            )
+            return cls._without_fringes(evidence)
         fringes = tuple(evidence.fringes.values())
-        common = common_lag(
-            [f.free[:, :3] for f in fringes], [f.frame for f in fringes], cls._without_lag
-        )
+        common = common_lag([f.free[:, :3] for f in fringes], [f.frame for f in fringes])
         if common is None:
             return None
         part = central_crop(evidence)
@@ -291,7 +256,18 @@ class Lag(Effect):
         spread, spread_error = uneven.spread(common.keep, share, common.share_error)
         level_e = max(float(np.nanquantile(f.electrons[::7], 0.99)) for f in fringes)
         whole = cls(share, common.decay_frames, 0.0, (), level_e, common.later)
-        whole, of_level = _by_level(part, whole) if sure else (whole, {})
+        by_band = by_level(part, common, share, level_e) if sure else None
+        of_level: dict[str, float] = {}
+        if by_band is not None:
+            whole, of_level = replace(whole, bands=by_band.bands), dict(by_band.errors)
+            if by_band.capacity_e:
+                whole = replace(
+                    whole,
+                    share=by_band.share,
+                    decay_frames=by_band.decay_frames,
+                    later=(),
+                    capacity_e=by_band.capacity_e,
+                )
         quiet, quiet_error = _quiet(part, whole) if sure else (0.0, 1.0)
         decay = whole.decay_frames if whole.capacity_e else min(common.decay_frames, MAX_DECAY)
         return _estimate(
@@ -309,25 +285,34 @@ class Lag(Effect):
         )
 
     @classmethod
-    def _of_persistence(cls, found: Persistence) -> Estimate:
-        share = float(np.clip(found.share, 0, 0.5))
-        lag = cls(share, 0.0 if found.in_seconds else found.decay, 0.0, carried=1.0)
-        lag = replace(lag, decay_s=found.decay) if found.in_seconds else lag
+    def _without_fringes(cls, evidence: Evidence) -> Estimate | None:
+        """From the level of darks after light, or else from the first flat of each level."""
+        if (slow := persistence(evidence)) is not None:
+            frames, seconds = (0.0, slow.decay) if slow.in_seconds else (slow.decay, 0.0)
+            share = float(np.clip(slow.share, 0, 0.5))
+            name = "decay_s" if slow.in_seconds else "decay_frames"
+            return _estimate(
+                cls(share, frames, 0.0, carried=1.0, decay_s=seconds),
+                {"share": slow.share_error, name: slow.decay_error},
+                slow.share / slow.share_error,
+                "the dark level decays after exposure to light",
+            )
+        found = lag_of_flats(evidence)
+        if found is None:
+            return None
+        share, error, carried = found
+        before = "charge of the frame before"
+        if not carried:
+            pairs = all(len(s.adu) < _TELL_LAMP for s in evidence.ladder)
+            before = "a clear; a shutter or lamp that gives the first frame less light looks "
+            before += "the same: take darks at once after flats"
+            before += ", and three flats per level" if pairs else ""
         return _estimate(
-            lag,
-            {
-                "share": found.share_error,
-                "decay_s" if found.in_seconds else "decay_frames": found.decay_error,
-            },
-            found.share / found.share_error,
-            "the dark level decays after exposure to light",
+            cls(float(np.clip(share, 0, 0.5)), spread=0.0, carried=carried),
+            {"share": error},
+            share / error,
+            f"the first flat of each level is fainter, as after {before}",
         )
-
-    @classmethod
-    def _without_lag(cls, share: float, decay_frames: float, frames: F32) -> tuple[F32, F64]:
-        """Frames without a lag, and the shares that appear 1, 2, ... frames later."""
-        lag = cls(share, decay_frames)
-        return lag.restored(frames), share * lag.releases
 
 
 def _estimate(lag: Lag, errors: dict[str, float], sigmas: float, why: str) -> Estimate:
@@ -364,46 +349,6 @@ def _shares(lag: Lag, detector: SimulatedDetector, rows: Rows) -> F32:
     if lag.spread:
         share *= np.clip(1 + np.float32(lag.spread) * _pixels(detector, rows), 0, 1 / lag.share)
     return share
-
-
-def _by_level(evidence: Evidence, lag: Lag) -> tuple[Lag, dict[str, float]]:
-    """The lag by level, and its errors: a share per band, or traps of limited capacity."""
-
-    def banded(shares: F64, charge: F32) -> F32:
-        return _banded(lag, shares).lost(charge)[0]
-
-    def trapped(values: F64, charge: F32) -> F32:
-        return _trapped(lag, values).lost(charge)[0]
-
-    few, fit = (LossFit(central_crop(evidence, MAX_SAMPLES // n), lag.level_e) for n in (8, 2))
-    bands, traps = fit.by_level(few, banded, trapped, lag.share, lag.share * lag.level_e)
-    names = [f"bands[{n}]" for n in range(len(BANDS))]
-    if traps is not None:
-        found = _trapped(lag, traps.value)
-        names += ["decay_frames", "capacity_e"]
-        scale = [*(1 / found.share for _ in BANDS), found.decay_frames**2 / found._keep, 1.0]
-        errors = traps.errors * scale
-    elif bands is not None:
-        found, errors = _banded(lag, bands.value), bands.errors / lag.share
-    else:
-        return lag, {}
-    return found, dict(zip(names, map(float, errors), strict=True))
-
-
-def _banded(lag: Lag, shares: F64) -> Lag:
-    """The lag with a share for each band of the level."""
-    return replace(lag, bands=tuple(float(v) for v in np.clip(shares / lag.share, 0, 100)))
-
-
-def _trapped(lag: Lag, values: F64) -> Lag:
-    """Traps with shares of the bands of the level, a kept share, and a capacity."""
-    *shares, keep, most = values
-    decay = -1 / np.log(np.clip(keep, 1e-3, np.exp(-1 / MAX_DECAY)))
-    share = float(np.mean(np.maximum(shares, 0)))
-    traps = replace(
-        lag, share=min(share, 0.5), decay_frames=float(decay), capacity_e=float(most), later=()
-    )
-    return _banded(traps, np.array(shares))
 
 
 def _quiet(evidence: Evidence, lag: Lag) -> tuple[float, float]:

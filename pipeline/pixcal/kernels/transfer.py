@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pixcal.model.arrays import F32
+from pixcal.model.arrays import F32, F64
 
 
 def left_behind(charge: F32, share: F32, begins: F32, weights: F32, normal: F32) -> F32:
@@ -37,3 +37,23 @@ def fill_traps(taken: F32, keep: float, most: float) -> tuple[F32, F32]:
         after = np.minimum(left + taken[t], np.float32(most))
         lost[t], released[t], held = after - held, held - left, after
     return lost, released
+
+
+def released_by_frame(taken: F32, releases: F64) -> tuple[F32, F32]:
+    """As `fill_traps`, for traps that release shares of their charge 1, 2, ... frames later."""
+    released = np.zeros_like(taken)
+    for back, release in enumerate(releases, start=1):
+        released[back:] += np.float32(release) * taken[:-back]
+    return taken - released, released
+
+
+def without_lag(frames: F32, share: float, keep: float) -> F32:
+    """Frames (t, ...) without a lag of one share, of which ``keep`` stays for another frame; e-.
+
+    In the order of time without gaps; the first one after darkness.
+    """
+    found, held = np.empty_like(frames), np.zeros_like(frames[0])
+    for n, frame in enumerate(frames):
+        found[n] = (frame - np.float32(1 - keep) * held) / np.float32(1 - share)
+        held = np.float32(keep) * held + np.float32(share) * found[n]
+    return found

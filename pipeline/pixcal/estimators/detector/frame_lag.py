@@ -1,6 +1,6 @@
 """Lag of all pixels, from fringe contrast or first frames of flats; its variation over pixels."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.frame_order import follows
 from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.significance import root_with_error
+from pixcal.kernels.transfer import without_lag
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 # of the phase, free in each pixel so that a nonlinear response is not taken for lag
@@ -214,6 +215,11 @@ class CommonLag:
     later: tuple[float, ...] = ()  # parts released in later frames, if not exponential
 
     @property
+    def release(self) -> F64:
+        """Parts (lag,) of the charge left that come out 1, 2, ... frames later."""
+        return np.asarray((1 - self.keep) * self.keep ** np.arange(LAGS))
+
+    @property
     def decay_frames(self) -> float:
         """Frames in which the released charge falls by a factor e."""
         return float(-1 / np.log(self.keep)) if self.keep else 0.0
@@ -226,15 +232,10 @@ class CommonLag:
         return self.keep_error * self.decay_frames**2 / self.keep
 
 
-def common_lag(
-    frames: Sequence[F64],
-    numbers: Sequence[Indices],
-    corrected: Callable[[float, float, F32], tuple[F32, F64]],
-) -> CommonLag | None:
+def common_lag(frames: Sequence[F64], numbers: Sequence[Indices]) -> CommonLag | None:
     """Lag from the contrast of frames (t, 3) against the phase step; None: no evidence.
 
-    ``numbers``: (t,) of the frames in their set. ``corrected``: corrects frames for a lag of given
-    share and decay; gives also the shares released later.
+    ``numbers``: (t,) of the frames in their set.
     """
     found = CommonLag(0.0, 0.0, 0.0, 0.0, 0.0)
     for _ in range(CONTRAST_ROUNDS):
@@ -242,11 +243,10 @@ def common_lag(
         for own, which in zip(frames, numbers, strict=True):
             # Linearised about the current lag, which is removed from the frames first.
             share = float(np.clip(found.share, 0, 0.5))
-            rest, known = corrected(share, found.decay_frames, own.astype(np.float32))
+            rest = without_lag(own.astype(np.float32), share, found.keep)
             fitted = _contrast_steps(rest.astype(float), which)
             if fitted is not None:
-                more = np.pad(known[:LAGS], (0, LAGS - len(known[:LAGS])))
-                steps.append((more + fitted[0], fitted[1]))
+                steps.append((share * found.release + fitted[0], fitted[1]))
         if not steps:
             return None
         information = np.sum([n for _, n in steps], axis=0)
@@ -288,7 +288,7 @@ def _exponential(information: F64, right: F64) -> CommonLag:
 def _freely(found: CommonLag, information: F64, right: F64) -> CommonLag:
     """The lag with a free release in each frame, where an exponential does not describe it."""
     free = np.linalg.solve(information, right)
-    away = free - found.share * (1 - found.keep) * found.keep ** np.arange(LAGS)
+    away = free - found.share * found.release
     unlike = float(away @ information @ away) >= _NOT_EXPONENTIAL
     if not unlike or found.share < CLEAR * found.share_error:
         return found

@@ -6,17 +6,19 @@ leaves harmonics of the phases in the residuals. Gauss-Newton steps fit the loss
 predicts to both, together with a nonlinear response.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from pixcal.estimators.detector.frame_lag import MAX_DECAY, CommonLag
 from pixcal.estimators.diagnosis.distortions import Freedom
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.diagnosis.evidence import MAX_SAMPLES, Evidence, FringeEvidence, central_crop
 from pixcal.kernels.frame_order import since_gap
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.transfer import fill_traps, released_by_frame
 from pixcal.model.arrays import F32, F64
 
 BANDS = (0.0, 0.125, 0.25, 0.5)  # where bands of the level begin, over the full scale
@@ -31,9 +33,65 @@ NOT_EVEN = 25.0  # chi-square from which the share depends on the level
 # of full scale without such a limit
 RETENTIONS, CAPACITIES = (0.3, 0.6), (0.1, 0.2, 0.4, 0.7)
 STEPS = 12  # Gauss-Newton steps for such traps
+_LARGEST = 100.0  # factor of the share in a band
 _NO_INFLUENCE = 1e-9  # relative error below which a parameter does not influence the frames
 
 Loss = Callable[[F64, F32], F32]
+
+
+@dataclass(frozen=True)
+class LagByLevel:
+    """A lag whose share depends on the level, or is limited by the room in traps."""
+
+    share: float  # mean
+    bands: tuple[float, ...]  # factors of the share in each band of the level
+    errors: Mapping[str, float]  # of the bands and, with traps, of their decay and capacity
+    decay_frames: float = 0.0
+    capacity_e: float = 0.0  # zero: no limit
+
+
+def by_level(evidence: Evidence, lag: CommonLag, share: float, level_e: float) -> LagByLevel | None:
+    """Shares of bands of the level, or traps of limited capacity; None if the share is even.
+
+    ``share``: mean one; ``level_e``: full scale, e-.
+    """
+
+    def taken(shares: F64, charge: F32) -> F32:
+        parts = in_bands(charge, level_e)
+        return np.asarray(sum(np.float32(s) * p for s, p in zip(shares, parts, strict=True)))
+
+    def banded(shares: F64, charge: F32) -> F32:
+        held = taken(np.clip(shares / share, 0, _LARGEST) * share, charge)
+        if lag.later:
+            return released_by_frame(held, np.array(lag.later) / sum(lag.later))[0]
+        return fill_traps(held, lag.keep, np.inf)[0]
+
+    def trapped(values: F64, charge: F32) -> F32:
+        *shares, keep, most = values
+        return fill_traps(taken(np.maximum(shares, 0), charge), _kept(keep), most)[0]
+
+    few, fit = (LossFit(central_crop(evidence, MAX_SAMPLES // n), level_e) for n in (8, 2))
+    bands, traps = fit.by_level(few, banded, trapped, share, share * level_e)
+    if bands is None:
+        return None
+    shares, errors, more = bands.value, bands.errors, {}
+    if traps is not None:
+        shares, (*of_bands, of_keep, of_most) = np.maximum(traps.value[:-2], 0), traps.errors
+        keep = _kept(traps.value[-2])
+        errors, decay = np.array(of_bands), float(-1 / np.log(keep))
+        share = min(float(np.mean(shares)), 0.5)
+        more = {"decay_frames": of_keep * decay**2 / keep, "capacity_e": of_most}
+    named = {f"bands[{n}]": float(e / share) for n, e in enumerate(errors)}
+    named |= {name: float(error) for name, error in more.items()}
+    factors = tuple(float(v) for v in np.clip(shares / share, 0, _LARGEST))
+    if traps is None:
+        return LagByLevel(share, factors, named)
+    return LagByLevel(share, factors, named, decay, float(traps.value[-1]))
+
+
+def _kept(keep: float) -> float:
+    """Share that traps keep for another frame, in the range that frames can tell."""
+    return float(np.clip(keep, 1e-3, np.exp(-1 / MAX_DECAY)))
 
 
 def in_bands(level: F32, level_e: float) -> list[F32]:
