@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pixcal.effects.intra_pixel_response import IntraPixelResponse, _gain, transfer
+from pixcal.effects.intra_pixel_response import IntraPixelResponse, _slopes, transfer
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.scene import detector_maps, fringe_light
 from pixcal.model.bench import Bench
@@ -60,7 +60,8 @@ def test_the_scatter_of_visibilities_follows_the_slope_of_the_law(width: float) 
     draws = np.random.default_rng(2).standard_normal((2, 200_000))
     widths = width + 1e-3 * draws
     visibility = np.log(transfer(FIVE, widths[0])) + np.log(transfer(0.3, widths[1]))
-    assert _gain(found, found, width) * 1e-6 == pytest.approx(visibility.var(), rel=0.015)
+    slopes = _slopes(found, width)
+    assert slopes @ slopes * 1e-6 == pytest.approx(visibility.var(), rel=0.015)
 
 
 @pytest.mark.quick(1)
@@ -130,3 +131,26 @@ def test_scatter_that_crossed_fringes_share_is_not_of_widths(
     assert found is not None
     assert found.significance > 4
     assert bool(found.refused) == shared
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("alike", [0.0, 0.5, 1.0])
+def test_widths_that_diffusion_makes_alike_along_both_axes_are_told(
+    acquired: Callable[..., Evidence], alike: float
+) -> None:
+    """With two periods along an axis, a width is told from a contrast common to all fringes."""
+    sets = [([11.5, 0.0], 300), ([0.0, 11.0], 300), ([5.5, 0.0], 300)]
+    fringes = [
+        {"name": f"set{n}", "baseline_mm": mm, "count": count, "peak_e": 45000}
+        for n, (mm, count) in enumerate(sets)
+    ]
+    widths = {"width_px": [0.95, 0.95], "width_rms_px": 0.02, "alike": alike}
+    found = IntraPixelResponse.estimate(
+        acquired({"frames.fringes": fringes}, {"intra_pixel_response": widths})
+    )
+    assert found is not None
+    assert isinstance(found.effect, IntraPixelResponse)
+    assert not found.refused
+    assert found.effect.alike == pytest.approx(alike, abs=0.1)
+    allowed = found.errors["width_rms_px"]
+    assert abs(found.effect.width_rms_px - 0.02) < 4 * allowed < 0.02

@@ -16,13 +16,16 @@ from pixcal.kernels.beams import LightMaps
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.scene import TILE, DetectorMaps, Rows, chip_map, geometry
 from pixcal.kernels.significance import SIGNIFICANT, root_with_error
-from pixcal.model.arrays import F64, Mask
+from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
 
 REPEAT = 0.002  # assumed relative agreement of the visibilities of two fibre pairs
-SHARED = "the visibility scatters alike in sets of crossed fringes, which pixel widths do not cause"
+SHARED = (
+    "the visibility scatters alike in sets of crossed fringes; only a second fringe period along an "
+    "axis shows whether pixel widths cause that"
+)
 _MIN_PIXELS = 200
 _APART = 1.1
 _STEP = 1e-3  # change of the width for derivatives, px
@@ -32,6 +35,8 @@ _SQUARE = 1e-4  # the same of its square, px²
 @dataclass(frozen=True)
 class IntraPixelResponse(Effect):
     """Each pixel responds uniformly over a width along x and y, which differs from pixel to pixel.
+
+    Lithography varies both widths by themselves, charge diffusion both alike.
 
     `predict` and `undo` take the mean width.
     """
@@ -56,6 +61,9 @@ class IntraPixelResponse(Effect):
     width_rms_px: float = quantity(
         0.005, unit="px", low=0, high=0.5, doc="rms of the width from pixel to pixel, each axis"
     )
+    alike: float = quantity(
+        0.0, low=0, high=1, doc="share of that variance which is common to both axes of a pixel"
+    )
 
     def pixels(
         self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
@@ -65,8 +73,13 @@ class IntraPixelResponse(Effect):
         detector = recording.bench.detector
         k = optics.paraxial_vector(geometry(recording.bench, recording.number))
         factor = np.ones(light.iota.shape)
+
+        def drawn(of: object) -> F32:
+            return chip_map(detector, rows, f"{self.name}-{of}", lambda r: r.standard_normal(TILE))
+
+        common = np.sqrt(self.alike) * drawn("both") if self.alike else 0.0
         for axis, (width, rate) in enumerate(zip(self.width_px, k, strict=True)):
-            own = chip_map(detector, rows, f"{self.name}-{axis}", lambda r: r.standard_normal(TILE))
+            own = common + np.sqrt(1 - self.alike) * drawn(axis)
             factor *= transfer(rate, np.maximum(width + self.width_rms_px * own, 0))
         kept = factor.astype(np.float32)
         return replace(light, alpha_sin=light.alpha_sin * kept, alpha_cos=light.alpha_cos * kept)
@@ -91,17 +104,17 @@ class IntraPixelResponse(Effect):
         k = np.array([f.k for f in sets])
         square, error = _width(k, np.array([_log_visibility(f) for f in sets]))
         width, width_error = map(float, root_with_error(min(square, 9.0), error))
-        scatter, its_error, shared = _scatter(sets, max(width, 0.5), _bias_variance(evidence))
-        rms, rms_error = map(float, root_with_error(scatter, its_error))
+        found = _scatter(sets, max(width, 0.5), _bias_variance(evidence))
+        rms, rms_error = map(float, root_with_error(found.variance, found.error))
         # A wider response changes the visibility more for the same scatter of its width.
         rms_error = float(np.hypot(rms_error, rms * width_error / max(width, 0.5)))
         return Estimate(
-            cls((width, width), min(rms, 0.5)),
+            cls((width, width), min(rms, 0.5), found.alike),
             {"width_px[0]": width_error, "width_px[1]": width_error, "width_rms_px": rms_error},
             # Of the scatter only, because unequal fibre powers also change a visibility.
-            float(scatter / its_error),
+            found.variance / found.error,
             "visibility that varies from pixel to pixel, more strongly at shorter fringe periods",
-            refused=SHARED if shared else "",
+            refused=SHARED if found.shared else "",
         )
 
 
@@ -138,35 +151,68 @@ def _bias_variance(evidence: Evidence) -> float:
     return evidence.read_noise**2 / sum(counts) if counts else 0.0
 
 
-def _scatter(
-    sets: list[FringeEvidence], width: float, bias_variance: float
-) -> tuple[float, float, bool]:
-    """Variance of the width, px², its error, and whether crossed directions share most of it."""
-    normal, right = np.zeros((2, 2)), np.zeros(2)
-    maps, scatters = [], []
-    for found in sets:
-        one, other = (_visibility(found, half) for half in (0, 1))
-        kept = np.isfinite(one) & np.isfinite(other)
-        one, other = _structure(one, kept), _structure(other, kept)
-        square, error = _of_pixels(one, other, kept)
-        square -= bias_variance / _light(found) ** 2
-        # Widths along both axes scatter independently; a term independent of the fringe is free.
-        terms = np.array([_gain(found, found, width), 1.0])
-        normal += np.outer(terms, terms) / error**2
-        right += terms * square / error**2
-        maps.append((np.where(kept, (one + other) / 2, 0), kept))
-        scatters.append(square)
-    covariance = inverse_normal(normal, 1e-15)
-    scatter = float(covariance[0] @ right)
-    shared = False
-    for (m, f), (n, g) in combinations(enumerate(sets), 2):
-        if abs(f.k[0] * g.k[1] - f.k[1] * g.k[0]) < CROSSED * np.hypot(*f.k) * np.hypot(*g.k):
-            continue
-        product, error = _of_pixels(maps[m][0], maps[n][0], maps[m][1] & maps[n][1])
-        product -= bias_variance / (_light(f) * _light(g)) + _gain(f, g, width) * max(scatter, 0.0)
-        most = np.sqrt(max(scatters[m], 0.0) * max(scatters[n], 0.0)) / 2
-        shared |= bool(product > max(SIGNIFICANT * error, most))
-    return scatter, float(np.sqrt(covariance[0, 0])), shared
+@dataclass(frozen=True)
+class _Scatter:
+    """Variance of the widths of pixels, px², from the visibilities of their fringes."""
+
+    variance: float
+    error: float
+    alike: float  # share that is common to both axes
+    shared: bool  # whether crossed fringes share most of their scatter, which widths do not explain
+
+
+def _scatter(sets: list[FringeEvidence], width: float, bias_variance: float) -> _Scatter:
+    """Widths that scatter independently along both axes, unless crossed fringes show otherwise.
+
+    A part of the visibility that no width explains, as it is independent of the fringes, is free.
+    """
+    maps = [_two_maps(found) for found in sets]
+    both = [(one + other) / 2 for one, other, _ in maps]
+    pairs = [(m, m) for m in range(len(sets))] + list(combinations(range(len(sets)), 2))
+    terms, products, errors = np.empty((len(pairs), 3)), *np.empty((2, len(pairs)))
+    for at, (m, n) in enumerate(pairs):
+        first, second = maps[m][:2] if m == n else (both[m], both[n])
+        product, errors[at] = _of_pixels(first, second, maps[m][2] & maps[n][2])
+        products[at] = product - bias_variance / (_light(sets[m]) * _light(sets[n]))
+        slopes = _slopes(sets[m], width), _slopes(sets[n], width)
+        terms[at] = slopes[0] @ slopes[1], 1.0, slopes[0].sum() * slopes[1].sum()
+    own, crossed = slice(len(sets)), [at for at, (m, n) in enumerate(pairs) if _cross(sets, m, n)]
+
+    def fit(rows: slice, columns: slice) -> tuple[F64, F64]:
+        design = terms[rows, columns] / errors[rows, None]
+        covariance = inverse_normal(design.T @ design, 1e-15)
+        return covariance @ design.T @ (products[rows] / errors[rows]), covariance
+
+    (variance, _), covariance = fit(own, np.s_[:2])
+    rest = products - terms[:, 0] * max(variance, 0.0)
+    most = [np.sqrt(np.maximum(products[list(pairs[at])], 0).prod()) / 2 for at in crossed]
+    shared = any(
+        rest[at] > max(SIGNIFICANT * errors[at], m) for at, m in zip(crossed, most, strict=True)
+    )
+    if shared and len(pairs) > terms.shape[1]:
+        (single, free, common), every = fit(np.s_[:], np.s_[:])
+        # Twice the part that no width explains must be less than any crossed fringes share.
+        of_widths = 2 * free < min(products[at] for at in crossed)
+        if of_widths and common > SIGNIFICANT * np.sqrt(every[2, 2]):
+            alike = float(np.clip(common / (max(single, 0.0) + common), 0, 1))
+            total = single + common
+            error = np.sqrt(every[0, 0] + 2 * every[0, 2] + every[2, 2])
+            return _Scatter(float(total), float(error), alike, False)
+    return _Scatter(float(variance), float(np.sqrt(covariance[0, 0])), 0.0, bool(shared))
+
+
+def _cross(sets: list[FringeEvidence], m: int, n: int) -> bool:
+    """Whether the fringes of two sets differ in direction."""
+    k, other = np.array([sets[m].k, sets[n].k])
+    area = abs(k[0] * other[1] - k[1] * other[0])
+    return bool(area >= CROSSED * np.hypot(*k) * np.hypot(*other))
+
+
+def _two_maps(found: FringeEvidence) -> tuple[F64, F64, Mask]:
+    """Visibility of the pixels in two halves of the frames; where both are known."""
+    one, other = (_visibility(found, half) for half in (0, 1))
+    kept = np.isfinite(one) & np.isfinite(other)
+    return _structure(one, kept), _structure(other, kept), kept
 
 
 def _of_pixels(one: F64, other: F64, kept: Mask) -> tuple[float, float]:
@@ -176,13 +222,11 @@ def _of_pixels(one: F64, other: F64, kept: Mask) -> tuple[float, float]:
     return float(white.mean()), float(white.std() / np.sqrt(len(white)))
 
 
-def _gain(one: FringeEvidence, other: FringeEvidence, width: float) -> float:
-    """Covariance of the visibilities of two sets for a width scatter of one pixel."""
-    # Change of the logarithm of the visibility per pixel of width, along each axis.
-    k = np.array([one.k, other.k])
+def _slopes(found: FringeEvidence, width: float) -> F64:
+    """Change (2,) of the logarithm of the visibility per pixel of width, along each axis."""
+    k = np.array(found.k)
     wide, narrow = (np.log(np.abs(transfer(k, width + step))) for step in (_STEP, -_STEP))
-    ours, theirs = (wide - narrow) / (2 * _STEP)
-    return float(ours @ theirs)
+    return np.asarray((wide - narrow) / (2 * _STEP))
 
 
 def _light(found: FringeEvidence) -> float:
