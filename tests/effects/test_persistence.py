@@ -132,10 +132,31 @@ def test_dark_signal_of_darks_after_light_is_given_without_what_that_left(decay:
     (slope, _), late = dark_signal(recorded(0.01, lambda t: float(np.exp(-t / decay))))
     assert late is not None
     assert abs(slope - late.rate) < 4 * late.error < 0.1 * slope
-    assert f"decays over {decay:.0f} s" in late.warning
+    assert late.sure
+    assert f"decays over {decay:.0f} s" in late.warning("e-/s")
+    assert "e-/exposure of it" in late.warning("e-/exposure")
     clean, none = dark_signal(recorded(0.0, lambda _: 0.0))
     assert none is None
     assert abs(clean[0]) < 4 * clean[1]
+
+
+def changed(evidence: Evidence, change: Callable[[Stack], F32]) -> Evidence:
+    return replace(evidence, stacks=tuple(replace(s, adu=change(s)) for s in evidence.stacks))
+
+
+@pytest.mark.parametrize("settles", [50.0, 100.0, 200.0])
+def test_a_bias_that_settles_is_told_from_charge_of_light(settles: float) -> None:
+    """The same fall of the darks: before light, the bias frames fall too."""
+    evidence = recorded(0.0, lambda _: 0.0)
+
+    def settling(stack: Stack) -> F32:
+        time = stack.start_s + stack.time_s
+        return stack.adu + (40 * np.exp(-time / settles))[:, None, None]
+
+    _, late = dark_signal(changed(evidence, settling))
+    assert late is not None
+    assert not late.sure
+    assert "or a drift of the bias; record darks before the light" in late.warning("e-/s")
 
 
 def test_a_camera_without_traps_has_none() -> None:

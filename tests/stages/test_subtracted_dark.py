@@ -9,10 +9,12 @@ import pytest
 from astropy.io import fits
 
 from pixcal.engine.run import Runtime
+from pixcal.estimators.detector.persistence import Persistence
 from pixcal.estimators.detector.subtracted_dark import subtracted_dark
 from pixcal.stages import reduce
 from pixcal.stages.evidence import load_evidence
 from pixcal.stages.ingest import stage as ingest
+from pixcal.stages.reduce.dark_levels import LateRate
 
 GAIN, READ, BIAS, DARK = 3.3, 2.6, 128.0, 300.0  # e-/ADU, ADU, ADU, e-/s
 SHAPE = (121, 134)
@@ -71,6 +73,21 @@ def test_dark_current_and_gain_are_those_of_the_noise(tmp_path: Path, clamped: b
     assert noise["measured"] == pytest.approx(READ * GAIN, rel=0.02)
     current = found["figures_of_merit"]["dark_current"]
     assert current["value"] == pytest.approx(DARK, abs=4 * current["error"])
+
+
+@pytest.mark.parametrize(("clamped", "sure"), [(True, True), (False, True), (False, False)])
+def test_charge_of_light_is_taken_from_a_level_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clamped: bool, sure: bool
+) -> None:
+    """Only if it is sure; the noise of a camera that subtracts its level hardly shows it."""
+    late = LateRate(100.0, 2.0, Persistence(0.01, 1e-4, 50.0, 1.0, True), sure)
+    monkeypatch.setattr("pixcal.stages.reduce.dark_current.late_rate", lambda *_: late)
+    found = reduced(taken(tmp_path / "camera", clamped))
+    current = found["figures_of_merit"]["dark_current"]
+    less = 0.0 if clamped or not sure else late.rate
+    assert current["value"] == pytest.approx(DARK - less, abs=4 * current["error"])
+    assert ("without 1e+02 e-/s" in current["note"]) == bool(less)
+    assert (late.warning("e-/s") in found["warnings"]) == (not clamped)
 
 
 def test_the_diagnosis_allows_for_its_noise(tmp_path: Path) -> None:

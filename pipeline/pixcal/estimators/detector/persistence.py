@@ -17,6 +17,8 @@ _SHORTEST = 0.1
 _OF_MODEL = 2e-3  # least relative error: the light of a series is not quite steady
 _ROUNDS = 3  # of the fit, each with the light that the last one gives
 _STEP = 0.01  # relative, for derivatives by the decay
+_DRIFTS = 40  # time constants of a drift that are tried before the best is refined
+_SLOWEST, _FASTEST = 10.0, 1e-3  # of them, in durations of the session
 
 
 # series of frames, and the mean above bias of each frame, e-
@@ -108,6 +110,65 @@ def released_late(levels: Levels, least: float) -> tuple[Persistence, list[F64]]
     late = best.share * sequence.of_light(best).released(best.decay, best.in_seconds)
     places = {id(stack): at for stack, at, _ in sequence.places}
     return best, [late[places[id(stack)]] for stack, _ in levels]
+
+
+def told_from_drift(levels: Levels, late: Sequence[F64], least: float) -> bool:
+    """Whether charge of earlier light is told from a drift of the level without light.
+
+    It must fit all unlit frames better than a level that settles, or falls steadily, from the start
+    of the session on; and the steps from frame to frame after light must follow it, which those of
+    a random walk do not. ``late``, ``least``: as `released_late` gives and takes them.
+    """
+    start = min(float(s.start_s + s.time_s[0]) for s, _ in levels)
+    light = min(float(s.start_s + s.time_s[0]) for s, _ in levels if s.kind == "flat")
+    unlit = [
+        (s.start_s + s.time_s - start, means, own)
+        for (s, means), own in zip(levels, late, strict=True)
+        if s.kind != "flat"
+    ]
+    rest = np.concatenate([_about_mean(means - own) for _, means, own in unlit])
+    freedom = len(rest) - len(unlit) - _PARAMETERS
+    if freedom < 1:
+        return False
+    left, drift = float(rest @ rest), _left_by_drift([(at, means) for at, means, _ in unlit])
+    if drift - left < _SURE**2 * max(left / freedom, least):
+        return False
+    after = [(means, own) for at, means, own in unlit if start + at[0] > light]
+    step, expected = (
+        np.concatenate([np.diff(one) for one in of]) for of in zip(*after, strict=True)
+    )
+    square = float(expected @ expected)
+    if len(step) <= _PARAMETERS or square <= 0:
+        return False
+    share = float(expected @ step) / square
+    rest = step - share * expected
+    variance = max(float(rest @ rest) / (len(step) - _PARAMETERS), 2 * least)
+    return bool(share * np.sqrt(square / variance) > _SURE)
+
+
+def _left_by_drift(unlit: Sequence[tuple[F64, F64]]) -> float:
+    """Sum of squares that a drift with one time constant leaves of levels about their means.
+
+    ``unlit``: times of the frames after the start of the drift, s, and means, of each series.
+    """
+    levels = np.concatenate([_about_mean(means) for _, means in unlit])
+    span = max(float(at[-1]) for at, _ in unlit)
+
+    def left(constant: float) -> float:
+        fall = np.concatenate([_about_mean(np.exp(-at / np.exp(constant))) for at, _ in unlit])
+        square = float(fall @ fall)
+        rest = levels - (float(fall @ levels) / square if square > 0 else 0.0) * fall
+        return float(rest @ rest)
+
+    tried = np.log(span * np.geomspace(_FASTEST, _SLOWEST, _DRIFTS))
+    sums = [left(float(one)) for one in tried]
+    best = int(np.argmin(sums))
+    bounds = float(tried[max(best - 1, 0)]), float(tried[min(best + 1, _DRIFTS - 1)])
+    return min(min(sums), float(minimize_scalar(left, bounds=bounds, method="bounded").fun))
+
+
+def _about_mean(values: F64) -> F64:
+    return np.asarray(values - values.mean())
 
 
 Series = Sequence[tuple[Indices, F64, float]]

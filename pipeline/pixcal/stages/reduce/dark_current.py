@@ -39,7 +39,8 @@ def dark_current(
 ) -> DarkCurrent | None:
     """The dark current; its error is from frames, bias drift included. None if it is unknown.
 
-    Without charge that light before the darks left, of which a warning tells.
+    Without charge that light before the darks left, where that is told from a drift of the bias; a
+    warning tells of either.
     ``conversion``: gain with its error (e-/ADU); ``scale``: over the gain used for the maps.
     """
     if not source.exposures.has_rate:
@@ -74,11 +75,12 @@ def dark_current(
         rate = better * (rate + gain * subtracted)
         error = math.hypot(better * gain * off, rate * of_gain)
         note = f"by the noise of dark frames: the camera subtracts it from their level; {note}"
-    late = late_rate(source, levels, gain, gain * job.read_noise)
-    if late is not None and not (subtracted or source.cut_off):
+    given = not (subtracted or source.cut_off)  # whether the rate is that of the level
+    late = late_rate(source, levels, gain, gain * job.read_noise) if given else None
+    if late is not None and late.sure:
         rate, error = rate - late.rate, late.error
         notes.append(f"without {late.rate:.2g} {unit} that light before the darks left")
-    warnings = () if late is None else (late.warning,)
+    warnings = () if late is None else (late.warning(unit),)
     return DarkCurrent((rate, error), unit, "; ".join([note, *notes]), warnings)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixcal.estimators.detector.emva import dark_slope
-from pixcal.estimators.detector.persistence import Persistence, released_late
+from pixcal.estimators.detector.persistence import Persistence, released_late, told_from_drift
 from pixcal.estimators.diagnosis.evidence import Stack
 from pixcal.model.arrays import F64, Mask
 from pixcal.report.text import number
@@ -67,19 +67,24 @@ def middle_rows(middle: Window) -> slice:
 class LateRate:
     """Charge in dark frames that light before them left, as if it were dark signal."""
 
-    rate: float  # e-/s
-    error: float  # of the dark signal without it, e-/s
+    rate: float  # e-/s, or e-/exposure
+    error: float  # of the dark signal without it
     lag: Persistence
+    sure: bool  # whether it is told from a drift of the bias
 
-    @property
-    def warning(self) -> str:
-        """What it means for the map of the dark signal."""
-        decay, unit = self.lag.decay, "s" if self.lag.in_seconds else "frames"
+    def warning(self, unit: str) -> str:
+        """What it means for the map of the dark signal; ``unit``: of the rates."""
+        decays = "s" if self.lag.in_seconds else "frames"
+        decay, gone = (f"{number(n * self.lag.decay, 2)} {decays}" for n in (1, _GONE))
+        if not self.sure:
+            return (
+                "the level of the darks falls: charge from light before them, or a drift of the "
+                f"bias; record darks before the light, or {gone} or more after it"
+            )
         return (
-            "the darks hold charge that light before them left, which decays over "
-            f"{number(decay, 2)} {unit}: the map of the dark signal holds {number(self.rate, 2)} "
-            f"e-/s of it on average; record darks {number(_GONE * decay, 2)} {unit} or more after "
-            "light"
+            f"the darks hold charge that light before them left, which decays over {decay}: the "
+            f"map of the dark signal holds {number(self.rate, 2)} {unit} of it on average; record "
+            f"darks {gone} or more after light"
         )
 
 
@@ -99,7 +104,8 @@ def late_rate(
         time = np.array(source.tables[group.array]["time_s"], float)[frames]
         stack = Stack(group.array, group.exptime, frames, time, _NO_SAMPLES, start)
         series.append((stack, gain * (own - unlit)))
-    found = released_late(series, read_noise**2 / levels.pixels)
+    least = read_noise**2 / levels.pixels
+    found = released_late(series, least)
     if found is None:
         return None
     lag, late = found
@@ -110,7 +116,7 @@ def late_rate(
     if slope is None or of_late is None:
         return None
     error = float(np.hypot(slope[1], of_late[0] * lag.share_error / lag.share))
-    return LateRate(of_late[0], error, lag)
+    return LateRate(of_late[0], error, lag, told_from_drift(series, late, least))
 
 
 def _starts(source: Ingested) -> dict[str, float]:
