@@ -144,6 +144,24 @@ def changed(evidence: Evidence, change: Callable[[Stack], F32]) -> Evidence:
     return replace(evidence, stacks=tuple(replace(s, adu=change(s)) for s in evidence.stacks))
 
 
+def test_missing_samples_do_not_shift_the_levels() -> None:
+    pattern = np.linspace(0, 500, SHAPE[0])[:, None]
+
+    def lacking(stack: Stack) -> F32:
+        adu = np.array(stack.adu + pattern)
+        if stack.kind == "flat":
+            adu[1, 5, 7] = np.nan
+        if stack.kind == "dark":
+            adu[3, :20], adu[6] = np.nan, np.nan
+        return adu
+
+    evidence = recorded(0.01, lambda t: float(np.exp(-t / 50)))
+    (slope, _), late = dark_signal(changed(evidence, lacking))
+    assert late is not None
+    assert late.sure
+    assert abs(slope - late.rate) < 4 * late.error < 0.1 * slope
+
+
 @pytest.mark.parametrize("settles", [50.0, 100.0, 200.0])
 def test_a_bias_that_settles_is_told_from_charge_of_light(settles: float) -> None:
     """The same fall of the darks: before light, the bias frames fall too."""

@@ -1,8 +1,12 @@
 """Levels of single frames without light, and the charge that light before them left there."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pixcal.estimators.detector.emva import dark_slope
 from pixcal.estimators.detector.persistence import Persistence, released_late, told_from_drift
@@ -16,6 +20,7 @@ from pixcal.storage.cube import CHUNK
 
 _DAY_S = 86400.0
 _GONE = 5  # decays after which hardly any charge is left
+_ROUNDS = 5  # of levels of frames and pixels in turn
 _NO_SAMPLES = np.zeros((0, 0, 0), np.float32)
 
 
@@ -29,19 +34,22 @@ class DarkLevels:
 
     @classmethod
     def of(cls, source: Ingested, middle: Window, good: Mask) -> "DarkLevels":
-        """Read the frames; ``good``: (y, x) pixels of the window that count."""
+        """Read the frames; ``good``: (y, x) pixels of the window that count.
+
+        Samples that are not finite do not count, nor do frames and groups without any others.
+        """
         (y0, _), columns = middle
         rows = middle_rows(middle)
         window, pixels = ((y0 + rows.start, y0 + rows.stop), columns), good[rows]
         flats = source.exposures.flat if _follows_light(source) else []
-        groups = (*source.exposures.dark, *flats) if pixels.any() else ()
-        levels = [
-            np.array(
-                [s[pixels].mean(dtype=float) for s in frames_of(source, g.array, g.frames, window)]
-            )
-            for g in groups
-        ]
-        return cls(groups, tuple(levels), int(pixels.sum()))
+        groups, levels = [], []
+        for group in (*source.exposures.dark, *flats) if pixels.any() else ():
+            own = _frame_levels(partial(_samples, source, group, window, pixels))
+            kept = tuple(n for n, one in zip(group.frames, own, strict=True) if np.isfinite(one))
+            if kept:
+                groups.append(replace(group, frames=kept))
+                levels.append(own[np.isfinite(own)])
+        return cls(tuple(groups), tuple(levels), int(pixels.sum()))
 
     @property
     def times(self) -> F64:
@@ -54,6 +62,33 @@ class DarkLevels:
         """Mean of each frame without light, ADU."""
         pairs = zip(self.groups, self.levels, strict=True)
         return np.concatenate([*(own for g, own in pairs if g.array != "flat"), []])
+
+
+def _frame_levels(read: Callable[[], Iterable[NDArray[Any]]]) -> F64:
+    """Mean (t,) of the pixels of each frame, as if none were missing; NaN without any sample."""
+    with np.errstate(invalid="ignore"):
+        levels = np.array([samples.mean(dtype=float) for samples in read()])
+    if np.isfinite(levels).all():
+        return levels
+    # Pixels differ by their own levels: which ones are missing must not shift a mean.
+    pixel = count = np.zeros(1)
+    for _ in range(_ROUNDS):
+        total, count = np.zeros(1), np.zeros(1)
+        for n, samples in enumerate(read()):
+            there = np.isfinite(samples)
+            levels[n] = (samples - pixel)[there].mean(dtype=float) if there.any() else np.nan
+            if there.any():
+                total = total + np.where(there, samples - levels[n], 0)
+                count = count + there
+        pixel = total / np.maximum(count, 1)
+    return levels + (pixel[count > 0].mean() if count.any() else 0)
+
+
+def _samples(
+    source: Ingested, group: Group, window: Window, pixels: Mask
+) -> Iterator[NDArray[Any]]:
+    """Samples (pixel,) of each frame of a group."""
+    return (frame[pixels] for frame in frames_of(source, group.array, group.frames, window))
 
 
 def middle_rows(middle: Window) -> slice:
