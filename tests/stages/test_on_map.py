@@ -95,6 +95,8 @@ def test_what_no_cause_explains_has_a_size():
     assert action.endswith("recommended frames: darks")
     found["gap"]["where"] = where[1:2]
     assert unexplained(found)[0][1] == "level, all: 5.020 e⁻ (simulated: 5.010)"
+    found["gap"]["where"] = [shared | {"measured": 6.34, "after": 3.97, "z_after": 5.0}]
+    assert unexplained(found)[0][1] == "correlation, x+2: 6.34 (simulated: 3.97)"
     assert unexplained(found | {"verdict": "explained"}) == unexplained(NOTHING) == ()
 
 

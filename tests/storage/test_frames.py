@@ -62,6 +62,13 @@ def test_time_stamps_win_over_names_and_period() -> None:
     assert "fringes/a: time stamps do not follow the file names (f1)" in warnings[0]
 
 
+def test_names_with_decimals_follow_the_time() -> None:
+    names = ["flat_0.25", "flat_0.5", "flat_1.0", "flat_10.0"]
+    found, warnings = table([frame_file(f, 60000 + n * SECOND) for n, f in enumerate(names)])
+    assert found["file"] == names
+    assert warnings == []
+
+
 def test_one_file_without_stamp_means_names() -> None:
     found, warnings = table([frame_file("a", 60001.0), frame_file("b"), frame_file("c", 60000.0)])
     assert found["file"] == ["a", "b", "c"]

@@ -220,12 +220,14 @@ def unexplained(diagnosis: Json) -> tuple[tuple[str, ...], ...]:
 
 def _departure(entry: Json) -> str:
     """What a statistic measures, and what the simulation has."""
-    scale, its_unit = (1, unit(entry["unit"])) if entry["unit"] else (100, "%")
-    ends = [scale * float(entry[key]) for key in ("measured", "after")]
+    ends = [float(entry[key]) for key in ("measured", "after")]
+    its_unit = f" {unit(entry['unit'])}" if entry["unit"] else ""
+    if not its_unit and max(map(abs, ends)) <= 1:
+        ends, its_unit = [100 * end for end in ends], " %"
     digits = digits_apart(*ends)
     decimals = digits - 1 - math.floor(math.log10(max(map(abs, ends))))
     measured, simulated = (number(round(v, decimals), digits) for v in ends)
-    return f"{entry['title']}, {entry['place']}: {measured} {its_unit} (simulated: {simulated})"
+    return f"{entry['title']}, {entry['place']}: {measured}{its_unit} (simulated: {simulated})"
 
 
 # least mean of a series, over the rms about it, that is reported: smaller ones are its scatter

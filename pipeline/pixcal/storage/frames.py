@@ -125,7 +125,8 @@ def _order(files: Sequence[FrameFile]) -> tuple[list[FrameFile], bool, list[str]
     warnings = []
     ordered = sorted(named, key=lambda file: file.mjd or 0.0)
     late = next((b for a, b in pairwise(named) if (b.mjd or 0.0) < (a.mjd or 0.0)), None)
-    if late is not None:
+    # Names such as 0.25 and 0.5 are in alphabetical order, not in that of whole numbers.
+    if late is not None and ordered != sorted(ordered, key=lambda file: file.source.name):
         warnings.append(
             f"time stamps do not follow the file names ({late.source.name}); ordered by time"
         )

@@ -120,7 +120,8 @@ def shot_share(
         times = 1 if own else 2
         share += times * (inverse @ right)[0]
         variance += times**2 * scatter * inverse[0, 0]
-    if share <= 0.1 or not np.isfinite(variance):
+    # Negative where levels are too alike to tell the noise of light from that of reading.
+    if share <= 0.1 or not 0 <= variance < np.inf:
         return None
     return float(share), float(np.sqrt(variance + FLOOR**2))
 
