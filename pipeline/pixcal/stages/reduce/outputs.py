@@ -24,10 +24,10 @@ def outputs_of(made: Build, summary: Summary, middle: Window) -> Outputs | None:
     return differing_outputs(flat.astype(float), shot.astype(float), mask == 0, first)
 
 
-def report_outputs(found: Outputs, gain: float, facts: dict[str, Any]) -> str:
+def report_outputs(found: Outputs, gain: float, facts: dict[str, Any], looked_at: str = "") -> str:
     """Words on the gain of each output, which is also added to the contents of ``reduce.json``.
 
-    ``gain``: of all outputs together (e-/ADU).
+    ``gain``: of all outputs together (e-/ADU). ``looked_at``: the part of the detector.
     """
     each = zip(found.names, gain * found.gain, gain * found.gain * found.error, strict=True)
     entries: list[dict[str, Any]] = []
@@ -40,7 +40,7 @@ def report_outputs(found: Outputs, gain: float, facts: dict[str, Any]) -> str:
     words = "; ".join(said) + " e-/ADU"
     facts["gain_e_per_adu"]["outputs"] = entries
     facts["warnings"].append(
-        f"the gain differs between outputs ({words}): electrons are counted by one gain for "
+        f"the gain differs between outputs{looked_at} ({words}): electrons are counted by one gain for "
         "all, and the flat map removes the steps"
     )
     return f"of all outputs together: {words}"
