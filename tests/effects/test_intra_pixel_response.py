@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pixcal.effects.intra_pixel_response import IntraPixelResponse, _slopes, transfer
+from pixcal.effects.intra_pixel_response import SHARED, IntraPixelResponse, _slopes, transfer
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.scene import detector_maps, fringe_light
 from pixcal.model.bench import Bench
@@ -133,24 +133,44 @@ def test_scatter_that_crossed_fringes_share_is_not_of_widths(
     assert bool(found.refused) == shared
 
 
+SETS = [
+    {"name": f"set{n}", "baseline_mm": mm, "count": 300, "peak_e": 45000}
+    for n, mm in enumerate(([11.5, 0.0], [0.0, 11.0], [5.5, 0.0]))
+]
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("alike", [0.0, 0.5, 1.0])
 def test_widths_that_diffusion_makes_alike_along_both_axes_are_told(
     acquired: Callable[..., Evidence], alike: float
 ) -> None:
     """With two periods along an axis, a width is told from a contrast common to all fringes."""
-    sets = [([11.5, 0.0], 300), ([0.0, 11.0], 300), ([5.5, 0.0], 300)]
-    fringes = [
-        {"name": f"set{n}", "baseline_mm": mm, "count": count, "peak_e": 45000}
-        for n, (mm, count) in enumerate(sets)
-    ]
     widths = {"width_px": [0.95, 0.95], "width_rms_px": 0.02, "alike": alike}
     found = IntraPixelResponse.estimate(
-        acquired({"frames.fringes": fringes}, {"intra_pixel_response": widths})
+        acquired({"frames.fringes": SETS}, {"intra_pixel_response": widths})
     )
     assert found is not None
     assert isinstance(found.effect, IntraPixelResponse)
     assert not found.refused
     assert found.effect.alike == pytest.approx(alike, abs=0.1)
+    assert abs(found.effect.alike - alike) <= 4 * found.errors.get("alike", 0.0)
     allowed = found.errors["width_rms_px"]
     assert abs(found.effect.width_rms_px - 0.02) < 4 * allowed < 0.02
+
+
+@pytest.mark.long
+def test_a_contrast_that_all_fringes_share_is_not_of_widths(
+    acquired: Callable[..., Evidence],
+) -> None:
+    """Widths that scatter as well do not hide it."""
+    widths = {"width_px": [0.95, 0.95], "width_rms_px": 0.005}
+    evidence = acquired({"frames.fringes": SETS}, {"intra_pixel_response": widths})
+    part = 6e-3 * np.random.default_rng(5).standard_normal(evidence.good.shape)
+    fringes = {}
+    for name, found in evidence.fringes.items():
+        change = np.concatenate([np.zeros((1, *part.shape)), found.theta[1:] * part])
+        more = np.tensordot(found.g, change, 1).astype(np.float32)
+        fringes[name] = replace(found, theta=found.theta + change, electrons=found.electrons + more)
+    estimate = IntraPixelResponse.estimate(replace(evidence, fringes=fringes))
+    assert estimate is not None
+    assert estimate.refused == SHARED

@@ -312,3 +312,21 @@ def test_noise_of_many_levels_shows_a_response_of_two_terms() -> None:
 @pytest.mark.parametrize(("quadratic", "levels"), [(0.0, 12), (-0.03, 12), (-0.1, 5)])
 def test_noise_along_a_line_shows_one_term(quadratic: float, levels: int) -> None:
     assert _bent_by_noise(_transfer(lambda e: e * (1 + quadratic * e / 1e4), 0.01, levels)) is None
+
+
+def test_a_window_of_few_rows_shows_the_response(acquired: Callable[..., Evidence]) -> None:
+    """Rows within the reach of charge outside are used where there are no others."""
+    sets = [
+        {"name": f"set{n}", "baseline_mm": [mm, 0.0], "count": 100, "peak_e": 45000}
+        for n, mm in enumerate((11.5, 7.0))
+    ]
+    few = {"detector.shape": [8, 120], "frames.fringes": sets}
+    found = Nonlinearity.estimate(acquired(few, {"nonlinearity": {"quadratic": -0.05}}))
+    assert found is not None
+    assert found.significance > 5
+    assert isinstance(found.effect, Nonlinearity)
+    # Fringes constrain neither offset nor factor: the bend of the curve is compared.
+    levels = np.float32([10_000, 20_000, 30_000])
+    true = Nonlinearity(-0.05, 0.0).response(levels)
+    bend, expected = (r[1] - (r[0] + r[2]) / 2 for r in (found.effect.response(levels), true))
+    assert bend == pytest.approx(expected, rel=0.2)

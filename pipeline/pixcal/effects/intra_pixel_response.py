@@ -22,10 +22,9 @@ from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
 
 REPEAT = 0.002  # assumed relative agreement of the visibilities of two fibre pairs
-SHARED = (
-    "the visibility scatters alike in sets of crossed fringes; only a second fringe period along an "
-    "axis shows whether pixel widths cause that"
-)
+_ALIKE = "the visibility scatters alike in sets of crossed fringes"
+SHARED = f"{_ALIKE}, which pixel widths do not cause"
+UNTESTED = f"{_ALIKE}; a second fringe period along an axis shows whether pixel widths cause it"
 _MIN_PIXELS = 200
 _APART = 1.1
 _STEP = 1e-3  # change of the width for derivatives, px
@@ -110,11 +109,16 @@ class IntraPixelResponse(Effect):
         rms_error = float(np.hypot(rms_error, rms * width_error / max(width, 0.5)))
         return Estimate(
             cls((width, width), min(rms, 0.5), found.alike),
-            {"width_px[0]": width_error, "width_px[1]": width_error, "width_rms_px": rms_error},
+            {
+                "width_px[0]": width_error,
+                "width_px[1]": width_error,
+                "width_rms_px": rms_error,
+                **({"alike": found.alike_error} if found.alike else {}),
+            },
             # Of the scatter only, because unequal fibre powers also change a visibility.
             found.variance / found.error,
             "visibility that varies from pixel to pixel, more strongly at shorter fringe periods",
-            refused=SHARED if found.shared else "",
+            refused=found.refused,
         )
 
 
@@ -157,8 +161,9 @@ class _Scatter:
 
     variance: float
     error: float
-    alike: float  # share that is common to both axes
-    shared: bool  # whether crossed fringes share most of their scatter, which widths do not explain
+    alike: float = 0.0  # alike, alike_error: share that is common to both axes
+    alike_error: float = 0.0
+    refused: str = ""  # why widths do not explain the scatter, if they do not
 
 
 def _scatter(sets: list[FringeEvidence], width: float, bias_variance: float) -> _Scatter:
@@ -194,11 +199,12 @@ def _scatter(sets: list[FringeEvidence], width: float, bias_variance: float) -> 
         # Twice the part that no width explains must be less than any crossed fringes share.
         of_widths = 2 * free < min(products[at] for at in crossed)
         if of_widths and common > SIGNIFICANT * np.sqrt(every[2, 2]):
-            alike = float(np.clip(common / (max(single, 0.0) + common), 0, 1))
-            total = single + common
-            error = np.sqrt(every[0, 0] + 2 * every[0, 2] + every[2, 2])
-            return _Scatter(float(total), float(error), alike, False)
-    return _Scatter(float(variance), float(np.sqrt(covariance[0, 0])), 0.0, bool(shared))
+            own, total = max(single, 0.0), single + common
+            by_parts = np.array([[1.0, 0.0, 1.0], [-common, 0.0, own] / (own + common) ** 2])
+            error, of_share = np.sqrt(np.diag(by_parts @ every @ by_parts.T)).tolist()
+            return _Scatter(float(total), error, float(common / (own + common)), of_share)
+    why = (SHARED if len(pairs) > terms.shape[1] else UNTESTED) if shared else ""
+    return _Scatter(float(variance), float(np.sqrt(covariance[0, 0])), refused=why)
 
 
 def _cross(sets: list[FringeEvidence], m: int, n: int) -> bool:

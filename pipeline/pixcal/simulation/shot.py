@@ -99,12 +99,9 @@ class Shot:
         """
         return self.recording.rng(effect, self.frame, *key)
 
-    def normals(self, effect: str, frame: int | None = None) -> F32:
-        """Standard normals (y, x) of an effect, independent of the range of rows; read only.
-
-        For this frame, or another one of the recording.
-        """
-        chain, frame = self._chain.of(self.frame if frame is None else frame)
+    def normals(self, effect: str) -> F32:
+        """Standard normals (y, x) of an effect, independent of the range of rows; read only."""
+        chain, frame = self._chain.of(self.frame)
         own = chain.effects[self._at]
         again = own.frames_back > 0 and effect.startswith(own.name)
         normals: F32 = chain.normals(effect, frame, keep=again)

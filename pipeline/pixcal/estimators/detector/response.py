@@ -48,11 +48,16 @@ def fit_response(
         tuple(evidence.fringes.values()),
         _signal_of(evidence, level_e, [UNIT * shifts]),
         3,
-        margin=REACH,
+        margin=_margin(evidence),
         prior=prior,
     )
     scale = np.array([1.0, 1.0, UNIT])
     return sizes * scale, covariance * np.outer(scale, scale)
+
+
+def _margin(evidence: Evidence) -> int:
+    """Rows along the edges, near which charge outside acts; fewer in a window with few of them."""
+    return int(min(REACH, (min(evidence.good.shape) - 1) // 4))
 
 
 def _signal_of(evidence: Evidence, level_e: float, every: Sequence[F64]) -> Distortion:
@@ -170,7 +175,9 @@ def _boundary_sums(evidence: Evidence) -> list[tuple[F64, F64]]:
         return sizes
 
     return [
-        distortions.distortion_sums(own, signal, POWERS + len(every), by_itself, margin=REACH)
+        distortions.distortion_sums(
+            own, signal, POWERS + len(every), by_itself, margin=_margin(evidence)
+        )
         for own in across
         if own
     ]

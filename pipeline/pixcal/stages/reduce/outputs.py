@@ -40,7 +40,7 @@ def report_outputs(found: Outputs, gain: float, facts: dict[str, Any], looked_at
     words = "; ".join(said) + " e-/ADU"
     facts["gain_e_per_adu"]["outputs"] = entries
     facts["warnings"].append(
-        f"the gain differs between outputs{looked_at} ({words}): electrons are counted by one gain for "
-        "all, and the flat map removes the steps"
+        f"the gain differs between outputs{looked_at} ({words}): electrons are counted by one gain "
+        "for all, and the flat map removes the steps"
     )
     return f"of all outputs together: {words}"
