@@ -56,9 +56,7 @@ def characterise(
     note = "" if measured else "declared, not measured"
     outputs = outputs_of(made, summary, middle)
     if outputs is not None:
-        sides = tuple(high - low for low, high in middle)
-        looked_at = "" if sides == source.shape else " in the middle {} × {} pixels".format(*sides)
-        note = report_outputs(outputs, gain[0], facts, looked_at)
+        note = report_outputs(outputs, gain[0], facts, source.shape)
     found: Json = {"conversion_gain": _figure("conversion gain", "e-/ADU", gain, note)}
     noise = _read_noise(found, summary, gain[0], source.quantum)
     _line_noise(found, dark, gain[0], job.shape, nearby)

@@ -24,11 +24,15 @@ def outputs_of(made: Build, summary: Summary, middle: Window) -> Outputs | None:
     return differing_outputs(flat.astype(float), shot.astype(float), mask == 0, first)
 
 
-def report_outputs(found: Outputs, gain: float, facts: dict[str, Any], looked_at: str = "") -> str:
+def report_outputs(
+    found: Outputs, gain: float, facts: dict[str, Any], shape: tuple[int, ...]
+) -> str:
     """Words on the gain of each output, which is also added to the contents of ``reduce.json``.
 
-    ``gain``: of all outputs together (e-/ADU). ``looked_at``: the part of the detector.
+    ``gain``: of all outputs together (e-/ADU). ``shape``: of the detector.
     """
+    sides = found.of_pixel.shape
+    looked_at = "" if sides == shape else " in the middle {} × {} pixels".format(*sides)
     each = zip(found.names, gain * found.gain, gain * found.gain * found.error, strict=True)
     entries: list[dict[str, Any]] = []
     entries += [{"where": n, "gain": float(g), "error": float(e)} for n, g, e in each if g > 0]
