@@ -7,27 +7,32 @@ Exposure times that are stamped rounded are off by a time that does not grow wit
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
+from scipy.optimize import linprog
+from scipy.special import fdtrc, ndtr
 
 from pixcal.estimators.detector.calibration import MIN_STEPS, Linearity, linearity
-from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import F64, Mask
 
 LAMP = 1e-3  # least relative error of the light of a flat, exposure time included
 RATES = 1.3  # largest ratio of light per second among levels of one lamp
 _BENT = 0.02  # largest deviation from a line with an offset in exposure time that one lamp gives
 SURE = 5.0  # errors from which a lamp or a response is told
+_BY_CHANCE = float(ndtr(-SURE))
+# least deviation from a line of which it is said that a lamp may cause it: below, the linearity and
+# its error say enough
+_WORTH = 5e-3
 _DEGREE = 6  # highest of the polynomial of the lamp's light in time
 _DETERMINED = 1e10  # condition of its normal equations
 # least width of the residuals of rounded times, over that of their distribution, and least share of
 # it that no curve in level explains
 _FILLED, _ROUGH = 0.2, 0.3
-# scatter of times about the line over that of a lamp about it, up to which rounding is likelier:
-# few lamps scatter from level to level and not from frame to frame
-_ALIKE = 1.5
+# Scatter in proportion to the time, as of a lamp that is set anew for each level, over scatter alike
+# for all times, and over that expected of the step, from which times are told as rounded: a lamp
+# has the size of the step by chance only.
+_LIKELIER = 0.95
 _NOISE = 5e-3  # least relative error of the noise of a level
 _ORDERED = 0.9  # correlation of exposure time and time of recording that a drift can mimic
 
@@ -52,7 +57,8 @@ class Straightness:
     # one flat at each level
     largest: float
     error: float | None
-    drift: float = 0.0  # relative change of the lamp over the flats, which ``line`` allows for
+    # peak to peak relative change of the lamp over the usable flats, which ``line`` allows for
+    drift: float = 0.0
     rounded: float = 0.0  # s, to which exposure times are rounded, if levels show it
     scatter: float = 0.0  # relative, of levels about a curve, if their noise excludes the response
     lamp: bool = False  # whether a lamp that drifts may have bent the levels
@@ -75,12 +81,16 @@ def straightness(
     line, drift, of_drift = _at_a_steady_lamp(levels, times, means, used)
     if line is None or not _one_lamp((means / times)[used], line):
         return None
+    change = 0.0
     if drift is not None:
         means = means / np.array([one.mean() for one in drift])
         light = [one / own for one, own in zip(light, drift, strict=True)]
+        # At saturated levels the drift is extrapolated.
+        change = float(np.ptp(np.concatenate([drift[n] for n in np.flatnonzero(used)])))
+        # A response that is not straight changes the drift that is seen, too.
+        of_drift = float(np.hypot(of_drift, change * line.max_deviation))
     ratios = [o.var(ddof=1) / o.mean() ** 2 / len(o) for o in light if len(o) > 1 and o.mean() > 0]
     error = float(np.hypot(np.sqrt(np.mean(ratios)), of_drift)) if ratios else None
-    change = 0.0 if drift is None else float(np.ptp(np.concatenate(drift)))
     found = Straightness(line, line.max_deviation, error, change)
     if line.max_deviation < LAMP or (not of_drift and line.max_deviation < SURE * (error or 0.0)):
         return found
@@ -92,7 +102,8 @@ def straightness(
     if favour < -(SURE**2):
         found = _without_times(found, times[used], means[used])
     if not found.rounded and not found.scatter and drift is None and favour < SURE**2:
-        return replace(found, lamp=_may_drift(levels))
+        told = error is not None and line.max_deviation > _WORTH
+        return replace(found, lamp=told and _may_drift(levels))
     return found
 
 
@@ -186,9 +197,10 @@ def _polynomial(design: F64, value: F64, freedom: int) -> tuple[F64, F64] | None
         sizes = np.linalg.solve(normal, terms.T @ value)
         rest = float(((value - terms @ sizes) ** 2).sum())
         criterion = freedom * np.log(max(rest, 1e-300)) + degree * np.log(freedom)
-        scatter = rest / (freedom - degree)
-        explained = (whole - rest) / max(scatter, 1e-300)
-        if criterion < best and sigmas_of_chi2(explained, degree) > SURE:
+        scatter = max(rest / (freedom - degree), 1e-300)
+        # The scatter is known from the few residuals alone.
+        ratio = (whole - rest) / degree / scatter
+        if criterion < best and fdtrc(degree, freedom - degree, ratio) < _BY_CHANCE:
             errors = np.linalg.cholesky(scatter * np.linalg.inv(normal))
             best, found = criterion, (np.asarray(sizes), np.asarray(errors.T))
     return found
@@ -260,12 +272,12 @@ def _rounded_to(times: F64, levels: F64) -> float:
     if len(set(levels)) <= MIN_STEPS or not step:
         return 0.0
 
-    # A cut-off of digits is rounding of times that are longer by half a step. Of three points the
-    # middle one is twice as far from the line of the others as all from the nearest line.
-    order = np.argsort(levels)
-    low, middle, high = order[np.array(list(combinations(range(len(times)), 3))).T]
-    share = (levels[middle] - levels[low]) / (levels[high] - levels[low])
-    furthest = np.abs(times[middle] - times[low] - share * (times[high] - times[low])).max() / 2
+    # A cut-off of digits is rounding of times that are longer by half a step. The line with the
+    # least largest distance (steps) decides.
+    same = np.ones_like(times)
+    terms = np.stack([levels / levels.max(), same], axis=1)
+    below = np.concatenate([np.column_stack([sign * terms, -same]) for sign in (1, -1)])
+    nearest = linprog([0, 0, 1], below, np.append(times, -times) / step, bounds=(None, None))
 
     def width(degree: int, unit: F64) -> float:
         """Of distances from a curve in a unit (n,), which has one size for all."""
@@ -273,11 +285,10 @@ def _rounded_to(times: F64, levels: F64) -> float:
         scale = float(np.exp(np.log(unit).mean()))
         return scale * float(np.linalg.norm(rest)) / float(np.sqrt(len(times) - degree - 1))
 
-    line, same = width(1, np.ones_like(times)), np.ones_like(times)
-    even = line > _FILLED * step / np.sqrt(12) and width(2, same) > _ROUGH * line
-    # A lamp that scatters is off by shares of the time.
-    alike = line < _ALIKE * width(1, times)
-    return step if even and alike and furthest <= step / 2 else 0.0
+    line, expected = width(1, same), step / np.sqrt(12)
+    even = line > _FILLED * expected and width(2, same) > _ROUGH * line
+    likelier = width(1, times) > _LIKELIER * max(line, expected)
+    return step if even and likelier and nearest.fun <= 0.5 else 0.0
 
 
 def _may_drift(levels: Sequence[Level]) -> bool:

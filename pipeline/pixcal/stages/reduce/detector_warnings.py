@@ -145,22 +145,23 @@ def _linearity_warnings(summary: Summary) -> list[str]:
     unflagged = "; no pixels are flagged NONLINEAR for it"
     if found.drift > _LATE:
         said.append(
-            f"the light of the flats changes by {100 * found.drift:.2g} % from the first to the "
-            "last, as the frames of each exposure time show: the linearity error allows for it"
+            f"the light of the flats changes by up to {100 * found.drift:.2g} %, as the frames of "
+            "each exposure time show: the linearity error allows for it"
         )
     if found.rounded:
         said.append(
-            f"the exposure times of the flats seem rounded to {found.rounded:g} s: the levels "
-            f"deviate by up to {off} from a straight line over them, by less than half of that "
-            "step, and their noise does not follow; the linearity error allows for it. Write the "
-            "true times into the headers, or expose for whole multiples of the step" + unflagged
+            f"the exposure times of the flats seem rounded to {found.rounded:g} s: deviations of "
+            f"the levels from a straight line, of up to {off}, are within half a step "
+            f"({found.rounded / 2:g} s) of the exposure times, and their noise does not follow; "
+            "the linearity error allows for it. Write the true times into the headers, or expose "
+            "for whole multiples of the step" + unflagged
         )
     elif found.scatter:
         said.append(
             f"the levels of the flats scatter by {100 * found.scatter:.2g} % about a smooth curve "
-            "over exposure time, and their noise does not follow: exposure times or the lamp "
-            "differ from level to level, or the response has a step; the linearity error allows "
-            "for it" + unflagged
+            "over exposure time, and their noise does not follow: exposure times that are rounded, "
+            "a lamp that is set anew for each level, or a step in the response would do that; the "
+            "linearity error allows for it" + unflagged
         )
     elif found.lamp:
         said.append(
