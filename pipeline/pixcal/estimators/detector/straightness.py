@@ -29,9 +29,9 @@ _DETERMINED = 1e10  # condition of its normal equations
 # least width of the residuals of rounded times, over that of their distribution, and least share of
 # it that no curve in level explains
 _FILLED, _ROUGH = 0.2, 0.3
-# Scatter in proportion to the time, as of a lamp that is set anew for each level, over scatter alike
-# for all times, and over that expected of the step, from which times are told as rounded: a lamp
-# has the size of the step by chance only.
+# Scatter in proportion to the time, as of a lamp that is set anew for each level, over scatter that
+# is alike for all times, and over that expected of the step: from here times are told as rounded.
+# A lamp has the size of the step by chance only.
 _LIKELIER = 0.95
 _NOISE = 5e-3  # least relative error of the noise of a level
 _ORDERED = 0.9  # correlation of exposure time and time of recording that a drift can mimic
