@@ -196,7 +196,8 @@ def test_its_size_is_found(acquired: Callable[..., Evidence], size: float) -> No
     # The falloff, which is found too, takes half of what is known of the size.
     assert abs(found.effect.shift_px_per_e - size) < 4 * found.errors["shift_px_per_e"] < 2e-8
     own = found.together[0]["shift_px_per_e"] if found.together else found.errors["shift_px_per_e"]
-    assert 4 * own < 1e-8
+    # The fit is of first order: three times the shift by the mean light, 22 ke-, are left out.
+    assert own < 2.5e-9 + 3 * size**2 * 2.5e4
     assert found.significance > 8
     value, error = of_noise(evidence)
     assert abs(value - size) < 4 * error
@@ -225,7 +226,7 @@ def test_what_looks_like_it_is_not_taken_for_it(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("falloff", [0.35, 1.2])
+@pytest.mark.parametrize("falloff", [0.35, 1.0])
 def test_by_itself_its_falloff_is_found_with_its_size(
     acquired: Callable[..., Evidence], falloff: float
 ) -> None:
@@ -256,19 +257,47 @@ def test_beside_a_bent_response_it_is_not_taken_to_be_alone(
     assert abs(found.effect.shift_px_per_e - 2e-7) < 4 * found.errors["shift_px_per_e"]
 
 
+OTHERWISE_BETWEEN_ROWS = {"shift_px_per_e": 3e-7, "falloff_px": 0.7, "along_y": 0.8}
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 6, 12, 101])
 def test_boundaries_that_move_otherwise_between_rows_are_found(
     acquired: Callable[..., Evidence], seed: int
 ) -> None:
-    given = {"shift_px_per_e": 3e-7, "falloff_px": 0.7, "along_y": 0.8}
-    seeds = {"seed": seed, "detector.seed": 4600 + seed}
-    found = BrighterFatter.estimate(acquired(seeds, {"brighter_fatter": given}))
+    """With two periods along an axis, which show the falloff whatever the ratio."""
+    given = OTHERWISE_BETWEEN_ROWS
+    sets = [
+        {"name": f"set{n}", "baseline_mm": mm, "count": 300, "peak_e": 45000}
+        for n, mm in enumerate(([11.5, 0.0], [0.0, 11.0], [6.0, 0.0]))
+    ]
+    changes = {"seed": seed, "detector.seed": 4600 + seed, "frames.fringes": sets}
+    found = BrighterFatter.estimate(acquired(changes, {"brighter_fatter": given}))
     assert found is not None
     for name, value in given.items():
         assert abs(getattr(found.effect, name) - value) < 3 * found.errors[name] < value / 2
     # The ratio hangs on the falloff; given that it is known far better.
     assert min(part["along_y"] for part in found.together if "along_y" in part) < 0.003
+
+
+@pytest.mark.long
+def test_with_one_period_along_each_axis_fringes_get_what_they_showed(
+    acquired: Callable[..., Evidence],
+) -> None:
+    """Falloff and ratio cannot both be known; what moves under these fringes is."""
+    evidence = acquired(None, {"brighter_fatter": OTHERWISE_BETWEEN_ROWS})
+    found = BrighterFatter.estimate(evidence)
+    assert found is not None
+    assert isinstance(found.effect, BrighterFatter)
+    y, x = np.mgrid[:40, :50]
+    for fringes in evidence.fringes.values():
+        light = (2e4 * (1 + 0.9 * np.cos(fringes.k[0] * x + fringes.k[1] * y))).astype(np.float32)
+        made, true = (
+            moved_charge(light, e.shift_px_per_e * boundary_shifts(e.falloff_px), e.along_y)
+            for e in (found.effect, BrighterFatter(**OTHERWISE_BETWEEN_ROWS))
+        )
+        inside = np.s_[REACH:-REACH, REACH:-REACH]
+        assert np.abs(made - true)[inside].max() < 0.03 * np.abs(true[inside]).max()
 
 
 @pytest.mark.long

@@ -27,6 +27,7 @@ _NEEDED = 12.0  # chi-square of three terms above which they are needed: one in 
 _APART = 9.0  # chi-square above which shifts along x and y differ
 _MAX_ALONG_Y = 10.0  # largest ratio of the shift along y to that along x
 _MAX_SHIFT = 1e-3  # px/e-; wells of a few thousand electrons have 1e-5 and more
+_SECOND_ORDER = 3.0  # relative error of the fitted shift, for a boundary shifted by 1 px
 _TURNS = 4  # iterations of the inverse; each cuts the error to a few per cent
 
 
@@ -124,7 +125,7 @@ class BrighterFatter(Effect):
             alone = _beside_noise(explaining, evidence)
         if alone is not None:
             falloff, size, along_y = alone.falloff_px, alone.shift, alone.along_y
-            errors, together = _errors(alone)
+            errors, together = _errors(alone, evidence)
             why += "; no nonlinearity is needed in addition"
         effect = cls(float(np.clip(size, 0, _MAX_SHIFT)), falloff, along_y)
         return Estimate(effect, errors, significance, why, together)
@@ -161,14 +162,23 @@ def _beside_noise(found: Boundaries, evidence: Evidence) -> Boundaries | None:
     return found if apart < _DISAGREE * float(np.linalg.norm(errors)) else None
 
 
-def _errors(found: Boundaries) -> tuple[dict[str, float], tuple[dict[str, float], ...]]:
-    """Errors of all parameters, and their correlated steps."""
-    own = {"shift_px_per_e": found.shift_error}
+def _errors(
+    found: Boundaries, evidence: Evidence
+) -> tuple[dict[str, float], tuple[dict[str, float], ...]]:
+    """Errors of all parameters, and their correlated steps.
+
+    The fit of the harmonics is of first order in the shift of a boundary.
+    """
+    light = max(float(np.median(f.theta[0][f.good])) for f in evidence.fringes.values())
+    second_order = _SECOND_ORDER * abs(found.shift) * light
+    own = {"shift_px_per_e": float(np.hypot(found.shift_error, second_order * found.shift))}
     ratio = {"along_y": found.along_y_error} if found.along_y_error else {}
     together = [d for d in (own, ratio) if d]
     if np.isfinite(found.falloff_error):
-        by_falloff = {"shift_px_per_e": found.with_falloff, "falloff_px": found.falloff_error}
-        together.append(by_falloff | dict.fromkeys(ratio, found.along_y_with_falloff))
+        steps = {"shift_px_per_e": found.with_falloff, "falloff_px": found.falloff_error}
+        steps |= dict.fromkeys(ratio, found.along_y_with_falloff)
+        times = float(np.hypot(1, second_order * found.falloff_px / found.falloff_error))
+        together.append({name: times * step for name, step in steps.items()})
     names = dict.fromkeys(name for part in together for name in part)
     errors = {n: float(np.linalg.norm([part.get(n, 0.0) for part in together])) for n in names}
     return errors, tuple(together)
