@@ -181,14 +181,14 @@ def _scatter(sets: list[FringeEvidence], width: float, bias_variance: float) -> 
         products[at] = product - bias_variance / (_light(sets[m]) * _light(sets[n]))
         slopes = _slopes(sets[m], width), _slopes(sets[n], width)
         terms[at] = slopes[0] @ slopes[1], 1.0, slopes[0].sum() * slopes[1].sum()
-    own, crossed = slice(len(sets)), [at for at, (m, n) in enumerate(pairs) if _cross(sets, m, n)]
+    crossed = [at for at, (m, n) in enumerate(pairs) if _cross(sets, m, n)]
 
     def fit(rows: slice, columns: slice) -> tuple[F64, F64]:
         design = terms[rows, columns] / errors[rows, None]
         covariance = inverse_normal(design.T @ design, 1e-15)
         return covariance @ design.T @ (products[rows] / errors[rows]), covariance
 
-    (variance, _), covariance = fit(own, np.s_[:2])
+    (variance, _), covariance = fit(np.s_[: len(sets)], np.s_[:2])
     rest = products - terms[:, 0] * max(variance, 0.0)
     most = [np.sqrt(np.maximum(products[list(pairs[at])], 0).prod()) / 2 for at in crossed]
     shared = any(
