@@ -1,7 +1,6 @@
 """Intra-pixel response: the fringe is averaged over each pixel."""
 
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -9,14 +8,13 @@ from scipy.optimize import least_squares
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.frame_series.fringe_motion import CROSSED
-from pixcal.estimators.maps.map_fit import gauge_terms, half_theta, neighbour_products, without
-from pixcal.estimators.maps.structure import without_outliers
+from pixcal.estimators.maps.visibility_scatter import Products, visibility_products
 from pixcal.kernels import optics
 from pixcal.kernels.beams import LightMaps
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.scene import TILE, DetectorMaps, Rows, chip_map, geometry
 from pixcal.kernels.significance import SIGNIFICANT, root_with_error
-from pixcal.model.arrays import F32, F64, Mask
+from pixcal.model.arrays import F32, F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
@@ -103,7 +101,7 @@ class IntraPixelResponse(Effect):
         k = np.array([f.k for f in sets])
         square, error = _width(k, np.array([_log_visibility(f) for f in sets]))
         width, width_error = map(float, root_with_error(min(square, 9.0), error))
-        found = _scatter(sets, max(width, 0.5), _bias_variance(evidence))
+        found = _scatter(sets, max(width, 0.5), visibility_products(evidence, sets))
         rms, rms_error = map(float, root_with_error(found.variance, found.error))
         # A wider response changes the visibility more for the same scatter of its width.
         rms_error = float(np.hypot(rms_error, rms * width_error / max(width, 0.5)))
@@ -149,12 +147,6 @@ def _width(k: F64, seen: F64) -> tuple[float, float]:
     return float(fit.x[0]), 1 / float(np.linalg.norm(fit.jac))
 
 
-def _bias_variance(evidence: Evidence) -> float:
-    """Variance of the subtracted bias, e-², which is common to both halves of the frames."""
-    counts = [len(s.adu) for s in evidence.of_kind("bias")]
-    return evidence.read_noise**2 / sum(counts) if counts else 0.0
-
-
 @dataclass(frozen=True)
 class _Scatter:
     """Variance of the widths of pixels, px², from the visibilities of their fringes."""
@@ -166,19 +158,14 @@ class _Scatter:
     refused: str = ""  # why widths do not explain the scatter, if they do not
 
 
-def _scatter(sets: list[FringeEvidence], width: float, bias_variance: float) -> _Scatter:
+def _scatter(sets: list[FringeEvidence], width: float, scatter: Products) -> _Scatter:
     """Widths that scatter independently along both axes, unless crossed fringes show otherwise.
 
     A part of the visibility that no width explains, as it is independent of the fringes, is free.
     """
-    maps = [_two_maps(found) for found in sets]
-    both = [(one + other) / 2 for one, other, _ in maps]
-    pairs = [(m, m) for m in range(len(sets))] + list(combinations(range(len(sets)), 2))
-    terms, products, errors = np.empty((len(pairs), 3)), *np.empty((2, len(pairs)))
+    pairs, products, errors = scatter
+    terms = np.empty((len(pairs), 3))
     for at, (m, n) in enumerate(pairs):
-        first, second = maps[m][:2] if m == n else (both[m], both[n])
-        product, errors[at] = _of_pixels(first, second, maps[m][2] & maps[n][2])
-        products[at] = product - bias_variance / (_light(sets[m]) * _light(sets[n]))
         slopes = _slopes(sets[m], width), _slopes(sets[n], width)
         terms[at] = slopes[0] @ slopes[1], 1.0, slopes[0].sum() * slopes[1].sum()
     crossed = [at for at, (m, n) in enumerate(pairs) if _cross(sets, m, n)]
@@ -214,49 +201,8 @@ def _cross(sets: list[FringeEvidence], m: int, n: int) -> bool:
     return bool(area >= CROSSED * np.hypot(*k) * np.hypot(*other))
 
 
-def _two_maps(found: FringeEvidence) -> tuple[F64, F64, Mask]:
-    """Visibility of the pixels in two halves of the frames; where both are known."""
-    one, other = (_visibility(found, half) for half in (0, 1))
-    kept = np.isfinite(one) & np.isfinite(other)
-    return _structure(one, kept), _structure(other, kept), kept
-
-
-def _of_pixels(one: F64, other: F64, kept: Mask) -> tuple[float, float]:
-    """Mean product (and its error) of two maps per pixel, minus the covariance of neighbours."""
-    products = neighbour_products(one, other, kept)
-    white = (products[0] - (4 * products[1] - products[2]) / 3)[kept]
-    return float(white.mean()), float(white.std() / np.sqrt(len(white)))
-
-
 def _slopes(found: FringeEvidence, width: float) -> F64:
     """Change (2,) of the logarithm of the visibility per pixel of width, along each axis."""
     k = np.array(found.k)
     wide, narrow = (np.log(np.abs(transfer(k, width + step))) for step in (_STEP, -_STEP))
     return np.asarray((wide - narrow) / (2 * _STEP))
-
-
-def _light(found: FringeEvidence) -> float:
-    return float(np.median(found.theta[0][found.good]))
-
-
-def _visibility(found: FringeEvidence, half: int) -> F64:
-    """Logarithm of the visibility (y, x) of half the frames, without fringes; outliers are NaN."""
-    good = found.good
-    theta = half_theta(found, half, good)
-    rest = np.full(good.shape, np.nan)
-    rest[good] = np.log(np.maximum(np.hypot(theta[1], theta[2]), 1e-9) / np.maximum(theta[0], 1e-9))
-    rest = without_outliers(rest)
-    used = np.isfinite(rest)
-    rest[used] = without(rest[used][:, None], gauge_terms(found)[:, used].T)[:, 0]
-    return rest
-
-
-def _structure(visibility: F64, kept: Mask) -> F64:
-    """Visibility (y, x) minus means of rows and columns; zero where not kept."""
-    rest = visibility[kept]
-    for index in np.nonzero(kept):
-        count = np.maximum(np.bincount(index), 1)
-        rest = rest - (np.bincount(index, rest) / count)[index]
-    out = np.zeros(kept.shape)
-    out[kept] = rest
-    return out

@@ -1,0 +1,82 @@
+"""How far the visibility of the fringes differs from pixel to pixel, in and between sets."""
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.maps.map_fit import gauge_terms, half_theta, neighbour_products, without
+from pixcal.estimators.maps.structure import without_outliers
+from pixcal.model.arrays import F64, Mask
+
+# pairs of sets, mean products of the logarithms of their visibilities, and the errors of these
+Products = tuple[list[tuple[int, int]], F64, F64]
+
+
+def visibility_products(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Products:
+    """Mean products per pixel, without noise: of each set with itself, then of pairs of sets.
+
+    Structure that neighbours share is removed, and so is the noise of the subtracted bias.
+    """
+    maps = [_two_halves(found) for found in sets]
+    both = [(one + other) / 2 for one, other, _ in maps]
+    pairs = [(m, m) for m in range(len(sets))] + list(combinations(range(len(sets)), 2))
+    products, errors = np.empty((2, len(pairs)))
+    for at, (m, n) in enumerate(pairs):
+        first, second = maps[m][:2] if m == n else (both[m], both[n])
+        product, errors[at] = _of_pixels(first, second, maps[m][2] & maps[n][2])
+        products[at] = product - _bias_variance(evidence) / (
+            mean_light(sets[m]) * mean_light(sets[n])
+        )
+    return pairs, products, errors
+
+
+def mean_light(found: FringeEvidence) -> float:
+    """Mean light of a set's good pixels, e-, to which one charge in all of them is relative."""
+    light = found.theta[0][found.good]
+    # Of the inverse squares, since pixels in little light change most; dead corners do not count.
+    return float(np.mean(np.maximum(light, 0.1 * np.median(light)) ** -2.0) ** -0.5)
+
+
+def _bias_variance(evidence: Evidence) -> float:
+    """Variance of the subtracted bias, e-², which is common to all frames."""
+    counts = [len(s.adu) for s in evidence.of_kind("bias")]
+    return evidence.read_noise**2 / sum(counts) if counts else 0.0
+
+
+def _two_halves(found: FringeEvidence) -> tuple[F64, F64, Mask]:
+    """Visibility of the pixels in two halves of the frames; where both are known."""
+    one, other = (_visibility(found, half) for half in (0, 1))
+    kept = np.isfinite(one) & np.isfinite(other)
+    return _structure(one, kept), _structure(other, kept), kept
+
+
+def _of_pixels(one: F64, other: F64, kept: Mask) -> tuple[float, float]:
+    """Mean product (and its error) of two maps per pixel, minus the covariance of neighbours."""
+    products = neighbour_products(one, other, kept)
+    white = (products[0] - (4 * products[1] - products[2]) / 3)[kept]
+    return float(white.mean()), float(white.std() / np.sqrt(len(white)))
+
+
+def _visibility(found: FringeEvidence, half: int) -> F64:
+    """Logarithm of the visibility (y, x) of half the frames, without fringes; outliers are NaN."""
+    good = found.good
+    theta = half_theta(found, half, good)
+    rest = np.full(good.shape, np.nan)
+    rest[good] = np.log(np.maximum(np.hypot(theta[1], theta[2]), 1e-9) / np.maximum(theta[0], 1e-9))
+    rest = without_outliers(rest)
+    used = np.isfinite(rest)
+    rest[used] = without(rest[used][:, None], gauge_terms(found)[:, used].T)[:, 0]
+    return rest
+
+
+def _structure(visibility: F64, kept: Mask) -> F64:
+    """Visibility (y, x) minus means of rows and columns; zero where not kept."""
+    rest = visibility[kept]
+    for index in np.nonzero(kept):
+        count = np.maximum(np.bincount(index), 1)
+        rest = rest - (np.bincount(index, rest) / count)[index]
+    out = np.zeros(kept.shape)
+    out[kept] = rest
+    return out
