@@ -148,4 +148,6 @@ def test_effects_name_kinds_of_frames_that_there_are() -> None:
 def test_an_unexplained_difference_is_looked_at_more_closely_in_its_domain() -> None:
     assert set(CLOSER_LOOK) == set(DOMAINS)
     assert recommend_closer_look({}, "time") == [CLOSER_LOOK["time"]]
-    assert recommend_closer_look({"dark": "dark frames"}, "time") == ["dark frames"]
+    lacks = {"dark": "dark frames", "ladder": "a ladder"}
+    assert recommend_closer_look(lacks, "time") == [CLOSER_LOOK["time"], "dark frames"]
+    assert recommend_closer_look(lacks, "intensity") == [CLOSER_LOOK["intensity"], "a ladder"]

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from pixcal.effects import effects
 from pixcal.estimators.diagnosis.evidence import SOON_S
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F64, Indices
@@ -243,9 +244,10 @@ def recommend_frames(
 
 
 def recommend_closer_look(missing: Mapping[str, str], domain: str) -> list[str]:
-    """Frames for an unexplained difference: those that are missing, or more in its domain."""
-    frames = recommend_frames(missing)
-    return frames if frames != [MORE] else [CLOSER_LOOK[domain]]
+    """Frames that show more of an unexplained difference, and missing ones of use in its domain."""
+    kinds = [kind for kind in effects().values() if kind.domains[0] == domain]
+    needed = {name for kind in kinds for name in kind.frames_needed}
+    return [CLOSER_LOOK[domain], *(words for name, words in missing.items() if name in needed)]
 
 
 def _axes(baselines: Iterable[Sequence[float]]) -> list[tuple[str, set[float]]]:
