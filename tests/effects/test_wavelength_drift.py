@@ -85,6 +85,15 @@ def test_a_walk_is_found(acquired: Acquired) -> None:
     assert found.significance > 5
 
 
+@pytest.mark.parametrize("ramp", [2e-3, 1e-2])
+def test_the_size_is_that_of_the_change_within_a_set(acquired: Acquired, ramp: float) -> None:
+    evidence = acquired(None, drift(ramp=ramp))
+    size = WavelengthDrift.estimate(evidence).size
+    seconds = np.concatenate([f.time_s - f.time_s.mean() for f in evidence.fringes.values()])
+    expected = ramp * seconds.std() / 3600
+    assert abs(size["value"] - expected) < 4 * size["error"] < 0.3 * expected
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("hop", "rate"), [(3e-4, 250.0), (3e-5, 400.0), (6e-5, 250.0)])
 def test_hops_are_found(acquired: Acquired, hop: float, rate: float) -> None:

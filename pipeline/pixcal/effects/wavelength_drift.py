@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,8 @@ from pixcal.estimators.frame_series.fringe_motion import Hop, Motion, colour_of,
 from pixcal.estimators.frame_series.hopping import Hopping, find_hopping, scatter_of
 from pixcal.kernels import optics
 from pixcal.kernels.scene import FrameStates, geometry
-from pixcal.kernels.significance import SIGNIFICANT
+from pixcal.kernels.significance import SIGNIFICANT, root_with_error
+from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.frame_fit import fit_frames
@@ -91,7 +93,21 @@ class WavelengthDrift(Effect):
             effect, errors = replace(effect, **values), errors | hop_errors
         significance = max(slow.significance, _sharpest(motion))
         refused = SETS_DIFFER if slow.sets_differ > SIGNIFICANT else ""
-        return Estimate(effect, errors, significance, slow.why, refused=refused)
+        size = {} if jumps else _size([colour_of(s) for s in motion.raw])
+        return Estimate(effect, errors, significance, slow.why, refused=refused, size=size)
+
+
+def _size(changes: Sequence[F64]) -> dict[str, Any]:
+    """Rms of the slow changes within sets, whatever their law."""
+    count = np.array([len(c) for c in changes])
+    # From frame to frame there is only noise; less its variance, that of white noise is zero.
+    noise = np.array([np.mean(np.diff(c) ** 2) / 2 for c in changes])
+    slow = np.array([c.var(ddof=1) for c in changes]) - noise
+    errors = count * noise * (noise + 4 * np.maximum(slow, 0.0))
+    error = float(np.sqrt(errors.sum())) / count.sum()
+    rms, rms_error = map(float, root_with_error(count @ slow / count.sum(), error))
+    of = "rms change of the wavelength during a set"
+    return {"value": rms, "error": rms_error, "unit": "", "of": of}
 
 
 def _sharpest(motion: Motion) -> float:
