@@ -17,10 +17,16 @@ GAIN = 0.75
 
 
 def ladder(
-    well_e: float, *, well_spread: float = 0.0, read_e: float = 1.0, bend: float = 0.0
+    well_e: float,
+    *,
+    well_spread: float = 0.0,
+    read_e: float = 1.0,
+    bend: float = 0.0,
+    border: int = 0,
 ) -> tuple[list[ExposureLevel], np.ndarray]:
     rng = np.random.default_rng(3)
     response = 1 + 0.02 * rng.standard_normal(SHAPE)
+    response[:border] = 0
     wells = well_e * (1 + well_spread * rng.standard_normal(SHAPE))
     steps = []
     for exptime in np.arange(1, 11):
@@ -50,6 +56,13 @@ def test_of_pixels_that_are_just_not_full_all_is_kept() -> None:
     lost = [float(np.isnan(step.signal).mean()) for step in kept][::-1]
     assert lost[:6] == [0.0] * 6
     assert lost[7:] == [1.0] * 3
+
+
+def test_pixels_without_light_are_not_full() -> None:
+    steps, _ = ladder(30_500.0, read_e=10.0, border=4)
+    kept, _ = unsaturated(steps, step_levels(steps))
+    below = [step.signal[:4] for step in kept if step.exptime < 7]
+    assert np.isfinite(below).all()
 
 
 @pytest.mark.parametrize(("read", "bend"), [(1.0, 0.0), (60.0, 0.0), (1.0, 0.15)])

@@ -193,7 +193,8 @@ def unsaturated(
     if not full.any():
         return steps, levels
     well = np.mean([step.signal for step, ended in zip(steps, full, strict=True) if ended], axis=0)
-    limit = np.where(np.isfinite(well), (1 - NEARLY) * well, np.inf)
+    # Pixels without light, of a border or an overscan, are never full.
+    limit = np.where(np.isfinite(well) & lit(well), (1 - NEARLY) * well, np.inf)
     left = [
         replace(step, signal=np.where(ended | (step.signal > limit), np.nan, step.signal))
         for step, ended in zip(steps, full, strict=True)
