@@ -139,8 +139,15 @@ def _of_outputs(frames: F64) -> F64:
     return frames + np.kron(levels, np.ones((1, ny, nx)))
 
 
+def _common_to_outputs(frames: F64) -> F64:
+    """Four outputs, read at the same time, share as much noise as each has of its own."""
+    first = np.random.default_rng(2).standard_normal((*frames.shape[:2], frames.shape[2] // 4))
+    shared = np.tile(first, (1, 1, 5))[..., : frames.shape[2]]
+    return frames + shared
+
+
 @pytest.mark.parametrize(
-    "change", [_coupled, _of_a_slow_amplifier, _flicker, _unequal, _of_outputs]
+    "change", [_coupled, _of_a_slow_amplifier, _flicker, _unequal, _of_outputs, _common_to_outputs]
 )
 @pytest.mark.parametrize("shape", [(8, 128, 128), (4, 256, 190), (12, 64, 300)])
 def test_noise_that_is_not_white_is_no_tone(
