@@ -29,16 +29,21 @@ DEAD_S = 1.5  # between frames
 
 
 def recorded(
-    share: float, kept: Callable[[float], float], pause: float = 0.0, stamp: float = 0.0
+    share: float,
+    kept: Callable[[float], float],
+    pause: float = 0.0,
+    stamp: float = 0.0,
+    repeats: int = 0,
 ) -> Evidence:
     """Bias, flats and darks of a camera whose traps hold whole electrons.
 
     ``kept``: part of the held charge that stays after a time, s; ``pause``: before the darks, s;
-    ``stamp``: unit of the time stamps, s.
+    ``stamp``: unit of the time stamps, s; ``repeats``: flats of the first level at the end of them.
     """
     rng = np.random.default_rng(3)
     held, clock, stacks = np.zeros(SHAPE, int), 0.0, []
     series = [("bias", 0.0, 0.0, 8), *(("flat", t, 4000 * t, 6) for t in (0.5, 2.0, 6.0))]
+    series += [("flat", 0.5, 2000.0, repeats)] * bool(repeats)
     for kind, seconds, light, count in [*series, ("dark", 10.0, 0.0, 12)]:
         frames, times = [], []
         if kind == "dark" and pause:
@@ -53,6 +58,11 @@ def recorded(
             clock += seconds + DEAD_S
         time = np.floor(np.array(times) / stamp) * stamp if stamp else np.array(times)
         start, number = time[0], np.arange(count)
+        if repeats and kind == "flat" and len(stacks) == 4:
+            start, frames = stacks[1].start_s, [*stacks[1].adu, *frames]
+            time = np.concatenate([start + stacks[1].time_s, time])
+            number = np.arange(len(frames))
+            del stacks[1]
         stacks.append(Stack(kind, seconds, number, time - start, np.array(frames), start))
     maps = {"bias": np.full(SHAPE, BIAS), "dark_rate": np.zeros(SHAPE), "flat": np.ones(SHAPE)}
     noise, good = (READ_NOISE, READ_NOISE), np.ones(SHAPE, np.bool_)
@@ -94,6 +104,13 @@ def test_traps_are_found_again_by_frames_or_by_time(
     assert float(share) == pytest.approx(100 * found.share, rel=0.01)
     assert float(decays) == pytest.approx(found.decay, rel=0.05)
     assert unit == ("s" if in_seconds else "frames")
+
+
+def test_flats_of_the_first_level_may_be_repeated_at_the_end() -> None:
+    found = persistence(recorded(0.01, lambda t: float(np.exp(-t / 50)), repeats=4))
+    assert found is not None
+    assert abs(found.share - 0.01) < 4 * found.share_error < 1e-3
+    assert abs(found.decay - 50) < 4 * found.decay_error < 20
 
 
 class Samples:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -43,6 +44,7 @@ class _Sequence:
     charge: F64  # (t,) mean that light and dark signal give, e-
     period: F64  # (t,) from the start of the frame until it is read, s
     pause: F64  # (t,) from then until the next frame starts, s
+    series: Indices  # (t,) number of each one's series
     places: tuple[tuple[Stack, Indices, F64], ...]  # measured frames of each series, and means, e-
 
     def released(self, decay: float, in_seconds: bool) -> F64:
@@ -58,12 +60,11 @@ class _Sequence:
     def of_light(self, lag: Persistence) -> "_Sequence":
         """Without what the frames lose and gain; the light of a series is steady."""
         released = self.released(lag.decay, lag.in_seconds)
-        charge = self.charge.copy()
-        ends = [*(int(at[0]) for _, at, _ in self.places[1:]), len(charge)]
-        for (_, at, means), end in zip(self.places, ends, strict=True):
-            light = float((means - lag.share * released[at]).mean()) / (1 - lag.share)
-            charge[at[0] : end] = max(light, 0.0)
-        return replace(self, charge=charge)
+        light = [
+            float((means - lag.share * released[at]).mean()) / (1 - lag.share)
+            for _, at, means in self.places
+        ]
+        return replace(self, charge=np.maximum(light, 0.0)[self.series])
 
 
 def persistence(evidence: Evidence) -> Persistence | None:
@@ -108,8 +109,7 @@ def released_late(levels: Levels, least: float) -> tuple[Persistence, list[F64]]
     if best.share <= _SURE * best.share_error:
         return None
     late = best.share * sequence.of_light(best).released(best.decay, best.in_seconds)
-    places = {id(stack): at for stack, at, _ in sequence.places}
-    return best, [late[places[id(stack)]] for stack, _ in levels]
+    return best, [late[at] for _, at, _ in sequence.places]
 
 
 def told_from_drift(levels: Levels, late: Sequence[F64], least: float) -> bool:
@@ -177,33 +177,34 @@ Series = Sequence[tuple[Indices, F64, float]]
 def _sequence(levels: Levels) -> _Sequence | None:
     """Frames in order of time, those of the other half at the level of their series.
 
-    None where time stamps are unknown, or series alternate.
+    Others may interrupt a series, as if the first level of flats is repeated at the end. None where
+    time stamps are unknown.
     """
-    levels = sorted(levels, key=lambda one: (one[0].start_s + one[0].time_s[0], one[0].frame[-1]))
-    stacks = [stack for stack, _ in levels]
-    begin = [float(s.start_s + s.time_s[0]) for s in stacks]
-    end = [float(s.start_s + s.time_s[-1]) for s in stacks]
-    if not stacks or not np.isfinite([*begin, *end]).all():
+    times = [stack.start_s + stack.time_s for stack, _ in levels]
+    if not times or not np.isfinite(np.concatenate(times)).all():
         return None
-    if any(last > first for last, first in zip(end, begin[1:], strict=False)):
-        return None
-    charge: list[float] = []
-    period: list[float] = []
-    pause: list[float] = []
-    places = []
-    for (stack, means), first, last, following in zip(
-        levels, begin, end, [*begin[1:], 0], strict=True
-    ):
-        number = stack.frame - stack.frame[0]
-        # Time stamps may be whole seconds: the period is that of the whole series.
-        span = (last - first) / number[-1] if number[-1] else stack.exptime_s
+    # Of frames of one time stamp, those of the series that began first.
+    every = sorted((t, own[0], n, i) for n, own in enumerate(times) for i, t in enumerate(own))
+    runs = [(n, [i for *_, i in own]) for n, own in groupby(every, key=lambda one: one[2])]
+    follows = [*(float(times[n][at[0]]) for n, at in runs[1:]), 0.0]
+    at = [np.zeros(len(own), int) for own in times]
+    charge, period, pause, series = np.zeros((4, 0))
+    for (n, own), following in zip(runs, follows, strict=True):
+        stack, means = levels[n]
+        number = stack.frame[own] - stack.frame[own[0]]
+        first = float(times[n][own[0]])
+        # Time stamps may be whole seconds: the period is that of the whole run.
+        span = (times[n][own[-1]] - first) / number[-1] if number[-1] else stack.exptime_s
         span = float(span) if np.isfinite(span) and span > 0 else _SHORTEST
-        count = int(max(stack.last, stack.frame[-1]) - stack.frame[0]) + 1
-        places.append((stack, len(charge) + number, means))
-        charge += [max(float(means.mean()), 0.0)] * count
-        period += [span] * count
-        pause += [0.0] * (count - 1) + [max(following - first - count * span, 0.0)]
-    return _Sequence(np.array(charge), np.array(period), np.array(pause), tuple(places))
+        ends = own[-1] == len(times[n]) - 1
+        count = int(max(number[-1], (stack.last - stack.frame[own[0]]) * ends)) + 1
+        at[n][own] = len(charge) + number
+        charge = np.append(charge, [max(float(means.mean()), 0.0)] * count)
+        period = np.append(period, [span] * count)
+        series = np.append(series, [n] * count)
+        pause = np.append(pause, [0.0] * (count - 1) + [max(following - first - count * span, 0.0)])
+    places = tuple((s, own, means) for (s, means), own in zip(levels, at, strict=True))
+    return _Sequence(charge, period, pause, series.astype(int), places)
 
 
 def _fit(
