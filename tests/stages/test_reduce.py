@@ -462,6 +462,18 @@ def test_an_overscan_is_named(tmp_path: Path) -> None:
     assert said[0].startswith("columns 0 to 4 see no light")
 
 
+def test_a_border_of_quiet_reference_pixels_does_not_count_in_the_read_noise(
+    tmp_path: Path,
+) -> None:
+    camera = Camera(1, SMALL)
+    border = np.ones(SMALL, np.bool_)
+    border[4:-4, 4:-4] = False
+    camera.response[border], camera.dark[border], camera.read[border] = 0, 0, 0.5 * READ
+    kinds = {"bias": (camera.take(40, 0), [0.0] * 40), "flat": (camera.take(4, 1, 3e4), [1.0] * 4)}
+    noise = small(tmp_path, kinds)["read_noise_e"]
+    assert noise["measured"] / GAIN == pytest.approx(READ / GAIN, abs=3 * noise["error"] / GAIN)
+
+
 def test_detector_frames_alone_are_enough(tmp_path: Path) -> None:
     camera = Camera(1, SMALL)
     found = small(

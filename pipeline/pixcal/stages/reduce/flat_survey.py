@@ -28,6 +28,7 @@ MIN_SAMPLES = 50
 _WRAPS = 1024  # least distance (ADU) of wrapped samples below those that are possible
 MIN_CHANGES = 3  # fewest frame-to-frame changes to measure a lamp's flicker
 NEIGHBOURS = 16  # codes below the highest that are compared with it
+_CLEAR = 5.0  # least level, in noises of a sample, that tells a pixel without light by one flat
 _LIT = 1.0  # level of a flat, over the noise of a sample without light, from which it is lit
 MIN_DARKS = 5  # fewest steps between levels of darks to separate groups
 # least step between two groups, over the median step and over the noise of a sample
@@ -56,6 +57,15 @@ class FlatSurvey:
         """
         found = np.abs(self.levels) > _LIT * self.noise
         return found if found.any() else np.ones(len(found), np.bool_)
+
+    def brightest(self, share: float) -> tuple[int, float] | None:
+        """Number of the brightest flat, and a ``share`` of its level (ADU above bias).
+
+        None if that share is within the noise of one sample, or the noise is unknown.
+        """
+        frame = int(self.levels.argmax())
+        least = share * float(self.levels[frame])
+        return (frame, least) if self.noise and least > _CLEAR * self.noise else None
 
     def of_frames(self, numbers: Sequence[int]) -> "FlatSurvey":
         """The survey of some of the flats."""

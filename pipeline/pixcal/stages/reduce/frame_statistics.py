@@ -70,6 +70,8 @@ class Measuring:
     flat: Sequence[Group]
     read_series: Group | None  # the one of ``dark`` whose noise is the read noise
     flats_timed: bool  # whether the exposure times of the flats are known
+    # number of a bright flat, and the level (ADU above bias) below which its pixels see no light
+    bright: tuple[int, float] | None
     # saturation, full: level (ADU) from which samples are saturated: in flats, and in any frames
     saturation: float
     full: float
@@ -116,7 +118,8 @@ class _Column:
     pairs: F64
     levels: F64
     noise: F64  # typical variance of a sample in this column (ADU²)
-    loud: Mask  # pixels noisy without light, which photon transfer leaves out
+    # pixels that photon transfer and read noise leave out: noisy without light, or unlit in flats
+    loud: Mask
     full: Mask  # pixels with saturated samples in flats
     line_noise: LineNoise = field(default_factory=LineNoise)
     line: DarkLine | None = None
@@ -288,6 +291,8 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
             levels = combination.update(frames)
             if not lamp and number == 0:
                 column.loud |= _loud(job, frames - levels[:, None, None])
+            if group == job.read_series and number == 0:
+                column.loud |= _unlit(job, column.index, frames[0])
             if lamp or group == job.read_series:
                 frames[:, column.loud] = np.nan
                 # The pairs are frames 0 and 1, 2 and 3, and so on.
@@ -319,6 +324,18 @@ def _loud(job: Measuring, frames: F32) -> Mask:
     factor = noisy_factor(job.options.noisy_factor, variance, len(frames) - 1, job.quantum)
     nearby = variance_nearby(variance, dof, usual)
     return noisy(variance, dof, nearby, unknown, 0 * dof, factor)
+
+
+def _unlit(job: Measuring, index: Index, dark: F32) -> Mask:
+    """Pixels that a bright flat leaves as ``dark`` (y, x): overscan, reference pixels, dead ones.
+
+    The noise of such pixels is not that of the others.
+    """
+    if job.bright is None:
+        return np.zeros(dark.shape, np.bool_)
+    frame, least = job.bright
+    flat = job.frames["flat"].read((frame, frame + 1), *tiles.extent(job.shape, index))[0]
+    return np.asarray(flat.astype(np.float32) - dark < least)
 
 
 def _usable(job: Measuring, samples: NDArray[Any], lamp: bool) -> F32:

@@ -20,7 +20,7 @@ from pixcal.model.errors import InputError
 from pixcal.model.flags import PixelFlag
 from pixcal.model.options import Reduce
 from pixcal.stages.reduce.black_cut_off import cut_off_warnings
-from pixcal.stages.reduce.calibration import Finishing, calibration_writers, finish
+from pixcal.stages.reduce.calibration import FLAT_FLOOR, Finishing, calibration_writers, finish
 from pixcal.stages.reduce.columns import run_noted, strip_width
 from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
 from pixcal.stages.reduce.detector_warnings import detector_warnings, lamp_warnings
@@ -176,6 +176,7 @@ def _measuring(source: Ingested, config: Config, folder: Place) -> Measuring:
         flat=exposures.flat,
         read_series=exposures.read_series,
         flats_timed=exposures.known,
+        bright=None if source.survey is None else source.survey.brightest(FLAT_FLOOR),
         saturation=source.saturation("flat") if exposures.flat else math.inf,
         full=min(map(source.saturation, source.tables)),
         quantum=source.quantum,
