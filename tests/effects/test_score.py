@@ -2,14 +2,16 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from dark_frames import in_the_dark
 
+from pixcal.effects.bias_drift import BiasDrift
 from pixcal.engine.run import Runtime
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
@@ -124,6 +126,40 @@ def test_light_of_any_order_is_added_to_that_of_the_fit(
     of = next(iter(acquired().fringes))
     more = replica.simulated_samples(of, [Haze()]) - replica.simulated_samples(of)
     assert np.median(more) * acquired().gain == pytest.approx(1000, rel=0.02)
+
+
+@pytest.mark.parametrize("rms", [0.0, 3.0])
+def test_a_level_that_varies_is_no_noise_of_parts_of_frames(
+    rms: float, acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench]
+) -> None:
+    """The level of each frame without light is free, as the light of fringes is."""
+    kind = effect_of_file(OWN / "group_noise.py")
+    on = BiasDrift(20.0, 0.0, 0.0, 0.0), kind(rms=rms)  # type: ignore[call-arg]
+    found = kind.estimate(in_the_dark(acquired(), make_effect_bench(), *on))
+    assert found is not None
+    assert (found.significance > 5) == (rms > 0)
+    size = found.effect.rms  # type: ignore[attr-defined]
+    assert size < 1 if rms == 0 else abs(size - rms) < 4 * found.errors["rms"] < 0.4
+
+
+def test_the_level_of_frames_shows_an_effect_of_whole_frames(
+    acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench]
+) -> None:
+    @dataclass(frozen=True)
+    class Pedestal(Effect):
+        name, title, acts_at = "pedestal", "level of its own", Stage.READOUT
+        domains, strengths, sources = ("noise",), ("rms",), ()
+        rms: float = 1.0
+
+        def readout(self, adu, shot):  # type: ignore[no-untyped-def]
+            return adu + np.float32(self.rms * shot.rng(self.name).standard_normal())
+
+    evidence = in_the_dark(acquired(), make_effect_bench(), Pedestal(2.0))
+    found = Pedestal.estimate(evidence)
+    assert found is not None
+    assert found.significance > 5
+    assert isinstance(found.effect, Pedestal)
+    assert abs(found.effect.rms - 2) < 4 * found.errors["rms"] < 1
 
 
 def test_pairs_of_independent_samples_have_the_variance_that_is_said() -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.simulation.deviations import (
+    LINEAR,
     Change,
     Deviation,
     SetDeviations,
@@ -33,7 +34,9 @@ SCATTER_SEEDS = range(3, 11)  # seeds of the draws that measure the scatter of a
 FRAMES = 4  # calibration frames of an exposure time that are used
 MIXED = 64  # frames of a recording that test how a model changes the noise
 COMMON = 0.5  # least share common to two draws of a change that is not random
-LINEAR = ("residual", "frames", "maps")
+MOMENTS = {"pairs": "residual", "power": "frames"}  # quadratic deviations, and of what they are
+# share of a change of frames without light that is no level, up to which it is of whole frames
+EVEN = 0.1
 
 
 @dataclass(frozen=True)
@@ -126,21 +129,34 @@ class Changes:
 
     def response(self, model: ForwardModel) -> Response:
         """How a model shows."""
-        every = [(of, name) for of, look in self._looks.items() for name in look.linear]
+        every = [(of, name) for of in self._looks for name in LINEAR]
         draws = [self._linear(model, seed, every) for seed in SEEDS]
-        sound = [
-            k for k in every if k[1] != "maps" or is_smooth(draws[0][k], self.measured(k).weight)
-        ]
-        draws = [{k: v for k, v in draw.items() if k in sound} for draw in draws]
+        keys = [key for key in every if self._is_sound(key, draws[0])]
+        draws = [{k: v for k, v in draw.items() if k in keys} for draw in draws]
         random = not self._repeats(*draws)
-        keys = sound
         if random:
-            keys = [(of, name) for of, look in self._looks.items() for name in look.quadratic]
+            keys = [
+                (n, name) for n in self._looks for name, of in MOMENTS.items() if (n, of) in keys
+            ]
         pairs = [(of, "pairs") for of in self._looks]
         mixes = model.acts_at >= Stage.CHARGE and self._repeats(
             *(self._mixed(model, seed, pairs) for seed in SEEDS)
         )
         return Response(random, mixes, tuple(dict.fromkeys([*keys, *(pairs if mixes else ())])))
+
+    def _is_sound(self, key: Key, draw: Draw) -> bool:
+        """Whether a change of a deviation is no common change of another origin.
+
+        Offsets scatter from pixel to pixel in maps. Levels of frames without light drift; they
+        count for a model of whole frames alone.
+        """
+        of, name = key
+        if name == "maps":
+            return is_smooth(draw[key], self.measured(key).weight)
+        if name != "frames" or of in self._evidence.fringes:
+            return True
+        uneven, level = (float((draw[of, n] ** 2).mean()) for n in ("residual", "frames"))
+        return uneven < EVEN * level
 
     def _repeats(self, one: Draw, other: Draw) -> bool:
         """Whether most of a change is common to two draws."""
@@ -209,7 +225,7 @@ class Changes:
 
     def _second_moments(self, model: ForwardModel, seed: int, keys: Sequence[Key]) -> Draw:
         """Contribution of a random change to quadratic deviations."""
-        needed = [(of, "residual" if name == "pairs" else "frames") for of, name in keys]
+        needed = [(of, MOMENTS[name]) for of, name in keys]
         change = self._linear(model, seed, needed)
         return {
             (of, name): self._looks[of].second_moments(name, change[of, source])

@@ -1,9 +1,9 @@
 """Deviations of frames from the nominal bench, and how they change with the samples.
 
-For a fringe set: residuals, parameters of the frames, maps of the pixels, and second moments of the
-first two. For calibration frames: change in time, mean, second moments. All are zero on the nominal
-bench, except for known noise and the scatter of pixels. A change of the samples changes the first
-three linearly, less the part that the fit absorbs.
+Residuals, parameters of the frames, maps of the pixels, and second moments of the first two. The
+parameter of a frame without light is its level, as free as the light of fringes. All are zero on
+the nominal bench, except for known noise and the scatter of pixels. A change of the samples changes
+the first three linearly, less the part that the fit absorbs.
 """
 
 from collections.abc import Sequence
@@ -32,8 +32,10 @@ AROUND = 5  # side (pixels) of a pixel's surroundings
 ALONE = 0.5
 OUTLIER_SIGMA = 8.0  # standard deviations above which a residual is an outlier
 HARMONICS = 2  # harmonics of the phase on which fitted frame parameters may depend
+TINY = 1e-30  # weight that counts as none
 KNOWN = 0.02  # relative error of the modelled variance of a frame's parameters
 
+LINEAR = ("residual", "frames", "maps")
 Change = dict[str, NDArray[Any]]
 # offsets (rows, columns) to neighbours in other rows and columns
 DIAGONAL = ((1, 1), (1, -1), (1, 2), (1, -2), (2, 1), (2, -1))
@@ -97,8 +99,6 @@ def without_smooth(maps: F64) -> F64:
 class _Deviations:
     """Common part of fringes and calibration frames."""
 
-    linear: tuple[str, ...]
-    quadratic: tuple[str, ...]
     good: Mask
 
     def measured(self, name: str) -> Deviation:
@@ -107,6 +107,9 @@ class _Deviations:
         return found
 
     residual: Any
+    _parameters: Any  # (s, t) of the frames
+    _frame_noise: Any  # (s, t) theirs, from the noise of the samples
+    _lost = 0.0  # share of their modes that a fit removed
 
     @cached_property
     def _root(self) -> F32:
@@ -135,22 +138,36 @@ class _Deviations:
         )
         return np.asarray((after - before) * len(self._root) / len(noise))
 
+    @cached_property
+    def frames(self) -> Deviation:
+        """Parameters (s, t) of the frames; noise from samples or, if larger, from steps."""
+        steps = np.diff(self._parameters, axis=1)
+        spread = (SIGMA_OF_MAD * np.median(np.abs(steps), axis=1, keepdims=True)) ** 2 / 2
+        return Deviation(self._parameters, _inverse(np.maximum(spread, self._frame_noise**2)))
+
+    @cached_property
+    def power(self) -> Deviation:
+        """Power (s, band) of the frames' parameters, divided by the power of their noise."""
+        power = band_power(self._parameters / self._frame_noise)
+        modes = band_power(np.ones(self._parameters.shape), squares=False) * (1 - self._lost)
+        return Deviation(power - modes, _inverse(2 * modes + (KNOWN * modes) ** 2))
+
     def second_moments(self, name: str, change: NDArray[Any]) -> F64:
-        """Contribution of a random change of the residuals to ``pairs``."""
+        """Contribution of a random change: of residuals to ``pairs``, of frames to ``power``."""
+        if name == "power":
+            return band_power(change / self._frame_noise)
         return pair_sums(self.over_noise(change), self.good)
 
 
 class SetDeviations(_Deviations):
     """Deviations of a fringe set from the nominal bench."""
 
-    linear = ("residual", "frames", "maps")
-    quadratic = ("pairs", "power")
-
     def __init__(self, evidence: Evidence, found: FringeEvidence) -> None:
         self.found, self._evidence, self.good = found, evidence, found.good
         turns = np.arange(1, HARMONICS + 1)[:, None] * found.phi
         terms = np.concatenate([np.ones((1, len(found.phi))), np.cos(turns), np.sin(turns)])
         self._of_phase = np.linalg.svd(terms, full_matrices=False)[2]
+        self._lost = len(self._of_phase) / len(found.phi)
 
     @cached_property
     def freedom(self) -> Freedom:
@@ -167,14 +184,6 @@ class SetDeviations(_Deviations):
         return Deviation(rest, weight)
 
     @cached_property
-    def frames(self) -> Deviation:
-        """Parameters (4, t) of the frames; noise from samples or, if larger, from steps."""
-        series = self._series(self.found.free)
-        steps = np.diff(series, axis=1)
-        spread = (SIGMA_OF_MAD * np.median(np.abs(steps), axis=1, keepdims=True)) ** 2 / 2
-        return Deviation(series, _inverse(np.maximum(spread, self._frame_noise**2)))
-
-    @cached_property
     def maps(self) -> Deviation:
         """Maps (3, y, x) of the pixels, of `MAPS`."""
         maps = FringeSetData(self.found, self._evidence).maps
@@ -188,13 +197,8 @@ class SetDeviations(_Deviations):
         return self._pairs(place, freedom.frame_covariance.mean(axis=0), freedom.of_time)
 
     @cached_property
-    def power(self) -> Deviation:
-        """Power (4, band) of the frame parameters, divided by the power of their noise."""
-        series = self._series(self.found.free)
-        power = band_power(series / self._frame_noise)
-        modes = band_power(np.ones(series.shape), squares=False)
-        modes *= 1 - len(self._of_phase) / series.shape[1]
-        return Deviation(power - modes, _inverse(2 * modes + (KNOWN * modes) ** 2))
+    def _parameters(self) -> F64:
+        return self._series(self.found.free)
 
     @cached_property
     def _frame_noise(self) -> F64:
@@ -225,7 +229,7 @@ class SetDeviations(_Deviations):
         return np.asarray(series - (series @ self._of_phase.T) @ self._of_phase)
 
     def change(
-        self, samples: F32, constant: F64, relative: F64, names: Sequence[str] = linear
+        self, samples: F32, constant: F64, relative: F64, names: Sequence[str] = LINEAR
     ) -> Change:
         """Change of the linear deviations by a change of the samples.
 
@@ -262,31 +266,43 @@ class SetDeviations(_Deviations):
         out[:, good] = [of_map[name] for name in MAPS]
         return change_of_maps(out, self.maps)
 
-    def second_moments(self, name: str, change: NDArray[Any]) -> F64:
-        """Contribution of a random change: of residuals to ``pairs``, of frames to ``power``."""
-        if name == "power":
-            return band_power(change / self._frame_noise)
-        return super().second_moments(name, change)
-
 
 class StackDeviations(_Deviations):
     """Deviations of calibration frames of one kind and exposure time."""
-
-    linear = ("residual", "maps")
-    quadratic = ("pairs",)
 
     def __init__(self, evidence: Evidence, stack: Stack) -> None:
         self._evidence, self._stack, self.good = evidence, stack, evidence.good
 
     @cached_property
     def residual(self) -> Deviation:
-        """Samples (t, n) of good pixels less their mean over time, ADU."""
+        """Samples (t, n) of good pixels less their mean over time and the frame's level, ADU."""
+        return self._split[0]
+
+    @cached_property
+    def _parameters(self) -> F64:
+        return self._split[1]
+
+    @cached_property
+    def _split(self) -> tuple[Deviation, F64]:
+        """Residuals, and levels (1, t) of the frames."""
         e, adu = self._evidence, self._stack.adu[:, self.good]
         dark = e.dark_charge_rate[self.good] * np.nan_to_num(self._stack.exptime_s)
-        variance = (e.read_noise**2 + dark) / e.gain**2 * max(1 - 1 / len(adu), 0.5)
+        variance = (e.read_noise**2 + dark) / e.gain**2 * self._left
         rest = adu - adu.mean(axis=0)
-        weight = np.where(rest**2 < OUTLIER_SIGMA**2 * variance, 1 / variance, 0)
-        return Deviation(rest, weight.astype(np.float32))
+        calm = (rest - np.median(rest, axis=1, keepdims=True)) ** 2 < OUTLIER_SIGMA**2 * variance
+        weight = np.where(calm, 1 / variance, 0).astype(np.float32)
+        level = np.einsum("tn,tn->t", weight, rest) / np.maximum(weight.sum(axis=1), TINY)
+        return Deviation(rest - level[:, None], weight), level[None].astype(float)
+
+    @property
+    def _left(self) -> float:
+        """Share of the variance that the means over time leave."""
+        return max(1 - 1 / len(self._stack.adu), 0.5)
+
+    @cached_property
+    def _frame_noise(self) -> F64:
+        weight = self.residual.weight.sum(axis=1, dtype=float)[None]
+        return np.asarray(np.maximum(weight * self._left, TINY) ** -0.5)
 
     @cached_property
     def maps(self) -> Deviation:
@@ -301,19 +317,23 @@ class StackDeviations(_Deviations):
         """Products of residuals (`pair_sums`)."""
         count = len(self._stack.adu)
         same = np.full((1, count), count**-0.5, np.float32)
-        nowhere = np.zeros((1, np.count_nonzero(self.good)), np.float32)
-        return self._pairs(nowhere, np.zeros((1, 1)), same)
+        of_level = (self._frame_noise**2).mean()[None, None] * self._left
+        return self._pairs(self._root.mean(axis=0)[None], of_level, same)
 
     def pairs_between(self, noise: F32, other: F32, per_adu: F32) -> F64:
         """As in `SetDeviations`, in ADU."""
         return super().pairs_between(noise, other, np.ones_like(per_adu))
 
-    def change(self, samples: F32, bias: F64, names: Sequence[str] = linear) -> Change:
+    def change(self, samples: F32, bias: F64, names: Sequence[str] = LINEAR) -> Change:
         """As in `SetDeviations`, in ADU; ``bias``: its simultaneous change."""
         changed = samples[:, self.good]
         change: Change = {}
+        rest = changed - changed.mean(axis=0)
+        level = rest.mean(axis=1, keepdims=True)
         if "residual" in names:
-            change["residual"] = changed - changed.mean(axis=0)
+            change["residual"] = rest - level
+        if "frames" in names:
+            change["frames"] = level.T.astype(float)
         if "maps" in names:
             mean = np.full((1, *self.good.shape), np.nan)
             mean[0, self.good] = changed.mean(axis=0) - bias[self.good]

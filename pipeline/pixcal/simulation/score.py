@@ -22,7 +22,8 @@ from pixcal.estimators.frame_series.variance_components import log_chance, log_c
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.significance import root_with_error
 from pixcal.model.arrays import F64
-from pixcal.simulation.changes import LINEAR, Changes, Key, Response, Template
+from pixcal.simulation.changes import Changes, Key, Response, Template
+from pixcal.simulation.deviations import LINEAR
 from pixcal.simulation.forward import ForwardModel, field_of, numbers, with_numbers
 
 STEP = 1.1  # factor on a parameter for its derivative
