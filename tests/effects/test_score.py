@@ -12,6 +12,7 @@ import yaml
 from dark_frames import in_the_dark
 
 from pixcal.effects.bias_drift import BiasDrift
+from pixcal.effects.row_noise import RowNoise
 from pixcal.engine.run import Runtime
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
@@ -20,6 +21,7 @@ from pixcal.simulation.deviations import common_precision, pair_sums, pair_varia
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.own_effect import effect_of_file
 from pixcal.simulation.replica import Replica
+from pixcal.simulation.score import score
 from pixcal.stages import diagnose, fit, ingest, reduce, simulate
 from pixcal.stages.diagnose.trial import estimate
 from pixcal.stages.evidence import load_evidence
@@ -160,6 +162,19 @@ def test_the_level_of_frames_shows_an_effect_of_whole_frames(
     assert found.significance > 5
     assert isinstance(found.effect, Pedestal)
     assert abs(found.effect.rms - 2) < 4 * found.errors["rms"] < 1
+
+
+def test_each_strength_is_as_well_known_as_its_draws_are_many(
+    acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench]
+) -> None:
+    """Rows are drawn anew each; noise of every second row once for a frame."""
+    truth = {"row_rms": 8.0, "interlace_rms": 5.0}
+    on = RowNoise(**dict.fromkeys(RowNoise.strengths, 0.0) | truth)
+    found = score(RowNoise, in_the_dark(acquired(), make_effect_bench(), on))
+    assert found is not None
+    for name, low, high in (("row_rms", 0.03, 0.3), ("interlace_rms", 0.2, 0.8)):
+        assert low < found.errors[name] < high
+        assert abs(getattr(found.model, name) - truth[name]) < 4 * found.errors[name]
 
 
 def test_pairs_of_independent_samples_have_the_variance_that_is_said() -> None:

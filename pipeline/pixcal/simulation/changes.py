@@ -5,7 +5,7 @@ everything random are made. Their mean estimates the change; half their differen
 that the contribution of chance can be subtracted from sums of squares.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -176,14 +176,10 @@ class Changes:
             other = {**other, **{k: other.get(k, 0) + v for k, v in b.items()}}
         return Template.of(one, other)
 
-    def scatter(self, model: ForwardModel, response: Response, template: Template) -> float:
-        """Relative rms scatter of the second moments that single draws of a random model add."""
-        total = {k: self.measured(k).weight * template.mean[k] for k in response.keys}
-        sizes = []
+    def draws(self, model: ForwardModel, response: Response) -> Iterator[Draw]:
+        """Second moments that single draws of a random model add."""
         for seed in SCATTER_SEEDS:
-            drawn = self._second_moments(model, seed, response.keys)
-            sizes.append(sum(float((total[k] * drawn[k]).sum()) for k in response.keys))
-        return float(np.std(sizes, ddof=1)) / max(float(np.mean(sizes)), 1e-300)
+            yield self._second_moments(model, seed, response.keys)
 
     def _simulated(self, of: str | int) -> F32:
         if of not in self._plain:

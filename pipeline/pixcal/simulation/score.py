@@ -154,13 +154,28 @@ class _Fit:
             model, errors = self._fitted(model, errors)
         if self.response.random:
             # An acquisition holds a single draw, whose scatter dominates at high significance.
-            scatter = self.changes.scatter(model, self.response, self.template(model)) / 2
-            for name in set(errors) & set(self.strengths):
-                errors[name] = float(np.hypot(errors[name], scatter * abs(numbers(model)[name])))
+            for name, scatter in self._scatter(model).items():
+                errors[name] = float(np.hypot(errors[name], scatter))
         why = RANDOM if self.response.random else STEADY
         keys, template = self.telling(shape)
         telling = dataclasses.replace(self.response, keys=keys)
         return Scored(model, errors, significance, why, telling, template)
+
+    def _scatter(self, model: ForwardModel) -> dict[str, float]:
+        """Scatter of the strengths of a random model over single draws."""
+        values = {n: v for n, v in numbers(model).items() if n in self.strengths and v}
+        if not values:
+            return {}
+        null, product = model.scaled(0.0), self.changes.product
+        alone = [self.template(with_numbers(null, {n: v})) for n, v in values.items()]
+        inverse = inverse_normal(self.sums(alone)[1], SINGULAR)
+        sizes = [
+            inverse @ [product(self.response.keys, one.mean, drawn) for one in alone]
+            for drawn in self.changes.draws(model, self.response)
+        ]
+        # Half of that of their squares, relatively.
+        scatter = np.std(sizes, axis=0, ddof=1) / 2
+        return {n: abs(v) * float(s) for (n, v), s in zip(values.items(), scatter, strict=True)}
 
     def _best_shape(self, start: ForwardModel) -> tuple[ForwardModel, tuple[F64, F64, float], int]:
         """Best other parameters than strengths, one by one on a grid; and the number of trials."""
