@@ -93,6 +93,7 @@ def test_pixels_differ_by_the_spread(make_effect_bench: Callable[..., Bench]) ->
         Lag(0.05, later=(0.5, 0.3, 0.2), carried=1.0),
         Lag(0.05, 0.8, 0.2, capacity_e=300.0, carried=1.0),
         Lag(0.05, carried=1.0, decay_s=2.0),
+        Lag(0.05, carried=1.0, decay_s=2.0, slow_part=0.4, slow_s=9.0),
     ],
 )
 def test_frames_depend_neither_on_their_order_nor_on_where_one_begins(

@@ -34,26 +34,32 @@ def recorded(
     pause: float = 0.0,
     stamp: float = 0.0,
     repeats: int = 0,
+    slow: tuple[float, Callable[[float], float]] | None = None,
 ) -> Evidence:
     """Bias, flats and darks of a camera whose traps hold whole electrons.
 
     ``kept``: part of the held charge that stays after a time, s; ``pause``: before the darks, s;
-    ``stamp``: unit of the time stamps, s; ``repeats``: flats of the first level at the end of them.
+    ``stamp``: unit of the time stamps, s; ``repeats``: flats of the first level at the end of them;
+    ``slow``: share and kept part of a second kind of traps.
     """
     rng = np.random.default_rng(3)
-    held, clock, stacks = np.zeros(SHAPE, int), 0.0, []
+    kinds = [(share, kept), *([slow] if slow else [])]
+    held, clock, stacks = [np.zeros(SHAPE, int) for _ in kinds], 0.0, []
     series = [("bias", 0.0, 0.0, 8), *(("flat", t, 4000 * t, 6) for t in (0.5, 2.0, 6.0))]
     series += [("flat", 0.5, 2000.0, repeats)] * bool(repeats)
     for kind, seconds, light, count in [*series, ("dark", 10.0, 0.0, 12)]:
         frames, times = [], []
         if kind == "dark" and pause:
-            held, clock = rng.binomial(held, kept(pause)), clock + pause
+            held = [rng.binomial(n, of(pause)) for n, (_, of) in zip(held, kinds, strict=True)]
+            clock += pause
         for _ in range(count):
-            charge = rng.poisson(light, SHAPE)
-            released = rng.binomial(held, 1 - kept(seconds + DEAD_S))
-            taken = rng.binomial(charge, share)
-            held += taken - released
-            frames.append(BIAS + charge - taken + released + rng.normal(0, READ_NOISE, SHAPE))
+            charge = signal = rng.poisson(light, SHAPE)
+            for own, (part, of) in zip(held, kinds, strict=True):
+                released = rng.binomial(own, 1 - of(seconds + DEAD_S))
+                taken = rng.binomial(charge, part)
+                own += taken - released
+                signal = signal - taken + released
+            frames.append(BIAS + signal + rng.normal(0, READ_NOISE, SHAPE))
             times.append(clock)
             clock += seconds + DEAD_S
         time = np.floor(np.array(times) / stamp) * stamp if stamp else np.array(times)
@@ -89,6 +95,7 @@ def test_traps_are_found_again_by_frames_or_by_time(
     found = persistence(evidence)
     assert found is not None
     assert found.in_seconds == in_seconds
+    assert found.slow_part == 0
     assert abs(found.share - 0.01) < 4 * found.share_error < 1e-3
     assert abs(found.decay - decay) < 4 * found.decay_error < 0.4 * decay
     estimate = Lag.estimate(evidence)
@@ -111,6 +118,26 @@ def test_flats_of_the_first_level_may_be_repeated_at_the_end() -> None:
     assert found is not None
     assert abs(found.share - 0.01) < 4 * found.share_error < 1e-3
     assert abs(found.decay - 50) < 4 * found.decay_error < 20
+
+
+def test_traps_of_two_kinds_are_found_again() -> None:
+    fast, slow = (lambda t, decay=decay: float(np.exp(-t / decay)) for decay in (8.0, 80.0))
+    evidence = recorded(0.03, fast, slow=(0.02, slow))
+    found = persistence(evidence)
+    assert found is not None
+    assert abs(found.share - 0.05) < 4 * found.share_error < 0.01
+    assert abs(found.slow_part - 0.4) < 4 * found.slow_part_error < 0.1
+    assert abs(found.decay - 8) < 4 * found.decay_error < 2
+    assert abs(found.slow - 80) < 4 * found.slow_error < 30
+    estimate = Lag.estimate(evidence)
+    assert estimate is not None
+    assert re.search(r"decays over 8\S* s and, 4\S* % of it, [78]\S* s$", estimate.size["of"])
+    (slope, _), late = dark_signal(evidence)
+    assert late is not None
+    assert abs(slope - late.rate) < 4 * late.error < 0.1 * slope
+    assert re.search(
+        r"over 8\S* s and [78]\S* s: .* darks [34]\d\d s or more", late.warning("e-/s")
+    )
 
 
 class Samples:
@@ -164,8 +191,16 @@ def changed(evidence: Evidence, change: Callable[[Stack], F32]) -> Evidence:
 def test_missing_samples_do_not_shift_the_levels() -> None:
     pattern = np.linspace(0, 500, SHAPE[0])[:, None]
 
+    def whole_of(stack: Stack) -> F32:
+        return np.array(stack.adu + pattern)
+
+    def lacking_one(stack: Stack) -> F32:
+        adu = whole_of(stack)
+        adu[1, 5, 7] = np.nan
+        return adu
+
     def lacking(stack: Stack) -> F32:
-        adu = np.array(stack.adu + pattern)
+        adu = whole_of(stack)
         if stack.kind == "flat":
             adu[1, 5, 7] = np.nan
         if stack.kind == "dark":
@@ -173,6 +208,10 @@ def test_missing_samples_do_not_shift_the_levels() -> None:
         return adu
 
     evidence = recorded(0.01, lambda t: float(np.exp(-t / 50)))
+    whole, found = (persistence(changed(evidence, change)) for change in (whole_of, lacking_one))
+    assert whole is not None
+    assert found is not None
+    assert found.share == pytest.approx(whole.share, abs=whole.share_error)
     (slope, _), late = dark_signal(changed(evidence, lacking))
     assert late is not None
     assert late.sure
@@ -199,8 +238,9 @@ def test_a_camera_without_traps_has_none() -> None:
     assert persistence(recorded(0.0, lambda _: 0.0, stamp=60.0)) is None
 
 
+@pytest.mark.parametrize("slow", [0.0, 0.4])
 def test_darks_after_flats_hold_what_came_out_by_then_with_its_shot_noise(
-    make_effect_bench: Callable[..., Bench],
+    make_effect_bench: Callable[..., Bench], slow: float
 ) -> None:
     """Levels by the sum over all earlier frames; the variance is that of single electrons."""
     changes = {
@@ -211,6 +251,8 @@ def test_darks_after_flats_hold_what_came_out_by_then_with_its_shot_noise(
         "frames.flats": [{"exptime_s": 0.05, "count": 3}, {"exptime_s": 0.1, "count": 5}],
     }
     bench, lag = make_effect_bench(changes), Lag(0.05, spread=0.0, carried=1.0, decay_s=0.4)
+    kinds = ((1 - slow, 0.4), (slow, 1.5))
+    lag = replace(lag, slow_part=slow, slow_s=1.5)
     first, second = (r for r in recordings(bench) if r.kind == "flat")
     dark = next(r for r in recordings(bench) if r.kind == "dark")
     start = second.start_s + second.count * second.period_s
@@ -225,8 +267,11 @@ def test_darks_after_flats_hold_what_came_out_by_then_with_its_shot_noise(
     ]
     for n, frame in enumerate(made):
         at = start + n * dark.period_s
-        held = sum(q * 0.05 * np.exp(-(at - t) / 0.4) for t, q in begins)
-        expected = held * (1 - np.exp(-dark.period_s / 0.4))
+        expected = sum(
+            q * 0.05 * part * np.exp(-(at - t) / decay) * (1 - np.exp(-dark.period_s / decay))
+            for t, q in begins
+            for part, decay in kinds
+        )
         few = 5 * np.sqrt(expected / frame.size)
         assert frame.mean() == pytest.approx(expected, abs=few + 0.003 * expected)
         assert frame.var() == pytest.approx(expected, rel=0.2)
@@ -276,3 +321,5 @@ def test_charge_decays_in_a_pause_before_the_darks(make_effect_bench: Callable[.
     assert late[1] / late[0] == pytest.approx(np.exp(-0.3 / 0.4), rel=0.02)
     with pytest.raises(InputError, match="decay_s"):
         replace(lag, capacity_e=1e4).check(bench)
+    with pytest.raises(InputError, match="slow_part: needs decay_s and slow_s"):
+        replace(lag, slow_part=0.1).check(bench)

@@ -53,7 +53,7 @@ class Lag(Effect):
     absorbed_because = (
         "the fit absorbs a uniform lag; its variation moves phases by hundredths of the bound"
     )
-    optional_parameters = ("decay_frames", "spread", "quiet", "carried", "decay_s")
+    optional_parameters = ("decay_frames", "spread", "quiet", "carried", "decay_s", "slow_part")
     frames_needed = ("random",)
     remedy = (
         "fix on the bench: flush the sensor, or discard the first frame after a change of light"
@@ -123,6 +123,16 @@ class Lag(Effect):
         doc="time in which the release falls by a factor e, in place of decay_frames and later; "
         "0: the release follows the number of frames",
     )
+    slow_part: float = quantity(
+        0.0, low=0, high=1, doc="part of the share that is released over slow_s, not decay_s"
+    )
+    slow_s: float = quantity(
+        0.0,
+        unit="s",
+        low=0,
+        high=1e6,
+        doc="time in which the release of slow_part falls by a factor e",
+    )
 
     @property
     def releases(self) -> F64:
@@ -151,54 +161,66 @@ class Lag(Effect):
         return float(np.exp(-1 / self.decay_frames)) if self.decay_frames else 0.0
 
     def check(self, bench: Bench) -> None:
-        """As in `ForwardModel.check`; traps of limited capacity release by frames."""
+        """As in `ForwardModel.check`; traps of limited capacity release by frames, slow by time."""
         if self.capacity_e and self.decay_s:
             raise InputError(
                 "lag.decay_s: with capacity_e, the release follows frames; give decay_frames "
                 "instead, or remove capacity_e"
             )
+        if self.slow_part and not (self.decay_s and self.slow_s):
+            raise InputError("lag.slow_part: needs decay_s and slow_s; give both, or remove it")
 
     def carry(self, charge: F32, state: F32 | None, shot: Shot) -> tuple[F32, F32]:
         """As in `ForwardModel.carry`; the state (part, y, x) is the charge held, e-.
 
-        One part, or what each of the frames before left, from the last one on.
+        One part for each kind of traps, or what each of the frames before left, from the last on.
         """
-        releases = self.releases if self._by_frame else np.array([1 - self._kept(shot)])
+        releases = self.releases if self._by_frame else 1 - self._kept(shot)
         held = np.zeros((len(releases), *charge.shape), np.float32) if state is None else state
         if state is not None and shot.frame == 0:
-            held = np.float32(self._since_last(shot)) * held
-        released = self._released(held, releases, shot)
+            held = self._since_last(shot)[:, None, None] * held
         left = self._left_behind(charge, shot)
         stays = self._left_behind(charge, shot, 1 - self.quiet) if self.quiet else left
         if self._by_frame:
+            released = self._released(held, releases, shot)
             return charge - left + released, np.concatenate([stays[None], held[:-1]])
-        rest = held[0] - released
+        each = [self._released(held[n, None], r, shot, n) for n, r in enumerate(releases[:, None])]
+        rest = held - np.stack(each)
         if self.capacity_e:
             room = _shares(self, shot.bench.detector, shot.rows) / np.float32(self.share)
-            room = np.maximum(room * np.float32(self.capacity_e) - rest, 0)
+            room = np.maximum(room * np.float32(self.capacity_e) - rest[0], 0)
             left, stays = np.minimum(left, room), np.minimum(stays, room)
-        return charge - left + released, (rest + stays)[None]
+        parts = np.array([1 - self.slow_part, self.slow_part][: len(each)], np.float32)
+        return charge - left + sum(each), rest + parts[:, None, None] * stays
 
-    def _kept(self, shot: Shot) -> float:
-        """Share of the held charge that a frame does not release."""
+    @property
+    def _decays_s(self) -> F64:
+        """Time constants (n,) of the kinds of traps, s; empty where these release by frames."""
+        every = [self.decay_s, self.slow_s] if self.slow_part else [self.decay_s]
+        return np.array(every if self.decay_s else [])
+
+    def _kept(self, shot: Shot) -> F64:
+        """Share (n,) of the charge held by each kind of traps that a frame does not release."""
         if not self.decay_s:
-            return self._keep
-        return float(np.exp((shot.time_s - shot.end_of(shot.frame)) / self.decay_s))
+            return np.array([self._keep])
+        return np.asarray(np.exp((shot.time_s - shot.end_of(shot.frame)) / self._decays_s))
 
-    def _since_last(self, shot: Shot) -> float:
-        """Share of the held charge that is left when a recording begins."""
-        pause = max(shot.time_s - shot.end_of(-1), 0.0) if self.decay_s else 0.0
-        return self.carried * float(np.exp(-pause / self.decay_s)) if pause else self.carried
+    def _since_last(self, shot: Shot) -> F32:
+        """Share (n,) of the held charge that is left when a recording begins."""
+        if not self.decay_s:
+            return np.array([self.carried], np.float32)
+        pause = max(shot.time_s - shot.end_of(-1), 0.0)
+        return (self.carried * np.exp(-pause / self._decays_s)).astype(np.float32)
 
-    def _released(self, held: F32, releases: F64, shot: Shot) -> F32:
-        """Charge (y, x) that a frame gets; each electron is released by chance."""
+    def _released(self, held: F32, releases: F64, shot: Shot, kind: int = 0) -> F32:
+        """Charge (y, x) that a frame gets from traps; each electron is released by chance."""
         found: F32 = np.zeros_like(held[0])
         drawn = np.zeros_like(found)
         for release, part in zip(releases, held, strict=True):
             found += np.float32(release) * part
             drawn += np.float32(release * (1 - release)) * part
         if shot.bench.shot_noise and self.quiet < 1 and drawn.any():
-            normals = shot.normals(f"{self.name} release")
+            normals = shot.normals(f"{self.name} {'slow ' * kind}release")
             found += np.sqrt(np.float32(1 - self.quiet) * np.maximum(drawn, 0)) * normals
         return found
 
@@ -291,9 +313,13 @@ class Lag(Effect):
             frames, seconds = (0.0, slow.decay) if slow.in_seconds else (slow.decay, 0.0)
             share = float(np.clip(slow.share, 0, 0.5))
             name = "decay_s" if slow.in_seconds else "decay_frames"
+            errors = {"share": slow.share_error, name: slow.decay_error}
+            if slow.slow_part:
+                errors |= {"slow_part": slow.slow_part_error, "slow_s": slow.slow_error}
+            traps = cls(share, frames, 0.0, carried=1.0, decay_s=seconds)
             return _estimate(
-                cls(share, frames, 0.0, carried=1.0, decay_s=seconds),
-                {"share": slow.share_error, name: slow.decay_error},
+                replace(traps, slow_part=slow.slow_part, slow_s=slow.slow),
+                errors,
                 slow.share / slow.share_error,
                 "the dark level decays after exposure to light",
             )
@@ -323,6 +349,8 @@ def _estimate(lag: Lag, errors: dict[str, float], sigmas: float, why: str) -> Es
     for name, (decay, unit) in decays.items():
         if decay > NONZERO * errors.get(name, np.inf):
             of += f", decays over {float(f'{decay:.2g}'):g} {unit}"
+    if lag.slow_part:
+        of += f" and, {100 * lag.slow_part:.2g} % of it, {float(f'{lag.slow_s:.2g}'):g} s"
     size = {"value": lag.share, "error": errors["share"], "unit": "", "of": of}
     return Estimate(lag, errors, sigmas, why, size=size if lag.share else {})
 

@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack, soon_after
 from pixcal.kernels.sample_sums import frame_means
 from pixcal.model.arrays import F64, Indices
 
 _SURE = 5.0  # standard errors of the share
-_PARAMETERS = 2  # share and decay
+_PARAMETERS = 2  # share and decay of a kind of traps
 LONGEST = 15.0  # longest decay, in frames or median periods
 _SHORTEST = 0.1
 _OF_MODEL = 2e-3  # least relative error: the light of a series is not quite steady
@@ -35,6 +35,11 @@ class Persistence:
     decay: float  # in which the release falls by a factor e, s or frames
     decay_error: float
     in_seconds: bool
+    # of a second kind of traps: its part of the share, and its longer decay, s
+    slow_part: float = 0.0
+    slow_part_error: float = 0.0
+    slow: float = 0.0
+    slow_error: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -57,24 +62,33 @@ class _Sequence:
             held = (kept * held + self.charge[n]) * after[n]
         return found
 
+    def late(self, lag: Persistence) -> F64:
+        """Charge (t,) that comes out in each frame, e-."""
+        found = (1 - lag.slow_part) * self.released(lag.decay, lag.in_seconds)
+        if lag.slow_part:
+            found = found + lag.slow_part * self.released(lag.slow, True)
+        return np.asarray(lag.share * found)
+
     def of_light(self, lag: Persistence) -> "_Sequence":
         """Without what the frames lose and gain; the light of a series is steady."""
-        released = self.released(lag.decay, lag.in_seconds)
-        light = [
-            float((means - lag.share * released[at]).mean()) / (1 - lag.share)
-            for _, at, means in self.places
-        ]
+        late = self.late(lag)
+        light = [float((means - late[at]).mean()) / (1 - lag.share) for _, at, means in self.places]
         return replace(self, charge=np.maximum(light, 0.0)[self.series])
 
 
 def persistence(evidence: Evidence) -> Persistence | None:
-    """As `released_late`, of the frames of a part of the window."""
-    means = [frame_means(s.adu, evidence.good) for s in evidence.stacks]
-    bias = evidence.bias[evidence.good].mean()
+    """As `released_late`, of pixels of a part of the window that no frame lacks."""
+    used = evidence.good.copy()
+    for stack in evidence.stacks:
+        used &= np.isfinite(stack.adu).all(axis=0)
+    if not used.any():
+        return None
+    means = [frame_means(s.adu, used) for s in evidence.stacks]
+    bias = evidence.bias[used].mean()
     levels = [
         (s, (own - bias) * evidence.gain) for s, own in zip(evidence.stacks, means, strict=True)
     ]
-    found = released_late(levels, evidence.read_noise**2 / evidence.good.sum())
+    found = released_late(levels, evidence.read_noise**2 / used.sum())
     return None if found is None else found[0]
 
 
@@ -106,9 +120,10 @@ def released_late(levels: Levels, least: float) -> tuple[Persistence, list[F64]]
     best = found[int(np.argmin((left / scale) @ count))]
     for _ in range(_ROUNDS):
         best = _fit(sequence.of_light(best), dark, best.in_seconds, freedom, least)
+    best = _of_two_kinds(sequence, dark, best, freedom - _PARAMETERS, least) or best
     if best.share <= _SURE * best.share_error:
         return None
-    late = best.share * sequence.of_light(best).released(best.decay, best.in_seconds)
+    late = sequence.of_light(best).late(best)
     return best, [late[at] for _, at, _ in sequence.places]
 
 
@@ -233,12 +248,67 @@ def _fit(
     return Persistence(size, float(errors[0]), decay, float(errors[1]), in_seconds)
 
 
+def _of_two_kinds(
+    sequence: _Sequence, series: Series, one: Persistence, freedom: int, least: float
+) -> Persistence | None:
+    """Traps of two decays in seconds; None unless they fit far better than ``one`` kind."""
+    if freedom < 1:
+        return None
+    dark = np.concatenate([at for at, _, _ in series])
+    unit = float(np.median(sequence.period[dark]))
+    lag, before = one, _misfit(sequence.of_light(one), series, one)
+    decays = np.array([0.5, 4.0]) * one.decay * (1.0 if one.in_seconds else unit)
+    limits = unit * _SHORTEST, unit * LONGEST
+    for _ in range(_ROUNDS):
+        own = sequence.of_light(lag)
+        decays = _decays(own, series, np.clip(decays, *limits), limits)
+        sizes, models, left = _shares(own, series, decays)
+        turned = (_shares(own, series, (1 + _STEP) * decays)[1] - models) * sizes
+        design = np.concatenate([models, turned / (_STEP * decays)], axis=1)
+        variance = max(left / freedom, least)
+        covariance = variance * np.linalg.pinv(design.T @ design)
+        if (sizes <= _SURE * np.sqrt(np.diag(covariance)[:2])).any():
+            return None
+        share = float(sizes.sum())
+        part = float(sizes[1]) / share
+        values = np.array([share, decays[0], part, decays[1]])
+        change = np.zeros((4, 4))
+        change[0, :2], change[2, :2] = 1, np.array([-part, 1 - part]) / share
+        change[1, 2] = change[3, 3] = 1
+        errors = np.sqrt(np.diag(change @ covariance @ change.T))
+        errors = np.hypot(errors, _OF_MODEL * values)
+        of_all, fast, of_slow, slow = zip(values.tolist(), errors.tolist(), strict=True)
+        lag = Persistence(*of_all, *fast, True, *of_slow, *slow)
+    return lag if before - left > _SURE**2 * variance else None
+
+
+def _decays(sequence: _Sequence, series: Series, start: F64, limits: tuple[float, float]) -> F64:
+    """Two decays (s) of least squares, ascending, from ``start`` on."""
+    found = minimize(
+        lambda x: _shares(sequence, series, np.exp(x))[2],
+        np.log(start),
+        method="Nelder-Mead",
+        bounds=[np.log(limits)] * 2,
+        options={"xatol": 1e-4, "fatol": np.inf},
+    )
+    return np.asarray(np.exp(np.sort(found.x)))
+
+
+def _shares(sequence: _Sequence, series: Series, decays: F64) -> tuple[F64, F64, float]:
+    """Least-squares shares of traps of given decays (s), their models, and what is left."""
+    pairs = [_centred(sequence.released(float(decay), True), series) for decay in decays]
+    models, levels = np.stack([model for model, _ in pairs], axis=1), pairs[0][1]
+    sizes: F64 = np.linalg.lstsq(models, levels)[0].astype(float)
+    rest = levels - models @ sizes
+    return sizes, models, float(rest @ rest)
+
+
 def _misfit(sequence: _Sequence, series: Series, found: Persistence) -> float:
     """Sum of squares that a persistence leaves of the levels about their means."""
     if not series:
         return 0.0
-    model, levels = _centred(sequence.released(found.decay, found.in_seconds), series)
-    return float(((levels - found.share * model) ** 2).sum())
+    late, levels = _centred(sequence.late(found), series)
+    return float(((levels - late) ** 2).sum())
 
 
 def _centred(model: F64, series: Series) -> tuple[F64, F64]:

@@ -109,8 +109,10 @@ class LateRate:
 
     def warning(self, unit: str) -> str:
         """What it means for the map of the dark signal; ``unit``: of the rates."""
-        decays = "s" if self.lag.in_seconds else "frames"
-        decay, gone = (f"{number(n * self.lag.decay, 2)} {decays}" for n in (1, _GONE))
+        of_time = "s" if self.lag.in_seconds else "frames"
+        decays = [self.lag.decay, self.lag.slow] if self.lag.slow_part else [self.lag.decay]
+        decay = " and ".join(f"{number(one, 2)} {of_time}" for one in decays)
+        gone = f"{number(_GONE * decays[-1], 2)} {of_time}"
         if not self.sure:
             return (
                 "the level of the darks falls: charge from light before them, or a drift of the "
