@@ -1,6 +1,6 @@
 """``pixcal budget``: the expected precision of a bench.
 
-docs/reference/products.md describes ``budget.json``.
+docs/reference/products-other.md describes ``budget.json``.
 """
 
 from collections.abc import Callable, Mapping

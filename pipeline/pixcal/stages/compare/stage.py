@@ -1,6 +1,6 @@
 """``pixcal compare``: common signal and differences of maps of the same pixels.
 
-docs/reference/products.md describes ``compare.json``.
+docs/reference/products-other.md describes ``compare.json``.
 """
 
 from collections.abc import Iterable, Sequence

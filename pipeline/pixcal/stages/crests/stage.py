@@ -1,6 +1,6 @@
 """Crests and valleys: fibre positions independent of the fit (paper, section 6, figures 16, 17).
 
-docs/reference/products.md describes ``crests.json``; ``crests.zarr/<set name>`` holds the points
+docs/reference/products-other.md describes ``crests.json``; ``crests.zarr/<set name>`` holds the points
 and the maps.
 """
 
