@@ -1,6 +1,7 @@
 """``pixcal astrometry``: how much the maps improve star centroids.
 
-docs/reference/products-other.md describes ``astrometry.json``; ``astrometry.zarr`` holds maps of errors.
+docs/reference/products-other.md describes ``astrometry.json``; ``astrometry.zarr`` holds maps
+of errors.
 """
 
 from collections.abc import Mapping

@@ -1,7 +1,7 @@
 """Crests and valleys: fibre positions independent of the fit (paper, section 6, figures 16, 17).
 
-docs/reference/products-other.md describes ``crests.json``; ``crests.zarr/<set name>`` holds the points
-and the maps.
+docs/reference/products-other.md describes ``crests.json``; ``crests.zarr/<set name>`` holds the
+points and the maps.
 """
 
 from collections.abc import Mapping
