@@ -12,6 +12,7 @@ from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 
+WHY = "visibility that scatters alike in all sets, as charge without light makes it"
 _MIN_PIXELS = 200
 
 
@@ -55,6 +56,8 @@ class DarkSignal(Effect):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """What the visibilities of fringe sets share, as charge in the time of an exposure."""
+        if evidence.of_kind("dark"):
+            return Estimate(cls(0.0), {}, 0.0, WHY, refused="dark frames measure it")
         sets = [
             f
             for f in evidence.fringes.values()
@@ -71,10 +74,4 @@ class DarkSignal(Effect):
         variance = float(weight @ (by * products[some]) / weight.sum())
         error = float(weight.sum() ** -0.5)
         scatter, scatter_error = map(float, root_with_error(variance, error))
-        return Estimate(
-            cls(scatter),
-            {"scatter": scatter_error},
-            variance / error,
-            "visibility that scatters alike in all sets, as charge without light makes it",
-            refused="dark frames measure it" if evidence.of_kind("dark") else "",
-        )
+        return Estimate(cls(scatter), {"scatter": scatter_error}, variance / error, WHY)
