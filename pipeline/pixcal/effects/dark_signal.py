@@ -13,6 +13,7 @@ from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 
 WHY = "visibility that scatters alike in all sets, as charge without light makes it"
+SIZE = "scatter of the dark current between pixels"
 _MIN_PIXELS = 200
 
 
