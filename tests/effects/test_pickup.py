@@ -109,6 +109,20 @@ def test_a_weak_tone_is_one() -> None:
         assert len(found.effect.rms) == 1
 
 
+def test_a_tone_whose_phase_wanders_from_row_to_row_is_found() -> None:
+    """As in a real camera, whose clocks are not locked to it: one frequency along the rows."""
+    rng = np.random.default_rng(7)
+    shape = (4, 256, 200)
+    y, x = np.arange(shape[1]), np.arange(shape[2])
+    phase = 0.2 * rng.standard_normal(shape[:2]).cumsum(axis=1) + rng.uniform(0, 6, (shape[0], 1))
+    wave = np.cos(2 * np.pi * (0.2965 * x + 0.125 * y[:, None]) + phase[..., None])
+    found = Pickup.estimate(_evidence(5 * rng.standard_normal(shape) + 3 * 2**0.5 * wave))
+    assert found is not None
+    assert found.significance > 20
+    assert len(found.effect.rms) > 10
+    assert found.size["value"] == pytest.approx(3, rel=0.35)
+
+
 def _coupled(frames: F64) -> F64:
     """Neighbours share noise."""
     return frames + 0.2 * np.roll(frames, 1, axis=2) + 0.2 * np.roll(frames, 1, axis=1)

@@ -28,9 +28,9 @@ _WILD = 8.0  # standard deviations above which a sample is no noise
 _MOST = 48  # tones
 _AT_ONCE, _NEARLY = 8, 0.25  # tones found in one search, and their least power over the strongest
 _DISTINCT = 0.7  # least distance of two tones, modes
-# Modes (y, x) whose median is the noise about a tone: of one frequency along rows alone where this
-# is low, as noise is 1/f there.
-_AROUND, _ALONE = (8, 8), (32, 1)
+# Modes (y, x) whose median is the noise about a tone: few of one frequency along rows where this is
+# low, as noise is 1/f there.
+_AROUND, _AROUND_SLOW = (8, 8), (32, 1)
 _SLOW = 8  # modes along rows that are low
 # Mains hum hardly changes along a row, and a tone whose period divides that of rows not along a
 # column. Noise of rows or columns has a spectrum of its own, with harmonics of steps between
@@ -180,8 +180,8 @@ def _search(frames: F32) -> tuple[F64, F64]:
     of_columns = np.array([_over_next_highest(own) for own in power[slow]])
     # Outputs that share noise have columns of modes with more of it, at all frequencies.
     fast = power[:, _SLOW:]
-    fast /= np.maximum(_surroundings(fast, _AROUND), _surroundings(fast, _ALONE))
-    power[:, :_SLOW] /= _surroundings(power[:, :_SLOW], _ALONE)
+    fast /= np.maximum(_surroundings(fast, _AROUND), np.median(fast, axis=0))
+    power[:, :_SLOW] /= _surroundings(power[:, :_SLOW], _AROUND_SLOW)
     power[down < _STEPS, :_DRIFTS] = 0
     power[slow] = of_columns
     power[:, 0] = of_rows
