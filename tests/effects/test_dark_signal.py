@@ -72,3 +72,4 @@ def test_an_acquisition_without_darks_is_explained() -> None:
     (cause,) = found["causes"]
     assert cause["effect"] == "dark_signal"
     assert cause["on_map"]["action"] == "unaffected"
+    assert cause["size"]["unit"] == "e-/s"

@@ -75,4 +75,6 @@ class DarkSignal(Effect):
         variance = float(weight @ (by * products[some]) / weight.sum())
         error = float(weight.sum() ** -0.5)
         scatter, scatter_error = map(float, root_with_error(variance, error))
-        return Estimate(cls(scatter), {"scatter": scatter_error}, variance / error, WHY)
+        errors_of = {"scatter": scatter_error}
+        size = {"value": scatter, "error": scatter_error, "unit": "e-/s", "of": SIZE}
+        return Estimate(cls(scatter), errors_of, variance / error, WHY, size=size)
