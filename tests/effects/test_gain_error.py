@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from all_frames import frames_of
 
-from pixcal.effects.gain_error import GainError, shot_share_of_flats
+from pixcal.effects.gain_error import GainError
+from pixcal.estimators.detector.flat_noise import shot_share_of_flats
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.recording import recordings
@@ -118,3 +119,15 @@ def test_levels_of_a_lamp_that_was_changed_do_not_bend_the_gain(
     stacks = (*(s for s in whole.stacks if s.kind != "flat"), *flats)
     share, error = shot_share_of_flats(replace(whole, stacks=stacks)) or (0.0, 0.0)
     assert abs(share - 1) < 4 * error < 0.2
+
+
+@pytest.mark.parametrize("factor", [1.0, 20.0, 200.0])
+def test_a_grossly_wrong_gain_is_measured_as_well(
+    acquired: Callable[..., Evidence], factor: float
+) -> None:
+    """As that of the output of a camera that multiplies electrons before it."""
+    right = replace(acquired(), fringes={})
+    noise = factor * right.read_noise
+    wrong = replace(right, gain=factor * right.gain, read_noise=noise)
+    (share, _), (more, error) = (shot_share_of_flats(one) or (0.0, 0.0) for one in (right, wrong))
+    assert abs(more / factor - share) < error / factor < 0.02

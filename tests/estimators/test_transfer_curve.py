@@ -8,11 +8,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from pixcal.effects.gain_error import shot_share_of_flats
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.effects.quantisation import Quantisation
 from pixcal.estimators.crosstalk.dense import frames_of, within
 from pixcal.estimators.crosstalk.links import links
+from pixcal.estimators.detector.flat_noise import shot_share_of_flats
 from pixcal.estimators.detector.ladder_curve import ladder_curve
 from pixcal.estimators.detector.neighbours import shared_charge
 from pixcal.estimators.detector.transfer_curve import transfer_curve

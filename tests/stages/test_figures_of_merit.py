@@ -398,7 +398,7 @@ def test_shot_noise_of_the_dark_signal_is_not_taken_for_that_of_light(tmp_path: 
 def test_half_the_declared_gain_may_be_that_of_an_electron_multiplier(
     declared: float, said: bool
 ) -> None:
-    fit: Any = SimpleNamespace(gain=0.05, error=0.0002)
+    fit: Any = SimpleNamespace(of_electrons=(0.05, 0.0002), excess=(1.0, 0.0))
     summary: Any = SimpleNamespace(declared=SimpleNamespace(gain_e_per_adu=declared), step=1.0)
     sentences = _declared_gain_warnings(fit, summary, declared)
     assert any("F² = 2" in one for one in sentences) == said
@@ -433,3 +433,41 @@ def test_dark_signal_in_outliers_is_told(multiplied: bool, tmp_path: Path) -> No
         value = reduced["figures_of_merit"]["dark_current"]["value"]
         # Pixels with many outliers are flagged as noisy: they are in neither.
         assert 0.7 * rate < value + float(note.partition("hold ")[2].split()[0]) < 1.05 * rate
+
+
+@pytest.mark.parametrize("declared", [8.0 / 200, 8.0, None])
+def test_multiplied_electrons_are_counted_as_collected(
+    declared: float | None, tmp_path: Path
+) -> None:
+    """Each becomes 200 on average; the output has 8 e-/ADU and 100 e- of read noise."""
+    rng, (multiplication, gain, read, dark) = np.random.default_rng(4), (200, 8.0, 100.0, 0.05)
+    acquisition = tmp_path / "acq"
+    acquisition.mkdir()
+    steps = [("bias", 0.0, 0.0, 20), ("dark0", 0.0, 20.0, 10), ("dark1", 0.0, 100.0, 10)]
+    steps += [(f"flat{n}", 5.0 * 2**n, 0.1 * 2**n, 4) for n in range(6)]
+    for name, light, seconds, count in steps:
+        electrons = rng.poisson(light + dark * seconds, (count, *SHAPE)).astype(float)
+        electrons = rng.gamma(np.maximum(electrons, 1e-9), multiplication)
+        samples = 500.5 + (electrons + read * rng.standard_normal(electrons.shape)) / gain
+        header = fits.Header({"EXPTIME": seconds})
+        samples = np.rint(samples.clip(0, 65535)).astype(np.uint16)
+        fits.writeto(acquisition / f"{name}.fits", samples, header)
+    detector = {"pitch_um": 13.0, "read_noise_e": read / multiplication}
+    if declared is not None:
+        detector["gain_e_per_adu"] = declared
+    kinds = {kind: [f"{kind}*.fits"] for kind in ("bias", "dark", "flat")}
+    listed = {"schema": "pixcal/acquisition/1", "detector": detector, "frames": kinds}
+    (acquisition / "acquisition.yaml").write_text(yaml.safe_dump(listed))
+    reduction = pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run")).reduction
+    true = {
+        "conversion_gain": gain / multiplication,
+        "read_noise": read / multiplication,
+        "dark_current": dark,
+    }
+    for name, value in true.items():
+        figure = reduction["figures_of_merit"][name]
+        assert abs(figure["value"] - value) < 3 * figure["error"] < 0.3 * value, name
+    words = " ".join(reduction["warnings"])
+    assert "electrons are multiplied before the output" in words
+    assert ("not the" in words.partition("gain of")[2]) == (declared == gain)
+    assert ("that of the output" in words) == (declared == gain)

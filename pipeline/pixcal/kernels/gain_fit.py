@@ -63,6 +63,14 @@ class GainFit:
     step: bool = False  # whether the curve has a step above the levels used, as of a dual gain
     # whether the curve leaves out the noise without light, which is not on it
     without_dark: bool = False
+    # F², variance of the noise over that of the light, and its error: electrons may be multiplied
+    excess: tuple[float, float] = (1.0, 0.0)
+
+    @property
+    def of_electrons(self) -> tuple[float, float]:
+        """Gain by which collected electrons are counted, and its error, e-/ADU."""
+        factor, error = self.excess
+        return factor * self.gain, math.hypot(factor * self.error, error * self.gain)
 
 
 def fit_gain(

@@ -83,15 +83,21 @@ def evidence_of(
         step_adu=max(int(ingested.quantum), 1),
         neighbours=tuple((y, x) for y, x in used["gain_e_per_adu"]["neighbours"]),
         without_dark=without_dark,
+        excess_noise_factor=_excess_noise_factor(used["gain_e_per_adu"]),
         subtracted_dark=float(used.get("subtracted_dark_e_s") or 0.0),
     )
 
 
 def _photon_transfer(gain: dict[str, Any]) -> tuple[float, float, float]:
-    """Gain measured, its error and reduced chi-square; nan where there is none."""
-    keys = ("measured", "error", "chi2_reduced")
-    value, error, chi2 = np.array([gain.get(key) for key in keys], float).tolist()
+    """Gain of the noise, its error and reduced chi-square; nan where there is none."""
+    measured = gain.get("of_noise") or [gain.get(key) for key in ("measured", "error")]
+    value, error, chi2 = np.array([*measured, gain.get("chi2_reduced")], float).tolist()
     return value, error, chi2
+
+
+def _excess_noise_factor(gain: dict[str, Any]) -> float:
+    """F² of electrons that are multiplied, else 1."""
+    return float(gain["measured"] / gain["of_noise"][0]) if gain.get("of_noise") else 1.0
 
 
 def _fringes(

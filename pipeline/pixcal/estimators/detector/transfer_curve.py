@@ -12,7 +12,8 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack, cached_on_evidence
 from pixcal.kernels.line_means import without_line_means
 from pixcal.kernels.residual_sums import residual_sums
-from pixcal.model.arrays import F64, Mask
+from pixcal.kernels.robust import robust_sigma
+from pixcal.model.arrays import F32, F64, Mask
 
 # rows and columns from a pixel to itself and to those that may share its noise
 STEPS = np.array([(0, 0), (0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0)])
@@ -22,6 +23,7 @@ FLOOR = 5e-3
 MIN_PIXELS = 200  # fewest pixels for a noise measurement
 CLIP = 6.0  # standard deviations beyond which a residual does not count
 
+_FAR_OFF = 4.0  # ratio of measured to expected noise beyond which a gain is grossly wrong
 _MIN_LEVELS = 3
 _ALIKE = 1e4
 _READ_KNOWN = 0.3  # assumed relative error of the variance of the read noise
@@ -123,7 +125,8 @@ def shot_share(
     # Negative where levels are too alike to tell the noise of light from that of reading.
     if share <= 0.1 or not 0 <= variance < np.inf:
         return None
-    return float(share), float(np.sqrt(variance + FLOOR**2))
+    floor = FLOOR * (share if share > _FAR_OFF else 1.0)
+    return float(share), float(np.sqrt(variance + floor**2))
 
 
 def sums_of_stacks(evidence: Evidence) -> list[F64]:
@@ -171,17 +174,19 @@ def _of_stack(evidence: Evidence, stack: Stack) -> F64 | None:
     pattern = evidence.flat if stack.kind == "flat" else np.ones(level.shape)
     pattern = np.where(good, pattern, 0).astype(np.float32)
     usual = pattern * max(float(level[good].mean() / pattern[good].mean()), 0.0)
-    noise = usual + np.float32(evidence.read_noise**2)
     frames -= level
+    read = np.float32(evidence.read_noise**2)
+    scale = _noise_scale(frames, good, float(usual[good].mean()), float(read))
+    noise = scale * usual + read
     more = np.einsum("tyx,yx->t", frames, pattern / noise)
     brighter = (more / (pattern**2 / noise).sum())[:, None, None] * pattern
     ones = np.ones(level.shape)
     # Noise that every second row shares does not average out over few frames.
     residual = without_line_means(frames - brighter, good)
-    return residual_sums(
+    sums = residual_sums(
         residual,
         usual + brighter,
-        ones,
+        scale * ones,
         evidence.read_noise**2 * ones,
         good,
         np.ones((len(frames), 1)),
@@ -190,6 +195,19 @@ def _of_stack(evidence: Evidence, stack: Stack) -> F64 | None:
         STEPS,
         CLIP,
     )
+    return np.asarray(sums / np.array([1, scale**2, scale, 1, scale, 1, 1]))
+
+
+def _noise_scale(rest: F32, good: Mask, shot: float, read: float) -> float:
+    """Noise of light in deviations (t, y, x) from pixels' means over that expected, roughly.
+
+    It is 1 unless it is above `_FAR_OFF`, as with a grossly wrong gain, which would clip samples.
+    """
+    # Between neighbours in a row, as rows may have noise in common.
+    steps = np.diff(rest, axis=2)[:, good[:, 1:] & good[:, :-1]]
+    spread = robust_sigma(steps) ** 2 / 2 * len(rest) / (len(rest) - 1)
+    scale = (spread - read) / max(shot, 1e-9)
+    return scale if scale > _FAR_OFF else 1.0
 
 
 def _shared_steps(evidence: Evidence) -> Mask:

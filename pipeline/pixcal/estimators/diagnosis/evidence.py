@@ -173,6 +173,8 @@ class Evidence:
     # whether the gain of `photon_transfer` leaves out noise without light, which is not that of
     # flats
     without_dark: bool = False
+    # F² that the gain allows for: above 1 where electrons are multiplied before the output
+    excess_noise_factor: float = 1.0
     read_noise_error: float = np.nan  # of ``read_noise``, e- rms; nan when unknown
     step_adu: int = 1  # all calibration samples are multiples of it
     # flats that saturate in the data with which a simulation is compared; None for the data

@@ -72,7 +72,7 @@ class Summary:
                 f"{asked}, but the flats show no photon noise above the read noise, or there are "
                 f"neither bias nor dark frames; {remedy}"
             )
-        return self.gain.gain
+        return self.gain.of_electrons[0]
 
     def read_noise_e(self, gain: float) -> float:
         """Read noise (e-): measured, else declared; never below the converter's rounding."""
@@ -85,7 +85,7 @@ class Summary:
         """A noise (ADU) and its error in e-, by the measured gain, else by the used gain."""
         if noise is None:
             return None
-        own, error = (gain, 0.0) if self.gain is None else (self.gain.gain, self.gain.error)
+        own, error = (gain, 0.0) if self.gain is None else self.gain.of_electrons
         return own * noise[0], math.hypot(own * noise[1], error * noise[0])
 
     def noise_before_rounding_e(self, gain: float) -> float:

@@ -19,6 +19,8 @@ _LINEARITY = 0.02
 _SURE, _LATE, _CURVED = 5.0, 0.005, 20.0
 # of a lamp that is reported as unsteady: fewest flats of a series, change over it, and scatter
 _FEWEST, _DRIFT, _SCATTER = 4, 0.01, 0.02
+# least declared over measured gain that an electron-multiplying register explains
+_MULTIPLIED = 3.0
 _OF_STEP = 0.1  # relative tolerance to recognise a gain declared per step of the converter
 
 
@@ -70,6 +72,12 @@ def detector_warnings(
 
 def _gain_warnings(fit: GainFit, summary: Summary, used: float, filtered: bool) -> list[str]:
     warnings = []
+    if fit.excess[0] > 1:
+        warnings.append(
+            "electrons are multiplied before the output, as the third moment of the noise of flats "
+            f"shows: the measured gain allows for an excess noise factor F² = {fit.excess[0]:g}, "
+            "right for a multiplication of 10 or more"
+        )
     if fit.chi2_reduced > _ROUGH:
         warnings.append(
             "the points of the photon-transfer curve deviate from a smooth curve by more than "
@@ -197,7 +205,7 @@ def _exposure_warnings(summary: Summary, straight: Linearity) -> list[str]:
 def _declared_gain_warnings(fit: GainFit, summary: Summary, used: float) -> list[str]:
     """That no gain is declared, or another one than measured."""
     declared, step = summary.declared.gain_e_per_adu, summary.step
-    value, error = fit.gain, fit.error
+    value, error = fit.of_electrons
     if declared is None:
         return [f"no gain declared: using {used:.4g} ± {error:.2g} e-/ADU, measured from the flats"]
     if abs(value - declared) <= max(3 * error, 0.02 * declared):
@@ -207,9 +215,13 @@ def _declared_gain_warnings(fit: GainFit, summary: Summary, used: float) -> list
         f"divided by {step:g}; "
     ] * (step > 1 and abs(value * step - declared) < _OF_STEP * declared)
     causes += [
+        f"the declared gain seems to be that of the output; divide it by the multiplication, about "
+        f"{float(f'{declared / value:.2g}'):g}; "
+    ] * (fit.excess[0] > 1 and declared > _MULTIPLIED * value)
+    causes += [
         "this is half of it, as the excess noise of an electron-multiplying register (F² = 2) "
         "gives at the right declared gain: if the camera has one, keep the declared gain; else "
-    ] * (abs(2 * value - declared) < max(6 * error, 0.02 * declared))
+    ] * (fit.excess[0] == 1 and abs(2 * value - declared) < max(6 * error, 0.02 * declared))
     return [
         f"photon transfer gives a gain of {value:.4g} ± {error:.2g} e-/ADU, not the "
         f"{declared:g} of detector.gain_e_per_adu: {''.join(causes)}"

@@ -59,14 +59,16 @@ def characterise(
         note = report_outputs(outputs, gain[0], facts, source.shape)
     found: Json = {"conversion_gain": _figure("conversion gain", "e-/ADU", gain, note)}
     noise = _read_noise(found, summary, gain[0], source.quantum)
+    excess = 1.0 if summary.gain is None else summary.gain.excess[0]
     _line_noise(found, dark, gain[0], job.shape, nearby)
     if top is not None:
-        _full_well(found, gain, top, reached, noise)
+        _full_well(found, gain, excess, top, reached, noise)
     if facts["linearity"] is not None:
         departure = (facts["linearity"][key] for key in ("max_deviation_percent", "error_percent"))
         found["linearity_error"] = _figure("linearity error, largest", "%", (*departure,))
     curves: Json = {"photon_transfer": _listed(summary.transfer.T, ("level", "variance", "error"))}
-    curves["photon_transfer"] |= {"gain": gain[0], "read_variance": (noise or (0.0,))[0] ** 2}
+    of_noise = {"gain": gain[0] / excess, "read_variance": (noise or (0.0,))[0] ** 2}
+    curves["photon_transfer"] |= of_noise
     if halves.dark is not None:
         electrons = halves.dark * gain[0]
         facts["warnings"] += _spread(found, curves, "dsnu", "e-", electrons, halves.good)
@@ -77,8 +79,7 @@ def characterise(
         light = halves.flat if outputs is None else halves.flat * outputs.of_pixel
         percent = np.stack([100 * emva.without_trend(half, halves.good) for half in light])
         facts["warnings"] += _spread(found, curves, "prnu", "%", percent, halves.good)
-    scale = gain[0] / entry["used"]
-    rate = dark_current(made, source, job, gain, scale, middle)
+    rate = dark_current(made, source, job, gain, gain[0] / entry["used"], middle)
     if rate is not None:
         found["dark_current"] = _figure("dark current", rate.unit, rate.measure, rate.note)
         facts["warnings"] += rate.warnings
@@ -155,6 +156,7 @@ def _top(summary: Summary, job: Measuring, clipped: bool) -> tuple[Measure | Non
 def _full_well(
     found: Json,
     gain: tuple[float, float | None],
+    excess: float,
     top: Measure,
     reached: bool,
     noise: Measure | None,
@@ -169,7 +171,7 @@ def _full_well(
     found["saturation"] = figure("saturation above bias", "ADU", top)
     well = gain[0] * top[0], gain[0] * top[1]
     found["full_well"] = figure("full well", "e-", well)
-    peak = math.sqrt(well[0])
+    peak = math.sqrt(well[0] / excess)
     error = math.hypot(top[1] / top[0], (gain[1] or 0.0) / gain[0]) * peak / 2
     found["snr_max"] = figure("largest signal-to-noise ratio", "", (peak, error))
     if noise is not None:

@@ -35,6 +35,7 @@ from pixcal.stages.reduce.frame_statistics import (
 )
 from pixcal.stages.reduce.fringe_sets import Bounds, set_warnings, share_at_mean, write_set
 from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.reduce.multiplied import with_excess_noise
 from pixcal.stages.reduce.read_noise import Nearby
 from pixcal.stages.reduce.subtracted import subtracted_rate, subtracted_warnings
 from pixcal.stages.tiles import STRIP, indices, span, strips
@@ -96,12 +97,13 @@ class Reduction:
         return {
             "gain_e_per_adu": {
                 "declared": summary.declared.gain_e_per_adu,
-                "measured": fitted.gain if fitted else None,
-                "error": fitted.error if fitted else None,
+                "measured": fitted.of_electrons[0] if fitted else None,
+                "error": fitted.of_electrons[1] if fitted else None,
                 "chi2_reduced": fitted.chi2_reduced if fitted else None,
                 "levels_adu": list(fitted.levels) if fitted else None,
                 "neighbours": [list(lag) for lag in fitted.neighbours] if fitted else [],
                 "without_dark": fitted.without_dark if fitted else None,
+                "of_noise": [fitted.gain, fitted.error] if fitted else None,
                 "used": gain,
                 "used_from": "measured" if summary.declared.gain_e_per_adu is None else config.gain,
             },
@@ -145,6 +147,7 @@ def reduce_frames(made: Workspace, source: Ingested, config: Config, runtime: Ru
     for writer in job.writers.values():
         writer.finish()
     summary = summarise(job, made.scratch / "statistics", source)
+    summary = with_excess_noise(summary, source, job)
     gain = summary.gain_to_use(config.gain)
     bounds = _calibrate(made, source, summary, gain, config, runtime)
     sets = {}

@@ -1,0 +1,83 @@
+"""Electron multiplication before the output, from the third moment of the noise of flats.
+
+The cumulants of n electrons that arrive by chance, each read as a random signal x, are ``n <x>``,
+``n <x²>`` and ``n <x³>``. So ``<x³> <x> / <x²>²``, which needs no gain, is 1 where all electrons
+count alike, and 3/2 after a multiplying register, where x is nearly exponential (Robbins & Hadwen
+2003, IEEE Trans. Electron Devices 50, 1227). Its noise, over that of the light, is
+``F² = 2 - 1/G`` for a multiplication G. Photon transfer alone cannot tell F² from another gain.
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from pixcal.model.arrays import F32, Mask
+
+MIN_FRAMES = 3  # of a level; two have no third moment
+EXCESS, EXCESS_ERROR = 2.0, 0.05  # F² of a large multiplication, and error if G is unknown
+
+_SURE = 5.0  # errors by which the ratio must exceed 1
+_RATIOS = (1.3, 1.7)  # of a register: a multiplication of 1.5 has 1.39
+# samples that count: within so many standard deviations, and signals of single electrons
+_CLIP, _ELECTRONS = 8.0, 15.0
+_MIN_PIXELS = 1000
+
+
+class Skew(NamedTuple):
+    """Third cumulant of a sample at a level."""
+
+    level: float  # ADU above the bias
+    cumulant: float  # ADU³
+    error: float
+
+
+def skew(frames: F32, level: float, variance: float, slope: float, good: Mask) -> Skew | None:
+    """Third cumulant of the noise of frames (t, y, x) of one scene; None without enough samples.
+
+    Parameters
+    ----------
+    frames : (t, y, x) float32
+        ADU.
+    level : float
+        ADU above the bias.
+    variance, slope : float
+        Variance without light (ADU²), and how it rises with the level (ADU).
+    good : (y, x) bool
+        Pixels to use.
+    """
+    count = len(frames)
+    if count < MIN_FRAMES:
+        return None
+    used = frames[:, good]
+    rest = used - used.mean(axis=0)
+    limit = _CLIP * np.sqrt(variance + slope * max(level, 0.0)) + _ELECTRONS * slope
+    away = np.abs(rest - np.median(rest, axis=1, keepdims=True))
+    rest = rest[:, (away < limit).all(axis=0)]
+    if rest.shape[1] < _MIN_PIXELS:
+        return None
+    rest -= rest.mean(axis=1, keepdims=True)
+    unbiased = count / ((count - 1) * (count - 2))
+    cubes = unbiased * (rest.astype(float) ** 3).sum(axis=0)
+    return Skew(level, float(cubes.mean()), float(cubes.std() / np.sqrt(rest.shape[1])))
+
+
+def is_multiplied(points: Iterable[Skew], slope: float) -> bool:
+    """Whether electrons were multiplied, from levels with and without light.
+
+    Parameters
+    ----------
+    points : iterable of Skew
+    slope : float
+        Rise of the variance with the level, ADU.
+    """
+    level, cumulant, error = np.array(list(points)).reshape(-1, 3).T
+    if len(level) < 2:
+        return False
+    weight = error**-2
+    away = level - np.average(level, weights=weight)
+    information = float(weight @ away**2)
+    if not information > 0:
+        return False
+    ratio = float((weight * away) @ cumulant) / information / slope**2
+    return _RATIOS[0] < ratio < _RATIOS[1] and ratio - 1 > _SURE * information**-0.5 / slope**2
