@@ -181,3 +181,36 @@ def table(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
     tables = [scale * t for t in (left, right, low, top)]
     bench.charge.append(_deflecting(galsim.cdmodel.BaseCDModel(*tables)))
     return {"right": tables[1].tolist(), "top": tables[3].tolist()}
+
+
+@law("charge_transfer", "traps", 150, 5000, "e- that the traps of a column hold", needs="pyxel")
+def charge_transfer(bench: Bench, size: float, rng: np.random.Generator) -> Drawn:
+    """Charge captured by traps during its transfer to the output, and released later.
+
+    By Pyxel's model of distortion (Short et al. 2013): the tail grows with the number of transfers,
+    and less than in proportion to the charge.
+    """
+    from pyxel.models.charge_transfer.utils_cdm import run_cdm_parallel
+
+    beta, volume, well = 0.37, 1e-10, 1.5 * bench.peak_e
+    step = 1e-3
+    release = np.array([step * rng.uniform(0.6, 3)])
+    density = np.array([size / (2 * volume * bench.shape[0])])
+
+    def transfers(e: F64, _: Frame) -> F64:
+        return np.asarray(
+            run_cdm_parallel(
+                np.ascontiguousarray(e),
+                beta,
+                volume,
+                step,
+                well,
+                1.2e7,
+                release,
+                density,
+                np.array([1e-10]),
+            )
+        )
+
+    bench.charge.append(transfers)
+    return {"release_rows": float(release[0] / step)}

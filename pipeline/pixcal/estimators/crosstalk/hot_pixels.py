@@ -136,28 +136,39 @@ def hot_pixels(
     if not exposures or not np.any(evidence.dark_rate):
         return None
     signal = evidence.dark_rate * max(exposures)
+    return hot_pixels_of(signal, _unsaturated(evidence), evidence.origin, links, known)
+
+
+def hot_pixels_of(
+    signal: F64,
+    usable: Mask,
+    origin: Place,
+    links: tuple[Place, ...],
+    known: Sequence[Coupling] = (),
+) -> HotPixels | None:
+    """The same of the mean signal (y, x) of darks, e-, of pixels that do not saturate."""
     rest = signal - median_filter(signal, 2 * REACH + 5, mode="reflect")
     _, noise = median_and_sigma(rest)
     if not noise > 0:
         return None
     highest = rest > OWN_RING * maximum_filter(rest, 2 * REACH + 1, mode="constant")
-    y, x = np.nonzero((rest > MIN_SIGMAS * noise) & highest & _unsaturated(evidence))
+    y, x = np.nonzero((rest > MIN_SIGMAS * noise) & highest & usable)
     order = np.argsort(-rest[y, x], kind="stable")[:MAX_PIXELS]
     y, x = y[order], x[order]
     if not len(y):
         return None
     least = MIN_SIGMAS * noise / 10
     warm = np.where((rest > least) & highest, rest, 0.0)
-    kept = 1 - outflow(known, rest.shape, evidence.origin)
+    kept = 1 - outflow(known, rest.shape, origin)
 
     def given(warm: F64) -> tuple[F64, F64]:
         """Charge (y, x) received from all hot pixels, e-; the share (h, link, 2) of each in it."""
         collected = warm / kept
-        got = couple(collected, known, evidence.origin) - collected * kept
+        got = couple(collected, known, origin) - collected * kept
         shares = np.zeros((len(y), len(links), 2))
         for c in known:
             source = np.zeros(rest.shape)
-            source[c.places(rest.shape, evidence.origin)[0]] = c.share
+            source[c.places(rest.shape, origin)[0]] = c.share
             step, side = ((c.dy, c.dx), 0) if (c.dy, c.dx) in links else ((-c.dy, -c.dx), 1)
             level = 1 + c.per_ke * 1e-3 * collected[y, x]
             shares[:, links.index(step), side] += source[y, x] * level / kept[y, x]

@@ -10,6 +10,7 @@ from pixcal.estimators.crosstalk.dense import CouplingFrames, Dense, frames_of, 
 from pixcal.estimators.crosstalk.links import links
 from pixcal.estimators.crosstalk.pattern import visibility_pattern
 from pixcal.estimators.crosstalk.support import Choice, choose
+from pixcal.estimators.crosstalk.trails import SURE, trailing
 from pixcal.estimators.diagnosis.evidence import Evidence, central_crop
 from pixcal.kernels.crosstalk import Coupling
 from pixcal.model.arrays import F64
@@ -80,6 +81,11 @@ def significance(evidence: Evidence) -> float | None:
 
 def _standing_out(evidence: Evidence) -> tuple[Evidence, CouplingFrames, Choice] | None:
     """The pixels examined, what frames tell of all their links, and the significant ones."""
+    if trailing(evidence) > SURE:
+        raise InputError(
+            "not decided: charge trails hot pixels in one direction, the farther they are from the "
+            "output the more, as incomplete charge transfer leaves it; this is no crosstalk"
+        )
     if not evidence.fringes:
         evidence = central_crop(evidence, MOST_PIXELS)
     every = links(evidence.good.shape)

@@ -21,6 +21,7 @@ from pixcal.model.flags import PixelFlag
 from pixcal.model.options import Reduce
 from pixcal.stages.reduce.black_cut_off import cut_off_warnings
 from pixcal.stages.reduce.calibration import FLAT_FLOOR, Finishing, calibration_writers, finish
+from pixcal.stages.reduce.charge_trails import trail_warnings
 from pixcal.stages.reduce.columns import run_noted, strip_width
 from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
 from pixcal.stages.reduce.detector_warnings import detector_warnings, lamp_warnings
@@ -245,6 +246,7 @@ def _report(
         light = source.survey.levels
         warnings += lamp_warnings([(g.exptime, light[list(g.frames)]) for g in job.flat])
     declared = source.detector.saturation_adu is not None
+    warnings += trail_warnings(made.folder / "calibration.zarr", source, found.gain)
     warnings += _dark_lines(ArrayReader(made.folder / "calibration.zarr" / "mask"), source.shape)
     for name, facts in sets.items():
         warnings += set_warnings(name, facts, declared, config.rounding_share)
