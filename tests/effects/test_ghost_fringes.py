@@ -212,11 +212,37 @@ def test_a_ghost_may_have_the_vector_of_the_fringes_of_another_set(
         assert abs(sign * own.beat_rad_px[axis] - beat[axis]) < 4 * error
 
 
+@pytest.mark.parametrize("apart", [0.0, 0.024])
+def test_ghosts_of_both_fibres_move_phases_where_they_are_not_in_phase(
+    acquired: Callable[..., Evidence], apart: float
+) -> None:
+    """A window reflects both fibres alike in every set, but its paths differ; a flat has no paths.
+
+    ``apart``: difference of the two beats, rad/px. The ghosts are in phase in the middle.
+    """
+    waves = []
+    for sign, key in ((1, "forward"), (-1, "backward")):
+        qx = 0.35 + sign * apart / 2
+        own = 0.02 * np.exp(1j * (0.35 - qx) * 33)
+        pair = own if key == "forward" else own.conjugate()
+        waves.append(
+            {
+                "beat_rad_px": [qx, 0.2],
+                "static": [float(own.real), -float(own.imag)],
+                key: [float(pair.real), float(pair.imag)],
+            }
+        )
+    found = GhostFringes.estimate(acquired(None, {"ghost_fringes": {"share": 0.0, "waves": waves}}))
+    assert found is not None
+    assert found.law == "ghosts of both fibres"
+    assert found.significance > 20 if apart else found.significance == 0
+
+
 @pytest.mark.long
 def test_a_pattern_of_mean_light_and_fringes_alike_in_all_sets_is_the_flats(
     acquired: Callable[..., Evidence],
 ) -> None:
-    """Ghosts of both fibres, of one vector and strength in every set, would be a coincidence."""
+    """Ghosts of both fibres that are in phase everywhere are the same, and move no offset."""
     on = {"share": 2e-3, "phase_rad": 1.0, "parent": "both"}
     evidence = acquired(None, {"ghost_fringes": on})
     found = GhostFringes.estimate(evidence)

@@ -37,8 +37,11 @@ TWO_GHOSTS = 25.0
 # largest misfit of the law of a beam over that of unrelated amplitudes, per degree of freedom;
 # ghosts of both fibres, taken only where they fit far better, always pass
 UNTIED = 0.75
-# largest differences between sets, relative and in errors, of a pattern of the flat
+# largest differences between sets, relative and in errors, of a pattern of the flat,
 ALIKE, ALIKE_SIGMAS = 0.1, 5.0
+# and largest wave of the phase relative to it, as of crosstalk; distance, periods in the window, of
+# the waves that together describe a curved one
+PHASE_SHARE, CLOSE = 0.05, 1.5
 
 
 @dataclass(frozen=True)
@@ -262,20 +265,28 @@ def _of_a_beam(waves: Sequence[WaveFit], tied: TiedWaves, evidence: Evidence) ->
 
 
 def _of_the_flat(waves: Sequence[WaveFit], evidence: Evidence) -> bool:
-    """Whether the waves of all sets are one pattern of the light, as from an error of the flat."""
+    """Whether the waves of all sets are one pattern of the light, as from an error of the flat.
+
+    Such a pattern multiplies mean light and fringes alike, and leaves the phases. Ghosts of both
+    fibres do so only where they are in phase.
+    """
     first = waves[0]
     same = [w for w in waves if w.q == first.q]
+    near = 2 * np.pi * CLOSE / np.array(evidence.good.shape[::-1])
+    close = [w for w in waves if np.all(np.abs(np.subtract(w.q, first.q)) < near)]
 
-    def alike(one: complex, other: complex, of_one: float, of_other: float) -> bool:
-        apart = ALIKE * abs(first.static) + ALIKE_SIGMAS * float(np.hypot(of_one, of_other))
-        return abs(one - other) < apart
+    def alike(one: WaveFit) -> bool:
+        apart = ALIKE_SIGMAS * float(np.hypot(one.errors[0], first.errors[0]))
+        return abs(one.static - first.static) < ALIKE * abs(first.static) + apart
+
+    def leaves_phases(of: str) -> bool:
+        own = [w for w in close if w.set == of]
+        moved = np.linalg.norm([w.forward - w.backward.conjugate() for w in own])
+        error = np.linalg.norm([w.errors[1:3] for w in own])
+        return bool(moved < PHASE_SHARE * abs(first.static) + ALIKE_SIGMAS * error)
 
     return (
         any(evidence.of_kind("flat"))
         and len(same) == len(evidence.fringes)
-        and all(
-            alike(w.static, first.static, w.errors[0], first.errors[0])
-            and alike(w.forward, w.backward.conjugate(), w.errors[1], w.errors[2])
-            for w in same
-        )
+        and all(alike(w) and leaves_phases(w.set) for w in same)
     )
