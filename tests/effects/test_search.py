@@ -517,6 +517,15 @@ def test_a_replay_is_taken_whose_law_is_without_promise() -> None:
     assert left < 0.05
 
 
+def test_where_a_replay_is_not_enough_all_candidates_are_told_so() -> None:
+    """It may gain enough for a law, but not for a replay; the others have no promise."""
+    wrong, other = candidate("left", 0.1), candidate("right", 0.03)
+    wrong.replay = candidate("left", 0.003).estimate.effect  # type: ignore[union-attr]
+    found, _ = search({"left": 0.003}, [wrong, other])
+    assert not found.accepted
+    assert all(c.reason for c in found.candidates.values())
+
+
 @pytest.mark.parametrize(
     ("companion", "accepted"), [("little", ("left",)), ("more", ("more", "left"))]
 )

@@ -216,8 +216,11 @@ class Search:
             enough = {n: r.gain for n, r in replays.items() if r.gain >= MIN_LOGLIK_GAIN_WEAK}
             gains |= enough
             laws |= {name: replays[name] for name in enough}
-        for name in gains.keys() - enough.keys():
-            candidates[name].reason = rejection.gain_too_small(gains[name], candidates[name])
+        # Where a replay seemed enough, candidates without promise were simulated once only.
+        for name in (gains if enough else self._remaining).keys() - enough.keys():
+            candidates[name].reason = rejection.gain_too_small(
+                gains.get(name, 0.0), candidates[name]
+            )
         if not enough:
             return gains, None, ""
         best = self._best(enough)
