@@ -194,6 +194,10 @@ def test_a_knee_is_measured_to_a_hundredth_of_its_size(acquired: Callable[..., E
     charge = found.effect.linearised(truth.response(lit)).astype(float)
     rest = charge - np.polyval(np.polyfit(lit, charge, 1), lit)
     assert rest.std() < 12.0
+    # The size is that of the curve, not of the polynomial that describes it poorly.
+    at = float(found.size["of"].split()[-2])
+    true = float(np.interp(at, levels, lost)) / at
+    assert abs(found.size["value"] - true) < 5 * found.size["error"] < -0.1 * true
 
 
 @pytest.mark.long

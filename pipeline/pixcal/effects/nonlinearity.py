@@ -1,6 +1,6 @@
 """Response of the pixel and its amplifier that is not a straight line."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +27,7 @@ FALLOFF_PX = 0.5  # falloff of boundary shifts (brighter-fatter effect) fitted w
 # levels at which a response is measured, from the darkest samples (0) to the brightest (1)
 KNOTS = np.array([0, 1 / 64, 1 / 32, *np.arange(1, 17) / 16])
 BEYOND = 4  # points beyond the brightest fringe, up to the brightest flat
+LOW = 0.3  # share of the range of levels whose signals set the line of a measured curve
 TAIL = 1e-3  # share of samples below, and above, the range of levels
 # least chi-square of a measured response added to a polynomial, over that of the polynomial
 BESIDE = 0.05
@@ -176,7 +177,7 @@ class Nonlinearity(Effect):
             law="response curve of second and third order",
             by_law=effect,
             refused=refused,
-            size=found.size,
+            size=_size_of_curve(curve, more[1], found.error),
         )
 
     @classmethod
@@ -196,11 +197,19 @@ class _Polynomial:
     top_e: float  # highest level measured
 
     @property
-    def size(self) -> dict[str, object]:
+    def _terms(self) -> F64:
         # A power that flats do not constrain has size zero and a large error; it is left out.
-        terms = (self.top_e / self.level_e) ** np.array([1, 2]) * (self.sizes != 0)
-        error = float(np.sqrt(terms @ self.covariance @ terms))
-        return _size(self.top_e, self.top_e * float(terms @ self.sizes), self.top_e * error)
+        return np.asarray((self.top_e / self.level_e) ** np.array([1, 2]) * (self.sizes != 0))
+
+    @property
+    def error(self) -> float:
+        """Of the deviation at the highest level, relative to that level."""
+        return float(np.sqrt(self._terms @ self.covariance @ self._terms))
+
+    @property
+    def size(self) -> dict[str, object]:
+        change = float(self._terms @ self.sizes)
+        return _size(self.top_e, self.top_e * change, self.top_e * self.error)
 
     @property
     def chi2(self) -> float:
@@ -247,6 +256,22 @@ def _size(charge: float, change: float, error: float) -> dict[str, object]:
         "unit": "",
         "of": f"off a straight line through low signals, at {at}",
     }
+
+
+def _size_of_curve(
+    curve: Nonlinearity, errors: Sequence[float], by_law_error: float
+) -> dict[str, object]:
+    """Size of a measured curve at its highest level; ``errors``: of its points, e-."""
+    levels = np.array([point.level_e for point in curve.bends[1:]])
+    low = levels[levels < levels[0] + LOW * np.ptp(levels)]
+    # Fringes determine neither factor nor offset of the charge: low signals define them.
+    factor, offset = np.polyfit(low, curve.response(low.astype(np.float32)), 1)
+    top = factor * levels[-1] + offset
+    unit = 10.0 ** (np.floor(np.log10(top)) - 1)
+    top = np.floor(top / unit) * unit  # as it is told
+    signal = float(curve.response(np.array([(top - offset) / factor], np.float32))[0])
+    error = np.hypot(by_law_error * top, errors[len(levels)])
+    return _size(top, signal - top, error)
 
 
 def _bends(
