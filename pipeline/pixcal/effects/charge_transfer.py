@@ -54,8 +54,9 @@ class ChargeTransfer(Effect):
     power: float = quantity(
         0.6, low=0, high=1.5, doc="power of the charge that the charge left behind goes with"
     )
-    level_e: float = quantity(10_000.0, unit="e-", above=0, high=1e7, doc="charge that rows and "
-                              "columns refer to")  # fmt: skip
+    level_e: float = quantity(
+        10_000.0, unit="e-", above=0, high=1e7, doc="charge that rows and columns refer to"
+    )
 
     @property
     def halo(self) -> int:
@@ -106,18 +107,16 @@ class ChargeTransfer(Effect):
             level_e=best.level_e,
         )
         errors = {"rows": rows.loss[1], "columns": columns.loss[1], "power": best.power[1]}
-        value, of = made.rows, "rows"
-        if made.columns > made.rows:
-            value, of = made.columns, "columns"
+        of = "columns" if made.columns > made.rows else "rows"
+        size = {"value": getattr(made, of), "error": errors[of], "unit": ""}
         return Estimate(
             made,
             errors,
             trailing(evidence),
             "charge trails hot pixels in one direction, the farther they are from the output the "
             "more",
-            size={"value": value, "error": errors[of], "unit": "",
-                  "of": f"of {best.level_e:.2g} e- per transfer of {of}"},
-        )  # fmt: skip
+            size=size | {"of": f"of {best.level_e:.0f} e- per transfer of {of}"},
+        )
 
 
 def _length(release: float) -> int:
