@@ -6,12 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from all_frames import frames_of
+from numpy_detectors import Detector
 
 from pixcal.effects.excess_noise import ExcessNoise
 from pixcal.effects.gain_error import GainError
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.recording import recordings
+from pixcal.stages import reduce
+from pixcal.stages.diagnose.parts import RawFrames, evidence_of
+from pixcal.stages.diagnose.windows import whole_of
+from pixcal.stages.reduce.black_cut_off import Black
 
 
 @pytest.mark.parametrize("excess", [0.5, 1.0])
@@ -70,3 +75,16 @@ def test_the_third_moment_decides_what_the_noise_is(
     assert (gain.significance > 5) != named
     if named:
         assert noise.effect.excess == pytest.approx(1, abs=4 * noise.errors["excess"])  # type: ignore[attr-defined]
+
+
+def test_halves_of_the_frames_know_what_the_whole_run_shows() -> None:
+    """Four flats of a level tell the third moment, two of each half do not."""
+    seen = {}
+    for factor in (1.0, 2.0):
+        black = Black({}, excess_noise_factor=factor)
+        detector = Detector(flats=((0.1, 2, 1), (0.3, 2, 1)))
+        frames, tables = detector.frames(3)
+        raw = RawFrames(detector.described(), frames, tables, reduce.Config(), black)
+        whole = whole_of(detector.shape)
+        seen[factor] = evidence_of(raw, whole, detector.shape).excess_noise_factor
+    assert seen == {1.0: 1.0, 2.0: 2.0}

@@ -61,13 +61,15 @@ def evidence_of(
     for listed in acquisition.frames.fringes:
         fringes[listed.name] = _fringes(run_dir, ingested, listed, (y, x), frames, (origin, window))
     used = read_json(run_dir / "reduce" / "reduce.json")
+    gain = used["gain_e_per_adu"]
     without_dark = None if black is None else black.without_dark
+    excess = max(1.0 if black is None else black.excess_noise_factor, excess_noise_factor(gain))
     if without_dark is None:
-        without_dark = bool(used["gain_e_per_adu"].get("without_dark"))
+        without_dark = bool(gain.get("without_dark"))
     return Evidence(
         fringes=fringes,
         stacks=_stacks(ingested, (y, x)),
-        gain=float(used["gain_e_per_adu"]["used"]),
+        gain=float(gain["used"]),
         read_noise=float(used["read_noise_e"]["used"]),
         amplifier_noise=float(used["read_noise_e"]["before_rounding"]),
         read_noise_error=float(used["read_noise_e"].get("used_error") or np.nan),
@@ -79,11 +81,11 @@ def evidence_of(
         wavelength_nm=acquisition.fibres.wavelength_nm,
         distance_mm=acquisition.fibres.distance_mm,
         origin=origin,
-        photon_transfer=_photon_transfer(used["gain_e_per_adu"]),
+        photon_transfer=_photon_transfer(gain),
         step_adu=max(int(ingested.quantum), 1),
-        neighbours=tuple((y, x) for y, x in used["gain_e_per_adu"]["neighbours"]),
+        neighbours=tuple((y, x) for y, x in gain["neighbours"]),
         without_dark=without_dark,
-        excess_noise_factor=_excess_noise_factor(used["gain_e_per_adu"]),
+        excess_noise_factor=excess,
         subtracted_dark=float(used.get("subtracted_dark_e_s") or 0.0),
     )
 
@@ -95,7 +97,7 @@ def _photon_transfer(gain: dict[str, Any]) -> tuple[float, float, float]:
     return value, error, chi2
 
 
-def _excess_noise_factor(gain: dict[str, Any]) -> float:
+def excess_noise_factor(gain: dict[str, Any]) -> float:
     """F² of electrons that are multiplied, else 1."""
     return float(gain["measured"] / gain["of_noise"][0]) if gain.get("of_noise") else 1.0
 

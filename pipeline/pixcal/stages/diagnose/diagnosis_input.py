@@ -26,7 +26,7 @@ from pixcal.stages.diagnose.measure_nominal import nominal_bench
 from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, RunFrames, evidence_of, take
 from pixcal.stages.diagnose.trial import Curves, Window, averaged, measured_curves
 from pixcal.stages.diagnose.windows import chosen_windows
-from pixcal.stages.evidence import Part
+from pixcal.stages.evidence import Part, excess_noise_factor
 from pixcal.stages.reduce.black_cut_off import Black
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.manifest import read_json
@@ -125,7 +125,12 @@ def _run_frames(run_dir: Path, ingested: Ingested, reduced: Mapping[str, Any]) -
         in_series(ingested.tables),
         {name: array.dtype for name, array in ingested.arrays.items()},
         parse(reduce.Config, known, str(run_dir / "reduce" / "manifest.json")),
-        Black(ingested.cut_off, gain.get("without_dark"), subtracted / float(gain["used"])),
+        Black(
+            ingested.cut_off,
+            gain.get("without_dark"),
+            subtracted / float(gain["used"]),
+            excess_noise_factor(gain),
+        ),
     )
 
 

@@ -74,6 +74,7 @@ class Black(NamedTuple):
     without_dark: bool | None = None
     # dark signal (ADU/s) that the camera subtracts: see `subtracted_dark`
     subtracted: float = 0.0
+    excess_noise_factor: float = 1.0  # `Evidence.excess_noise_factor`, which needs three flats
 
 
 class _Counts(NamedTuple):

@@ -24,11 +24,12 @@ def trail_warnings(calibration: Place, source: Ingested, gain: float) -> list[st
     usable = bias + rate * seconds / gain < _FULL * source.saturation("dark")
     found = hot_pixels_of(rate * seconds, usable, (y0, x0), LINKS)
     trails = None if found is None else trails_of(found, rate.shape, (y0, x0))
+    middle = (y0 + y1) / 2, (x0 + x1) / 2
     said = [
-        f"along {lines} that are read out towards {line} {one.output}, {with_error(*one.loss)} of "
-        f"{one.level_e:.0f} e- per transfer"
-        for one, lines, line in zip(
-            trails or (), ("columns", "rows"), ("row", "column"), strict=False
+        f"along {lines} that are read out towards the {'first' if one.output <= first else 'last'} "
+        f"{line}, {with_error(*one.loss)} of {one.level_e:.0f} e- per transfer"
+        for one, lines, line, first in zip(
+            trails or (), ("columns", "rows"), ("row", "column"), middle, strict=False
         )
         if one.significance > SURE
     ]
