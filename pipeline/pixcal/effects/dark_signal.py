@@ -57,6 +57,8 @@ class DarkSignal(Effect):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """What the visibilities of fringe sets share, as charge in the time of an exposure."""
+        if not evidence.fringes:
+            return None
         if evidence.of_kind("dark"):
             return Estimate(cls(0.0), {}, 0.0, WHY, refused="dark frames measure it")
         sets = [
