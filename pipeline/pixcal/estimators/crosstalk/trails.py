@@ -110,7 +110,7 @@ def _zero(at: Indices, values: F64, weight: F64, back: bool) -> int:
 
 
 def _ranks(values: NDArray[Any]) -> F64:
-    """Ranks, the mean of them for equal values; scipy.stats takes half a second to import."""
+    """Ranks, the mean of them for equal values; not from scipy.stats, which is slow to import."""
     _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
     return np.asarray((counts.cumsum() - (counts - 1) / 2)[places])
 
