@@ -24,7 +24,7 @@ class ChargeTransfer(Effect):
     name = "charge_transfer"
     title = "charge-transfer inefficiency"
     acts_at = Stage.SIGNAL
-    order = 0
+    order = -1
     domains = ("space", "noise")
     strengths = ("rows", "columns")
     frames_needed = ("dark",)

@@ -143,7 +143,8 @@ def treatment_of_kind(kind: type[Effect], model: str, models: Mapping[str, str])
         return _of_curved_fringes(model, models)
     if kind.absorbed_because:
         return "absorbed by the fit", kind.absorbed_because
-    return "not corrected", kind.left_because or "its file has no method to correct it"
+    why = kind.left_because or kind.remedy or "its file has no method to correct it"
+    return "not corrected", why
 
 
 def _of_curved_fringes(requested: str, models: Mapping[str, str]) -> tuple[str, str]:
