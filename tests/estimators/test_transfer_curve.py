@@ -283,9 +283,9 @@ def test_some_links_are_measured_as_among_all() -> None:
     among, alone = (frames_of([given], lambda _, own=own: own) for own in (every, near))
     assert among is not None
     assert alone is not None
-    some = among.of_steps(near)
-    assert some.steps == alone.steps
-    for one, other in ((some.noise, alone.noise), (some.hot, alone.hot)):
+    some, alone_links = among.of_steps(near).links, alone.links
+    assert some.links == alone_links.links
+    for one, other in ((some.products, alone_links.products), (some.hot, alone_links.hot)):
         assert one is not None
         assert other is not None
         for key, value in vars(other).items():

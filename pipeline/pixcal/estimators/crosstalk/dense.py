@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from pixcal.estimators.crosstalk.covariance import Products, products
-from pixcal.estimators.crosstalk.hot_pixels import HotPixels, hot_pixels
+from pixcal.estimators.crosstalk.hot_pixels import hot_pixels
 from pixcal.estimators.crosstalk.information import MeasuredLinks, to_first_order
 from pixcal.estimators.crosstalk.links import PixelClasses, Place, links
 from pixcal.estimators.crosstalk.pattern import pattern_information
@@ -55,30 +55,22 @@ class CouplingFrames:
     """What frames measure of the couplings of some steps, before pixels are joined in classes."""
 
     evidence: Evidence
-    noise: Products | None
-    hot: HotPixels | None
-    steps: tuple[Place, ...]
+    links: MeasuredLinks  # as measured, of any order in the shares
 
     def measured(self, known: Sequence[Coupling], per_ke: float = 0.0) -> MeasuredLinks:
         """The same to first order in the shares; known shares give the second order."""
         large = [replace(c, per_ke=per_ke) for c in known if abs(c.share) > NEGLIGIBLE]
-        shape, first = self.evidence.good.shape, self.evidence.origin
-        noise, hot = self.noise, self.hot
+        own = self.links
+        noise, hot = own.products, own.hot
         if noise is not None:
-            noise = to_first_order(noise, large, self.steps, first)
+            noise = to_first_order(noise, large, own.links, own.first)
         if hot is not None:
-            hot = hot.corrected(outflow(large, shape, first), per_ke)
-        return MeasuredLinks(noise, hot, self.steps, shape, first)
+            hot = hot.corrected(outflow(large, own.shape, own.first), per_ke)
+        return replace(own, products=noise, hot=hot)
 
     def of_steps(self, steps: tuple[Place, ...]) -> "CouplingFrames":
         """What they measure of some of the steps."""
-        at = [self.steps.index(step) for step in steps]
-        noise, hot = self.noise, self.hot
-        if noise is not None:
-            noise = replace(noise, right=noise.right[at], normal=noise.normal[at])
-        if hot is not None:
-            hot = replace(hot, value=hot.value[:, at], sigma=hot.sigma[:, at])
-        return replace(self, noise=noise, hot=hot, steps=steps)
+        return replace(self, links=self.links.of([self.links.links.index(s) for s in steps]))
 
     def kernel(
         self, classes: PixelClasses, known: Sequence[Coupling], per_ke: float = 0.0
@@ -90,12 +82,12 @@ class CouplingFrames:
         """
         every = tuple(
             coupling_of(classes, *divmod(u, 2), step)
-            for step in self.steps
+            for step in self.links.links
             for u in range(2 * classes.count)
         )
         if len(every) > MAX_SHARES:
             return None
-        shrinkage = ShareShrinkage.of(self.steps, classes.count)
+        shrinkage = ShareShrinkage.of(self.links.links, classes.count)
         shares = _shares_of(every, known)
         found = None
         for _ in range(ROUNDS):
@@ -139,7 +131,8 @@ def frames_of(
     total = _sum(noise)
     if first is None or (total is None and hot is None):
         return None
-    return CouplingFrames(first, total, hot, steps)
+    shape, origin = first.good.shape, first.origin
+    return CouplingFrames(first, MeasuredLinks(total, hot, steps, shape, origin))
 
 
 def dense_kernel(parts: Iterable[Evidence], start: Sequence[Coupling]) -> Dense | None:

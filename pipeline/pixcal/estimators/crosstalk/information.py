@@ -44,7 +44,7 @@ def total(information: Information) -> tuple[F64, F64]:
 
 @dataclass(frozen=True)
 class MeasuredLinks:
-    """Measurements of some links, corrected for known terms of second order."""
+    """Measurements of some links."""
 
     products: Products | None
     hot: HotPixels | None
@@ -133,11 +133,9 @@ def _shares(right: F64, normal: F64, read: float) -> tuple[F64, F64]:
 def to_first_order(
     found: Products, couplings: Sequence[Coupling], links: Sequence[Place], first: Place
 ) -> Products:
-    """Products that are first order in the shares, from the measured products.
-
-    A pixel keeps only a part of its charge; third pixels give to both partners; shares may change
-    with the charge; and the unit of all is the shot noise of a pixel.
-    """
+    """Products that are first order in the shares, from the measured products."""
+    # A pixel keeps only a part of its charge; third pixels give to both partners; shares may change
+    # with the charge; and the unit of all is the shot noise of a pixel.
     shape = found.right.shape[-2:]
     right = found.right / np.float32(found.shot)
     kept = 1 - outflow(couplings, shape, first)
@@ -168,10 +166,8 @@ def to_first_order(
 def level_dependence(
     found: Products, couplings: Sequence[Coupling], links: Sequence[Place]
 ) -> tuple[float, float]:
-    """Remaining relative change of the coupling with source charge (1/ke-), and its error.
-
-    From covariance whose rise with the square of the charge differs from that of the variance.
-    """
+    """Remaining relative change of the coupling with source charge (1/ke-), and its error."""
+    # From covariance whose rise with the square of the charge differs from that of the variance.
     sizes = {(c.dy, c.dx): 0.0 for c in couplings}
     lost = got = 0.0
     for c in couplings:

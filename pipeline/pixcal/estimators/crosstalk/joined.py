@@ -53,7 +53,7 @@ def measure(evidence: Evidence) -> Kernel | None:
     none = Kernel((), np.zeros((0, 0)), found.significance, (), 0.0, np.inf)
     if not found.links:
         return none
-    near = within(evidence.good.shape, {frames.steps[n] for n in found.links})
+    near = within(evidence.good.shape, {frames.links.links[n] for n in found.links})
     own: CouplingFrames | None = frames.of_steps(near)
     del frames, stands_out  # large
     known: tuple[Coupling, ...] = ()
@@ -68,7 +68,7 @@ def measure(evidence: Evidence) -> Kernel | None:
                 "not decided: a kernel of that period has more couplings than can be measured"
             )
         dense, per_ke, error = _level(own, dense, found, per_ke)
-        known = tuple(c for c in dense.couplings) if dense else ()
+        known = dense.couplings
     assert dense is not None
     return _significant_kernel(dense, replace(none, per_ke=per_ke, per_ke_error=error))
 
