@@ -191,11 +191,10 @@ class BiasDrift(Effect):
 
     @classmethod
     def _through(cls, evidence: Evidence) -> Estimate | None:
-        """Drift through all frames on a common time axis.
-
-        Bias frames separate it from a change of the dark current. Variation in few frames that both
-        a walk and a ramp explain is attributed to the walk, as a ramp would grow without limit.
-        """
+        """Drift through all frames on a common time axis."""
+        # Bias frames separate it from a change of the dark current. Variation in few frames that
+        # both a walk and a ramp explain is attributed to the walk, as a ramp would grow without
+        # limit.
         every = _all_series(evidence)
         if not every:
             return None

@@ -177,11 +177,9 @@ def _shared_power(pairs: list[tuple[F64, F64]], pixels: int) -> F64:
 
 
 def _smooth(neighbours: F64, ring: "Ring") -> tuple[float, float, float]:
-    """Variance of the smooth part, its error by noise, and its error as a sample of its kind.
-
-    From the covariance of neighbours; from waves of one length if these explain it, as they are
-    better known.
-    """
+    """Variance of the smooth part, its error by noise, and its error as a sample of its kind."""
+    # From the covariance of neighbours; from waves of one length if these explain it, as they are
+    # better known.
     variance, noise = float(neighbours.mean()), float(neighbours.std() / np.sqrt(neighbours.size))
     if abs(ring.variance - variance) < AGREE * np.hypot(noise, ring.noise):
         return ring.variance, ring.noise, ring.error

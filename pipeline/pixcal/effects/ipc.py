@@ -166,10 +166,8 @@ class Ipc(Effect):
         )
 
     def measured_again(self, parts: Iterable[Evidence]) -> Estimate | None:
-        """All couplings within two pixels, and those found beyond, with the period found before.
-
-        Shares that are not significant are shrunk by their errors.
-        """
+        """All couplings within two pixels, and those found beyond, with the period found before."""
+        # Shares that are not significant are shrunk by their errors.
         if not self.couplings or any(c.per_ke for c in self.couplings):
             return None
         found = dense_kernel(parts, self.couplings)

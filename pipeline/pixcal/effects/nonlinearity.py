@@ -318,11 +318,9 @@ def _full_scale(evidence: Evidence, usual: float) -> float:
 
 
 def _of_noise(evidence: Evidence, level_e: float) -> tuple[F64, F64] | None:
-    """(quadratic, cubic) and covariance from photon transfer; None with too few levels.
-
-    A signal ``S (1 + q u)`` has variance ``S (1 + 2 q u)²``; their ratio rises as 1 + 3 q u. The
-    cubic term is zero unless the ratio bends significantly.
-    """
+    """(quadratic, cubic) and covariance from photon transfer; None with too few levels."""
+    # A signal ``S (1 + q u)`` has variance ``S (1 + 2 q u)²``; their ratio rises as 1 + 3 q u. The
+    # cubic term is zero unless the ratio bends significantly.
     curve = transfer_curve(evidence)
     if curve is None:
         return None

@@ -136,10 +136,8 @@ class Pickup(Effect):
 
 
 def _noise(evidence: Evidence) -> tuple[F32, Mask] | None:
-    """Differences of frames (t, y, x) over root two, e-, without what all pixels share.
-
-    Zero in bad pixels. None without two frames of a kind whose noise spans a step.
-    """
+    """Differences of frames (t, y, x) over root two, e-, without what all pixels share."""
+    # Zero in bad pixels. None without two frames of a kind whose noise spans a step.
     middle = tuple(slice(max((n - _SIDE) // 2, 0), (n + _SIDE) // 2) for n in evidence.good.shape)
     good = evidence.good[middle]
     if min(good.shape) < _LEAST or not evidence.dithered:
@@ -200,10 +198,8 @@ def _search(frames: F32) -> tuple[F64, F64]:
 
 
 def _over_next_highest(power: F64) -> F64:
-    """Modes (n,) along one axis over the mean of those within an octave; zero for no tone.
-
-    The highest modes are differences of even and odd lines.
-    """
+    """Modes (n,) along one axis over the mean of those within an octave; zero for no tone."""
+    # The highest modes are differences of even and odd lines.
     found, end = np.zeros(len(power)), len(power) - 2
     for k in range(_FIRST, end):
         about = np.concatenate([power[k // 2 : k - 1], power[k + 2 : min(2 * k, end) + 1]])

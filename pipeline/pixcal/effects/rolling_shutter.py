@@ -173,11 +173,9 @@ class RollingShutter(Effect):
         return np.full(maps.theta.shape[1:], (1 + np.median(left)) ** -0.5)
 
     def _changes(self, frames: FittedFrames) -> Iterator[tuple[F64, F64]]:
-        """Shares of the window's rows (y,), and changes of the frames (t, 3) for a share of one.
-
-        Minus the part that the frames' parameters absorb: the mean of all rows and, if vectors are
-        free, slopes.
-        """
+        """Shares of the window's rows (y,), and changes of the frames (t, 3) for a share of one."""
+        # Minus the part that the frames' parameters absorb: the mean of all rows and, if vectors
+        # are free, slopes.
         g, rows = frames.g, np.arange(frames.rows[1], dtype=float)
         turned = np.stack([np.zeros(len(g)), -g[:, 2], g[:, 1]], axis=1)
         size = np.maximum(np.sum(turned**2, axis=1), 1e-30)[:, None]

@@ -118,11 +118,9 @@ def _sharpest(motion: Motion) -> float:
 def _hops(
     motion: Motion, jumps: Sequence[Hop], *, walks: bool
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Size and rate of the hops, both upwards and downwards.
-
-    Significant hops are the start; the likelihood accounts for short dwell times (with a walk, it
-    fits the rate only), unless the wavelength does more than hop between two levels.
-    """
+    """Size and rate of the hops, both upwards and downwards."""
+    # Significant hops are the start; the likelihood accounts for short dwell times (with a walk, it
+    # fits the rate only), unless the wavelength does more than hop between two levels.
     size, error = np.array([abs(h.size) for h in jumps]), np.array([h.error for h in jumps])
     weight = 1 / error**2
     seconds = sum(len(s) * s.step_s for s in motion.raw)

@@ -12,11 +12,9 @@ OF_THE_NANNY = "65536"  # MALLOC_TRIM_THRESHOLD_ that Dask's nanny sets for its 
 
 
 def keep_freed_memory() -> None:
-    """Let glibc's malloc reuse buffers in a worker of a Dask nanny.
-
-    The nanny sets MALLOC_TRIM_THRESHOLD_, which stops malloc from adapting: fresh pages for each
-    chunk make a sweep 3 to 4 times slower. The limits here are those that malloc would adapt to.
-    """
+    """Let glibc's malloc reuse buffers in a worker of a Dask nanny."""
+    # The nanny sets MALLOC_TRIM_THRESHOLD_, which stops malloc from adapting: fresh pages for each
+    # chunk make a sweep 3 to 4 times slower. The limits here are those that malloc would adapt to.
     if os.environ.get("MALLOC_TRIM_THRESHOLD_") == OF_THE_NANNY:
         _mallopt({_MMAP_THRESHOLD: 32 << 20, _TRIM_THRESHOLD: 64 << 20})
 

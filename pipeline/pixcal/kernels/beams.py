@@ -122,11 +122,9 @@ class Light:
 
 
 def with_margin(light: LightMaps, margin: int) -> LightMaps:
-    """The light with a margin of pixels like those at the edge, in which the fringes continue.
-
-    The phase continues by its step along each row, and from row to row at the edge, so a part of
-    the window has the same margin as the whole at common edges.
-    """
+    """The light with a margin of pixels like those at the edge, in which the fringes continue."""
+    # The phase continues by its step along each row, and from row to row at the edge, so a part of
+    # the window has the same margin as the whole at common edges.
     z = light.alpha_cos + 1j * light.alpha_sin
     beyond = np.arange(1, margin + 1)
     step = np.angle(np.sum(z[:, 1:] * z[:, :-1].conj(), axis=1))[:, None]

@@ -123,12 +123,10 @@ def shared_noise(
 
 
 def _slopes(shifts: F64, dy: int, dx: int, axes: tuple[float, float]) -> F32:
-    """Derivative of the charge a pixel gains through its boundaries by the charge of another.
-
-    Two factors (2, 4) for the boundaries to the right, to the left, below and above: of the charge
-    on both sides, as the other pixel moves the boundary; and of the boundary's shift, as the other
-    pixel, if it is the neighbour across, changes that charge.
-    """
+    """Derivative of the charge a pixel gains through its boundaries by the charge of another."""
+    # Two factors (2, 4) for the boundaries to the right, to the left, below and above: of the
+    # charge on both sides, as the other pixel moves the boundary; and of the boundary's shift, as
+    # the other pixel, if it is the neighbour across, changes that charge.
 
     def slope(y: int, x: int, axis: int) -> float:
         i, j = y + REACH, x + REACH - 1

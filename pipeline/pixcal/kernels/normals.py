@@ -75,10 +75,8 @@ def philox(
 def _fill(
     key: np.uint32, other: np.uint32, frame: np.uint32, first: int, words: U32, pairs: F32
 ) -> None:
-    """Fill (2, pair of rows, 2, x) from pair ``first`` on: one counter for each pair and column.
-
-    ``words`` (4, x) is scratch.
-    """
+    """Fill (2, pair of rows, 2, x) from pair ``first`` on: one counter for each pair and column."""
+    # ``words`` (4, x) is scratch.
     for i in range(pairs.shape[1]):
         _draw(np.uint32(first + i), frame, key, other, words)
         _box_muller(words[0], words[1], pairs[0, i, 0], pairs[1, i, 0])

@@ -150,11 +150,9 @@ _POWERS = (2.0, 3.0, 6.0)  # of charge that pushes (2, 3), of capacitance
 
 
 def _shared_noise(shares: F64, error: float) -> tuple[F64, float]:
-    """Weight of each of the shares in the noise that all share, and its variance.
-
-    ``shares``: covariances (12,) at `LAGS` over the shot noise, each with this error. The average
-    over sizes and powers, each with the weight of its evidence, as of the gain (`gain_fit`).
-    """
+    """Weight of each of the shares in the noise that all share, and its variance."""
+    # ``shares``: covariances (12,) at `LAGS` over the shot noise, each with this error. The average
+    # over sizes and powers, each with the weight of its evidence, as of the gain (`gain_fit`).
     count = len(LAGS)
     # The mean subtracted from a block is of shared noise, and so larger.
     seen, twice = np.eye(count) - 2 / BLOCK**2, 2 * (1 + 1 / BLOCK**2)

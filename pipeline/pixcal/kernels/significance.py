@@ -28,10 +28,8 @@ def root_with_error(
 
 
 def sigmas_of_chi2(value: float, dof: int) -> float:
-    """Standard deviations of a normal that are as rare as a chi-square this large.
-
-    By chance alone the result is a standard normal; it is negative for a small chi-square.
-    """
+    """Standard deviations of a normal that are as rare as a chi-square this large."""
+    # By chance alone the result is a standard normal; it is negative for a small chi-square.
     if value > _LARGE:
         # The logarithm of so small a probability underflows; this is its leading order.
         return math.sqrt(value - (dof - 1) * math.log(value / dof))

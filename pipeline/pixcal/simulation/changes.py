@@ -145,11 +145,9 @@ class Changes:
         return Response(random, mixes, tuple(dict.fromkeys([*keys, *(pairs if mixes else ())])))
 
     def _is_sound(self, key: Key, draw: Draw) -> bool:
-        """Whether a change of a deviation is no common change of another origin.
-
-        Offsets scatter from pixel to pixel in maps. Levels of frames without light drift; they
-        count for a model of whole frames alone.
-        """
+        """Whether a change of a deviation is no common change of another origin."""
+        # Offsets scatter from pixel to pixel in maps. Levels of frames without light drift; they
+        # count for a model of whole frames alone.
         of, name = key
         if name == "maps":
             return is_smooth(draw[key], self.measured(key).weight)

@@ -62,10 +62,8 @@ def weighed(maps: F64) -> Deviation:
 
 
 def common_precision(maps: F64) -> F64:
-    """Inverse covariance (m, m) of the noise of maps (m, y, x) of the same pixels.
-
-    From steps between neighbours along both axes, without outliers (`WILD_STEP`).
-    """
+    """Inverse covariance (m, m) of the noise of maps (m, y, x) of the same pixels."""
+    # From steps between neighbours along both axes, without outliers (`WILD_STEP`).
     steps = np.concatenate([np.diff(maps, axis=a).reshape(len(maps), -1) for a in (1, 2)], axis=1)
     steps = steps[:, np.isfinite(steps).all(axis=0)]
     usual = SIGMA_OF_MAD * np.median(np.abs(steps), axis=1, keepdims=True)
@@ -128,10 +126,8 @@ class _Deviations:
         return Deviation(pair_sums(values, self.good) - taken, _inverse(variance))
 
     def pairs_between(self, noise: F32, other: F32, per_adu: F32) -> F64:
-        """Change of ``pairs`` if noise (t, y, x) of the first frames, ADU, becomes ``other``.
-
-        An ADU is ``per_adu`` (y, x) reduced electrons.
-        """
+        """Change of ``pairs`` if noise (t, y, x) of the first frames, ADU, becomes ``other``."""
+        # An ADU is ``per_adu`` (y, x) reduced electrons.
         before, after = (
             pair_sums(self.over_noise((values * per_adu)[:, self.good]), self.good)
             for values in (noise, other)

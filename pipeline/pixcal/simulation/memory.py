@@ -19,11 +19,9 @@ class Memory:
 
     @property
     def block(self) -> int:
-        """Frames for which a state that began before them is used.
-
-        At least twice the memory, so that few frames prepare the next block; a power of two, as
-        the frames of a task of a simulation.
-        """
+        """Frames for which a state that began before them is used."""
+        # At least twice the memory, so that few frames prepare the next block; a power of two, as
+        # the frames of a task of a simulation.
         return 1 << (2 * self.frames - 1).bit_length() if self.fades else 1
 
 

@@ -103,10 +103,8 @@ class _Fit:
     def sums(
         self, templates: Sequence[Template], at: Template | None = None
     ) -> tuple[F64, F64, F64]:
-        """Right-hand side, normal matrix, and variance of the right-hand side.
-
-        The normal matrix excludes the contribution of random draws.
-        """
+        """Right-hand side, normal matrix, and variance of the right-hand side."""
+        # The normal matrix excludes the contribution of random draws.
         count = len(templates)
         right, normal, variance = np.zeros(count), np.zeros((count, count)), np.zeros((count,) * 2)
         keys, product = self.response.keys, self.changes.product

@@ -70,11 +70,9 @@ def dead(flat: F64, error: F64, low: float, high: float, floor: float) -> Mask:
 
 
 def _below_rings(flat: F64, where: Mask, factor: float) -> Mask:
-    """Whether pixels (n,) are below ``factor`` times the median of a ring about them.
-
-    Light falls steeply at the edge of the lit area, but pixels of a ring that lie along the edge
-    are equally bright. Around a cluster of dead pixels the widest ring reaches good ones.
-    """
+    """Whether pixels (n,) are below ``factor`` times the median of a ring about them."""
+    # Light falls steeply at the edge of the lit area, but pixels of a ring that lie along the edge
+    # are equally bright. Around a cluster of dead pixels the widest ring reaches good ones.
     y, x = np.nonzero(where)
     found = np.zeros(len(y), np.bool_)
     for offsets in _RINGS:
@@ -93,11 +91,9 @@ def _below_rings(flat: F64, where: Mask, factor: float) -> Mask:
 
 
 def _around(values: F64) -> tuple[F64, F64]:
-    """Median and upper quartile of each pixel's block of `NEIGHBOURS` by `NEIGHBOURS`.
-
-    Each colour of a filter mosaic (every second row and column) by itself; maps start at a block
-    boundary, as chunks do. A pixel with an empty block keeps its value.
-    """
+    """Median and upper quartile of each pixel's block of `NEIGHBOURS` by `NEIGHBOURS`."""
+    # Each colour of a filter mosaic (every second row and column) by itself; maps start at a block
+    # boundary, as chunks do. A pixel with an empty block keeps its value.
     maps = np.stack([values, values])
     for y, x in np.ndindex(2, 2):
         own = values[y::2, x::2]
@@ -245,10 +241,8 @@ def _common(off: F64, brightness: F64, used: Mask) -> F64:
 
 
 def _curve(powers: F64, products: F64, values: F64, usable: Mask) -> F64:
-    """Polynomial through values (n,) without outliers; all zero through too few.
-
-    ``powers, products``: (n, power), (n, power * power) of the places, and products of each two.
-    """
+    """Polynomial through values (n,) without outliers; all zero through too few."""
+    # ``powers, products``: (n, power), (n, power * power) of the places, and products of each two.
     terms = np.zeros(powers.shape[1])
     kept = usable
     for _ in range(_CLIPPINGS):

@@ -106,11 +106,10 @@ def usual_variance(variance: NDArray[Any], dof: int) -> float:
 
 
 def step_levels(steps: Sequence[ExposureLevel]) -> F64:
-    """Signal (step,) of the median pixel of the lit ones of a tile; NaN if most are saturated.
-
-    All levels use the same pixels, those never saturated but where most are, without the brightest
-    and the dimmest tenth: medians of a colour filter's pixels would jump from colour to colour.
-    """
+    """Signal (step,) of the median pixel of the lit ones of a tile; NaN if most are saturated."""
+    # All levels use the same pixels, those never saturated but where most are, without the
+    # brightest and the dimmest tenth: medians of a colour filter's pixels would jump from colour to
+    # colour.
     levels = np.full(len(steps), np.nan)
     seen = lit(np.fmax.reduce([step.signal for step in steps]))
     signal = np.stack([step.signal[seen] for step in steps])

@@ -54,10 +54,8 @@ LOWEST_RIPPLE = 1 / 16  # cycles per code
 
 
 def histogram(frames: Iterable[NDArray[np.generic]], good: Mask) -> F64 | None:
-    """Counts of the codes 0, 1, ... of frames (t, y, x); None unless samples are codes.
-
-    Samples at either end may have been clipped, so they do not count.
-    """
+    """Counts of the codes 0, 1, ... of frames (t, y, x); None unless samples are codes."""
+    # Samples at either end may have been clipped, so they do not count.
     counts = np.zeros(MAX_CODES)
     for stack in frames:
         samples = stack[:, good]
@@ -238,13 +236,11 @@ class CodeWidths:
 
     @property
     def measured(self) -> F64:
-        """The true width of every code from 0 on, less one.
-
-        What the local fit absorbed is restored, under one of two models: single codes are wide or
-        narrow, or thresholds are displaced, which leaves the response elsewhere unchanged, as
-        beside missing codes. Where few codes are uneven, the likelier model is taken: a wrong
-        reference widens one code and displaces all thresholds up to the next reference.
-        """
+        """The true width of every code from 0 on, less one."""
+        # What the local fit absorbed is restored, under one of two models: single codes are wide or
+        # narrow, or thresholds are displaced, which leaves the response elsewhere unchanged, as
+        # beside missing codes. Where few codes are uneven, the likelier model is taken: a wrong
+        # reference widens one code and displaces all thresholds up to the next reference.
         square = self.width**2
         few = float(np.median(square)) < _FEW * float(np.mean(square))
         few |= float(np.median(square / self.variance)) < _TOLD
@@ -263,11 +259,9 @@ class CodeWidths:
         return np.diff(ends, prepend=0) - 1
 
     def _measured(self, displaced: bool, few: bool) -> tuple[F64, float]:
-        """Widths of all codes, less one, and -2 log marginal likelihood of their model.
-
-        The model has ``displaced`` thresholds, or wide and narrow codes; if ``few``, each has its
-        own variance (Tipping 2001, sparse Bayesian learning, without posterior variances).
-        """
+        """Widths of all codes, less one, and -2 log marginal likelihood of their model."""
+        # The model has ``displaced`` thresholds, or wide and narrow codes; if ``few``, each has its
+        # own variance (Tipping 2001, sparse Bayesian learning, without posterior variances).
         top = int(self.number[-1]) + 1
         half = len(self.kernel) // 2
         bands = [self.kernel[half + k] * np.ones(top) for k in range(-half, half + 1)]
@@ -303,10 +297,8 @@ class CodeWidths:
 
     @property
     def uneven_above(self) -> bool:
-        """Whether codes are uneven above some code, and even below.
-
-        This occurs in cameras that read bright pixels at another gain, in coarser steps.
-        """
+        """Whether codes are uneven above some code, and even below."""
+        # This occurs in cameras that read bright pixels at another gain, in coarser steps.
         square = self.width**2
         for share in _SPLITS:
             split = int(share * len(square))

@@ -79,10 +79,8 @@ def _root(variance: float, error: float) -> Measure:
 
 
 def alternation(a: F64, b: F64, *, axis: int) -> Measure:
-    """Excess of every second row (axis 0) or column (axis 1) over those between.
-
-    Twice the amplitude at the Nyquist frequency; the error is from the scatter over the lines.
-    """
+    """Excess of every second row (axis 0) or column (axis 1) over those between."""
+    # Twice the amplitude at the Nyquist frequency; the error is from the scatter over the lines.
     means = (a.mean(axis=1 - axis) + b.mean(axis=1 - axis)) / 2
     # Slow structure differs little between neighbours; only pairs of lines are compared.
     steps = np.diff(means)
@@ -158,10 +156,8 @@ def saturation(points: F64) -> Measure | None:
 
 
 def full_level(points: F64) -> float:
-    """Lowest level (ADU) of full pixels, which have only read noise; infinite without any.
-
-    With few levels the curve's maximum may lie far below.
-    """
+    """Lowest level (ADU) of full pixels, which have only read noise; infinite without any."""
+    # With few levels the curve's maximum may lie far below.
     peak = int(points[:, 1].argmax()) if len(points) else 0
     full = points[peak + 1 :][points[peak + 1 :, 1] < _FULL * points[peak : peak + 1, 1], 0]
     return float(full[0]) if len(full) else math.inf

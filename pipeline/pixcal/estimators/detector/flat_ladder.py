@@ -83,11 +83,9 @@ def warming(evidence: Evidence) -> tuple[float, float]:
 
 
 def rise_of(series: Sequence[F64]) -> tuple[float, float]:
-    """Relative rise from frame to frame that series of light (t,) share, and its error.
-
-    Both are zero unless it is significant. First frames, which lag makes fainter, and NaN are
-    excluded.
-    """
+    """Relative rise from frame to frame that series of light (t,) share, and its error."""
+    # Both are zero unless it is significant. First frames, which lag makes fainter, and NaN are
+    # excluded.
     rises, weights, squares, freedom = [], [], 0.0, -1
     for whole in series:
         time = 1.0 + np.flatnonzero(np.isfinite(whole[1:]))
@@ -177,10 +175,8 @@ def unproven_ladder(evidence: Evidence) -> Ladder | None:
 def _of_one_lamp(
     times: F64, levels: F64, error: F64, moments: tuple[float, float]
 ) -> Ladder | None:
-    """The ladder without a level far off the curve of the others: no response has such a step.
-
-    The end levels are always kept, as a response may have a knee there.
-    """
+    """The ladder without a level far off the curve of the others: no response has such a step."""
+    # The end levels are always kept, as a response may have a knee there.
     whole = _bent(times, levels, error, moments)
     if whole is None or len(times) <= _WITH_CUBIC:
         return whole

@@ -18,12 +18,10 @@ _STEP = 1e-4  # step of the deviations of a response, for derivatives
 
 
 def shot_share_of_flats(evidence: Evidence) -> tuple[float, float] | None:
-    """Signal-dependent noise in flats over the expected noise; None without samples.
-
-    A nonlinear response changes the noise in proportion to the level, a wrong gain by one factor.
-    The nonlinearity is corrected by the levels or, if the lamp was changed between them, by
-    extrapolation of the noise to level zero.
-    """
+    """Signal-dependent noise in flats over the expected noise; None without samples."""
+    # A nonlinear response changes the noise in proportion to the level, a wrong gain by one factor.
+    # The nonlinearity is corrected by the levels or, if the lamp was changed between them, by
+    # extrapolation of the noise to level zero.
     pooled = shot_share(sums_of_stacks(evidence), known=read_known(evidence))
     curve = transfer_curve(evidence, whole=True)
     if pooled is None or curve is None:

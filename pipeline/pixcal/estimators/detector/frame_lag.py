@@ -73,11 +73,9 @@ class LagNonuniformity:
 
     @staticmethod
     def _scale(keep: float, share: float) -> float:
-        """Ratio of a pixel's deviation s - share to the deviation as measured.
-
-        Maps and frames were fitted to frames with lag, so (s - share) / (1 - s) of the light before
-        remains. The frame before, as fitted, holds 1 - share of it, and earlier light.
-        """
+        """Ratio of a pixel's deviation s - share to the deviation as measured."""
+        # Maps and frames were fitted to frames with lag, so (s - share) / (1 - s) of the light
+        # before remains. The frame before, as fitted, holds 1 - share of it, and earlier light.
         return ((1 - share) ** 2 + share**2 * (1 - keep) / (1 + keep)) / (1 - keep)
 
 
@@ -163,11 +161,9 @@ def _mean_square(right: F64, information: F64) -> tuple[float, float]:
 
 
 def _contrast_steps(frames: F64, numbers: Indices) -> tuple[F64, F64] | None:
-    """Shares (lag,) released 1, 2, ... frames later, and their information (lag, lag).
-
-    ``frames``: (t, 3) B, A cos phi, A sin phi; ``numbers``: (t,) of frames. None where these do
-    not constrain the shares.
-    """
+    """Shares (lag,) released 1, 2, ... frames later, and their information (lag, lag)."""
+    # ``frames``: (t, 3) B, A cos phi, A sin phi; ``numbers``: (t,) of frames. None where these do
+    # not constrain the shares.
     b, a_cos, a_sin = frames.T
     count = len(b)
     if count < MIN_FRAMES + LAGS:
@@ -327,10 +323,8 @@ def lag_of_flats(evidence: Evidence) -> tuple[float, float, float] | None:
 def _fit_steps(
     lacking: F64, step: F64, error: F64, flat: Mask, lamp: tuple[F64, float, float]
 ) -> tuple[float, float, float]:
-    """Share of what first frames lack, its error, and the chi-square of the steps.
-
-    ``lamp``: change of the steps per unit rise of the light, the rise, and its error.
-    """
+    """Share of what first frames lack, its error, and the chi-square of the steps."""
+    # ``lamp``: change of the steps per unit rise of the light, the rise, and its error.
     later, rise, of_rise = lamp
     step = step + rise * later
     # Flicker is measured from the fit's residuals: before the fit it includes lag.

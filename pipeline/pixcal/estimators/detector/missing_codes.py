@@ -26,11 +26,9 @@ _STANDS_IN = (0.5, -0.5, 0.0)  # next code, code before, nearest: thresholds rel
 
 
 def missing_codes(counts: F64) -> I64:
-    """Codes that never occur in ``counts`` (code,) though some just below and just above do.
-
-    Between the noise of two levels, as of the colours of a camera, no code is missing: counts fall
-    off towards the gap so steeply that none is expected there.
-    """
+    """Codes that never occur in ``counts`` (code,) though some just below and just above do."""
+    # Between the noise of two levels, as of the colours of a camera, no code is missing: counts
+    # fall off towards the gap so steeply that none is expected there.
     empty, there = np.flatnonzero(counts == 0), np.flatnonzero(counts > 0)
     if len(there) < 2:
         return empty[:0]

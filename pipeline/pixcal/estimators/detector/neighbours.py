@@ -91,10 +91,8 @@ def shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
 
 
 def _without_crosstalk(normal: F64, right: F64) -> tuple[F64, F64]:
-    """Sums without the terms proportional to the level, unless the products need these.
-
-    Flats hardly separate the level from its square: with both free, neither would be significant.
-    """
+    """Sums without the terms proportional to the level, unless the products need these."""
+    # Flats hardly separate the level from its square: with both free, neither would be significant.
     count = len(right)
     squares = list(range(2 * len(DIRECTIONS), count))
     constant = list(range(0, squares[0], 2))

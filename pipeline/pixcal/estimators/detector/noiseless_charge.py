@@ -16,11 +16,9 @@ _CLIP = 25.0  # squared residuals over their variance from which they are exclud
 def missing_noise(
     evidence: Evidence, added: Callable[[FringeEvidence, F32], F32]
 ) -> tuple[float, float]:
-    """Part of the shot noise of ``added`` charge (t, y, x), e-, that residuals lack; its error.
-
-    Squared residuals are fitted with the expected variance, a constant and the added charge, so a
-    wrong gain or read noise does not pass for it.
-    """
+    """Part of the shot noise of ``added`` charge (t, y, x), e-, that residuals lack; its error."""
+    # Squared residuals are fitted with the expected variance, a constant and the added charge, so a
+    # wrong gain or read noise does not pass for it.
     flat = evidence.flat.astype(np.float32)
 
     def terms(fringes: FringeEvidence, variance: F32) -> list[F32]:

@@ -162,10 +162,8 @@ def told_from_drift(levels: Levels, late: Sequence[F64], least: float) -> bool:
 
 
 def _left_by_drift(unlit: Sequence[tuple[F64, F64]]) -> float:
-    """Sum of squares that a drift with one time constant leaves of levels about their means.
-
-    ``unlit``: times of the frames after the start of the drift, s, and means, of each series.
-    """
+    """Sum of squares that a drift with one time constant leaves of levels about their means."""
+    # ``unlit``: times of the frames after the start of the drift, s, and means, of each series.
     levels = np.concatenate([_about_mean(means) for _, means in unlit])
     span = max(float(at[-1]) for at, _ in unlit)
 
@@ -190,11 +188,9 @@ Series = Sequence[tuple[Indices, F64, float]]
 
 
 def _sequence(levels: Levels) -> _Sequence | None:
-    """Frames in order of time, those of the other half at the level of their series.
-
-    Others may interrupt a series, as if the first level of flats is repeated at the end. None where
-    time stamps are unknown.
-    """
+    """Frames in order of time, those of the other half at the level of their series."""
+    # Others may interrupt a series, as if the first level of flats is repeated at the end. None
+    # where time stamps are unknown.
     times = [stack.start_s + stack.time_s for stack, _ in levels]
     if not times or not np.isfinite(np.concatenate(times)).all():
         return None

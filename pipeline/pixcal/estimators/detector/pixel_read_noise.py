@@ -88,12 +88,10 @@ class PixelNoise:
 
 
 def squares_without_hits(frames: F32) -> F64:
-    """Sum of squares (y, x) of frames (t, y, x) about their mean, as without a single hit.
-
-    A pixel that a particle hits in one frame is not noisy: a sample that is no normal number beside
-    the others of its pixel, nor beside those of usual pixels (the others may have one code), is
-    left out, and their sum extrapolated. It takes `FEWEST` frames.
-    """
+    """Sum of squares (y, x) of frames (t, y, x) about their mean, as without a single hit."""
+    # A pixel that a particle hits in one frame is not noisy: a sample that is no normal number
+    # beside the others of its pixel, nor beside those of usual pixels (the others may have one
+    # code), is left out, and their sum extrapolated. It takes `FEWEST` frames.
     count, rest = len(frames), frames - frames.mean(axis=0)
     rest *= rest
     total: F64 = rest.sum(axis=0, dtype=float)
@@ -108,10 +106,8 @@ def squares_without_hits(frames: F32) -> F64:
 
 
 def _likeliest(chance: F64, count: Indices, start: F64) -> F64:
-    """Distribution (n,) of true values that makes the counts (bin,) likeliest.
-
-    By expectation maximisation from a start; ``chance``: (bin, n) likelihood of each true value.
-    """
+    """Distribution (n,) of true values that makes the counts (bin,) likeliest."""
+    # By expectation maximisation from a start; ``chance``: (bin, n) likelihood of each true value.
     found = start
     for _ in range(STEPS):
         found = found * (chance.T @ (count / np.maximum(chance @ found, 1e-300))) / count.sum()

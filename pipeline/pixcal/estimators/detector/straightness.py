@@ -116,11 +116,9 @@ def _one_lamp(rates: F64, line: Linearity) -> bool:
 def _at_a_steady_lamp(
     levels: Sequence[Level], times: F64, means: F64, used: Mask
 ) -> tuple[Linearity | None, list[F64] | None, float]:
-    """The line, and the light (t,) of the lamp in each level with the error that it adds.
-
-    Without a lamp whose drift is told by the frames of each level and straightens the levels, its
-    light is None.
-    """
+    """The line, and the light (t,) of the lamp in each level with the error that it adds."""
+    # Without a lamp whose drift is told by the frames of each level and straightens the levels, its
+    # light is None.
     once = len(set(times[used])) == used.sum()
     line = linearity(times, means, used) if once else None
     found = _drift(levels)
@@ -182,10 +180,8 @@ def _drift(levels: Sequence[Level]) -> list[list[F64]] | None:
 
 
 def _polynomial(design: F64, value: F64, freedom: int) -> tuple[F64, F64] | None:
-    """Coefficients (n,) of the degree with most evidence, and shifts (n, n) by each error.
-
-    None without a significant one. The degree has the least Bayesian information criterion.
-    """
+    """Coefficients (n,) of the degree with most evidence, and shifts (n, n) by each error."""
+    # None without a significant one. The degree has the least Bayesian information criterion.
     best: float = np.inf
     found: tuple[F64, F64] | None = None
     whole = float(value @ value)
@@ -207,11 +203,9 @@ def _polynomial(design: F64, value: F64, freedom: int) -> tuple[F64, F64] | None
 
 
 def _noise_favours_levels(charge: F64, levels: F64, transfer: F64, read_variance: float) -> float:
-    """Chi-square by which noise fits a response through the levels better than a straight one.
-
-    A response of slope s has s² times the shot noise of a straight one of the same charge (in any
-    unit). Zero where there is no noise to tell.
-    """
+    """Chi-square by which noise fits a response through the levels better than a straight one."""
+    # A response of slope s has s² times the shot noise of a straight one of the same charge (in any
+    # unit). Zero where there is no noise to tell.
     order = np.argsort(levels)
     charge = charge[order] * np.mean(levels / charge)
     charge, signal = np.append(0.0, charge), np.append(0.0, levels[order])

@@ -87,10 +87,8 @@ def transfer_curve(evidence: Evidence, *, whole: bool = False) -> TransferCurve 
 
 
 def _read_alone(sums: F64) -> F64:
-    """Sums of frames without light, less the expected shot noise of their dark signal.
-
-    Dark signal is low, where the response has another slope than at the levels of flats.
-    """
+    """Sums of frames without light, less the expected shot noise of their dark signal."""
+    # Dark signal is low, where the response has another slope than at the levels of flats.
     n, _, s12, s22, _, p2, square = sums.T
     none = np.zeros_like(n)
     own = np.arange(len(n)) == 0
@@ -199,10 +197,8 @@ def _of_stack(evidence: Evidence, stack: Stack) -> F64 | None:
 
 
 def _noise_scale(rest: F32, good: Mask, shot: float, read: float) -> float:
-    """Noise of light in deviations (t, y, x) from pixels' means over that expected, roughly.
-
-    It is 1 unless it is above `_FAR_OFF`, as with a grossly wrong gain, which would clip samples.
-    """
+    """Noise of light in deviations (t, y, x) from pixels' means over that expected, roughly."""
+    # It is 1 unless it is above `_FAR_OFF`, as with a grossly wrong gain, which would clip samples.
     # Between neighbours in a row, as rows may have noise in common.
     steps = np.diff(rest, axis=2)[:, good[:, 1:] & good[:, :-1]]
     spread = robust_sigma(steps) ** 2 / 2 * len(rest) / (len(rest) - 1)

@@ -161,10 +161,8 @@ def _series(
 
 
 def unlit_stacks(evidence: Evidence, *kinds: str) -> list[Stack]:
-    """Series of frames without light, less those that begin soon after light.
-
-    After light the level may fall for many frames, as in a detector that lags: that is no bias.
-    """
+    """Series of frames without light, less those that begin soon after light."""
+    # After light the level may fall for many frames, as in a detector that lags: that is no bias.
     return [s for s in evidence.stacks if s.kind in kinds and not evidence.soon_after_light(s)]
 
 

@@ -166,11 +166,9 @@ def _series(
 
 
 def without(values: F64, shapes: F64, basis: WalkModes) -> F64:
-    """Series (t, c) without shapes (t, p) and mean, by weighted least squares of their modes.
-
-    A mode's weight is the inverse of the power around it: drifts and lines are no shapes. The noise
-    that the shapes absorb is restored in each mode.
-    """
+    """Series (t, c) without shapes (t, p) and mean, by weighted least squares of their modes."""
+    # A mode's weight is the inverse of the power around it: drifts and lines are no shapes. The
+    # noise that the shapes absorb is restored in each mode.
     modes, design = basis.of(values), basis.of(shapes)
     rest = np.empty_like(modes)
     for channel, wanted in enumerate(modes.T):

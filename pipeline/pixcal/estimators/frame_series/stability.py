@@ -83,10 +83,8 @@ def white_population(
 
 
 def _median_covariance(logs: F64, n_levels: int) -> F64:
-    """Covariance of the medians of rows, about the ``n_levels`` noise levels, times the columns.
-
-    The median's influence function is sign(x - median) / (2 f), f the density at the median.
-    """
+    """Covariance of the medians of rows, about the ``n_levels`` noise levels, times the columns."""
+    # The median's influence function is sign(x - median) / (2 f), f the density at the median.
     near = (0.46, 0.5, 0.54)
     below, median, above = np.quantile(logs, near, axis=1)
     density = (near[2] - near[0]) / (above - below)

@@ -208,10 +208,8 @@ class _State:
 
 
 def _swept(covariance: F64) -> tuple[F64, float]:
-    """Inverses (n, c, c) of covariances, and the summed logarithms of their determinants.
-
-    By the sweep operator over all modes at once (Goodnight 1979, American Statistician 33, 149).
-    """
+    """Inverses (n, c, c) of covariances, and the summed logarithms of their determinants."""
+    # By the sweep operator over all modes at once (Goodnight 1979, American Statistician 33, 149).
     own, log_determinant = np.ascontiguousarray(covariance.transpose(1, 2, 0)), 0.0
     for k in range(len(own)):
         pivot, row = own[k, k].copy(), own[k].copy()

@@ -188,10 +188,8 @@ class SmoothPhasor:
 
 
 def smooth_phasor(phasor: C128, good: Mask, k: tuple[float, float]) -> SmoothPhasor:
-    """Smooth version of a noisy phasor map alpha exp(i psi) / iota (y, x), from its good pixels.
-
-    A complex polynomial times the wave of the corrected fringe vector k (rad/px), no outliers.
-    """
+    """Smooth version of a noisy phasor map alpha exp(i psi) / iota (y, x), from its good pixels."""
+    # A complex polynomial times the wave of the corrected fringe vector k (rad/px), no outliers.
     shape, (kx, ky) = phasor.shape, k
     turned = np.where(good, phasor, 0) * plane_wave(shape, (-kx, -ky))
     if shape[1] > 1:

@@ -35,10 +35,8 @@ class FrameBatches:
 
 
 def plan_batches(time_s: F64, frames: int | None = None) -> FrameBatches:
-    """Divide a run into batches of equal time, by the time (t,) of its frames, gaps included.
-
-    By default of 500 frames, or fewer in a shorter run, for some 24 batches.
-    """
+    """Divide a run into batches of equal time, by the time (t,) of its frames, gaps included."""
+    # By default of 500 frames, or fewer in a shorter run, for some 24 batches.
     n = len(time_s)
     length = frames or max(MIN_FRAMES, min(DEFAULT_FRAMES, n // WANTED))
     steps = np.diff(time_s)
@@ -156,10 +154,8 @@ def _relative(batches: F32, turn: F32) -> F32:
 
 
 def phase_bound(tile: Tile, theta: F64, frames: FrameParameters, number: int = BOUND_PIXELS) -> F64:
-    """Cramér-Rao bound of the phase (rad) for a sample of pixels of a tile, for known frames.
-
-    For Gaussian noise of the pixel's own fitted variance (physics note, section 3).
-    """
+    """Cramér-Rao bound of the phase (rad) for a sample of pixels of a tile, for known frames."""
+    # For Gaussian noise of the pixel's own fitted variance (physics note, section 3).
     usable = tile.good & np.isfinite(theta).all(axis=0)
     where = np.flatnonzero(usable)
     if not len(where):

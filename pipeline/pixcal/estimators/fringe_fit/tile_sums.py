@@ -78,10 +78,8 @@ def tile_plane(
 
 
 def unwrap(planes: Sequence[TilePlane], grid_shape: tuple[int, int]) -> list[TilePlane]:
-    """Add multiples of 2π to planes, outwards from the centre, so that neighbouring tiles agree.
-
-    Tiles without a joined neighbour are joined to the nearest tile across the gap.
-    """
+    """Add multiples of 2π to planes, outwards from the centre, so that neighbouring tiles agree."""
+    # Tiles without a joined neighbour are joined to the nearest tile across the gap.
     rows, columns = grid_shape
     table = np.array(planes, dtype=object).reshape(rows, columns)
     result = table.copy()

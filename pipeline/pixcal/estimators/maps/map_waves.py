@@ -102,11 +102,9 @@ Maps = Mapping[str, Sequence[_Map]]  # of each set, by its name
 
 
 def find_waves(evidence: Evidence) -> Waves | None:
-    """The strongest waves in all sets' maps, at most `MOST` per set; None without enough pixels.
-
-    The significance counts all resolvable waves as trials. Waves near harmonics of a set's fringes,
-    near zero frequency, and of repeating rows or columns are left out.
-    """
+    """The strongest waves in all sets' maps, at most `MOST` per set; None without enough pixels."""
+    # The significance counts all resolvable waves as trials. Waves near harmonics of a set's
+    # fringes, near zero frequency, and of repeating rows or columns are left out.
     sets = [f for f in evidence.fringes.values() if np.count_nonzero(f.good) > _MIN_PIXELS]
     if not sets:
         return None

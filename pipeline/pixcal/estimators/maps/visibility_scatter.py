@@ -15,10 +15,8 @@ Products = tuple[list[tuple[int, int]], F64, F64]
 
 
 def visibility_products(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Products:
-    """Mean products per pixel, without noise: of each set with itself, then of pairs of sets.
-
-    Structure that neighbours share is removed, and so is the noise of the subtracted bias.
-    """
+    """Mean products per pixel, without noise: of each set with itself, then of pairs of sets."""
+    # Structure that neighbours share is removed, and so is the noise of the subtracted bias.
     maps = [_two_halves(found) for found in sets]
     both = [(one + other) / 2 for one, other, _ in maps]
     pairs = [(m, m) for m in range(len(sets))] + list(combinations(range(len(sets)), 2))

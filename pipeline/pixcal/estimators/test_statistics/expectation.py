@@ -176,10 +176,8 @@ def _usual_scatter(pairs: Mapping[Key, tuple[F64, F64]], nominal: Expectation) -
 
 
 def _certain(shift: F64, chance: F64) -> F64:
-    """Share (n,) of a curve's change that is due to effects (positive-part James-Stein).
-
-    For the whole curve, and for single values that are significant.
-    """
+    """Share (n,) of a curve's change that is due to effects (positive-part James-Stein)."""
+    # For the whole curve, and for single values that are significant.
     squares = shift**2 / np.maximum(chance, 1e-300)
     whole = max(1 - 1 / max(float(np.mean(squares)), 1e-300), 0.0)
     return np.maximum(whole, 1 - STANDS_OUT**2 / np.maximum(squares, STANDS_OUT**2))
@@ -194,11 +192,9 @@ def _variance(values: F64, floor: float) -> F64:
 
 
 def independent_values(values: F64, floor: float = 0.0) -> float:
-    """Effective number of independent values of a curve, for its least likely value.
-
-    Each simulation (simulation, n) is compared with the others. For the least p-value u of n,
-    -log(1 - u) has an exponential distribution of mean 1 / n, whose likelihood gives n.
-    """
+    """Effective number of independent values of a curve, for its least likely value."""
+    # Each simulation (simulation, n) is compared with the others. For the least p-value u of n,
+    # -log(1 - u) has an exponential distribution of mean 1 / n, whose likelihood gives n.
     count, n = values.shape
     if n == 1 or count < 3:
         return float(n)

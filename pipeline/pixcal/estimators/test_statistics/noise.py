@@ -185,10 +185,8 @@ def pixel_peakedness(data: FringeSetData) -> Curve:
     sets=False,
 )
 def read_noise(evidence: Evidence) -> Curve | None:
-    """Quantiles over the pixels of variance over the read noise's, hits by particles left out.
-
-    Masked pixels count if they jump.
-    """
+    """Quantiles over the pixels of variance over the read noise's, hits by particles left out."""
+    # Masked pixels count if they jump.
     stacks = [s for s in evidence.of_kind("bias") if len(s.adu) >= FEWEST]
     if not stacks or not evidence.dithered:
         return None

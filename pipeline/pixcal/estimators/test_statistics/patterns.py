@@ -39,11 +39,9 @@ def highest_ordinate(noise: F32, good: Mask) -> Curve:
 
 
 def tone_sigmas(noise: F32, good: Mask) -> Curve:
-    """Significance of the highest ordinate, a standard normal for white noise.
-
-    An ordinate has Wilson and Hilferty's distribution (1931), with two degrees of freedom per
-    frame.
-    """
+    """Significance of the highest ordinate, a standard normal for white noise."""
+    # An ordinate has Wilson and Hilferty's distribution (1931), with two degrees of freedom per
+    # frame.
     highest = highest_ordinate(noise, good)
     ninth = 1 / (9 * len(noise))
     own = (float(np.cbrt(highest.value[0])) - (1 - ninth)) / np.sqrt(ninth)

@@ -83,10 +83,8 @@ def unweighted_variance(
 
 
 def sampling_loss(iota: float, alpha: float, variance: float, phases: F64) -> tuple[float, float]:
-    """Ratio of frames needed with phases (t,) to uniform phases, at the median and worst phase.
-
-    Few phases favour some pixels and mix iota, alpha and phase; infinite if these are degenerate.
-    """
+    """Ratio of frames needed with phases (t,) to uniform phases, at the median and worst phase."""
+    # Few phases favour some pixels and mix iota, alpha and phase; infinite if these are degenerate.
     psi = 2 * np.pi * np.arange(TURN) / TURN
     information = np.zeros((TURN, 3, 3))
     for phi in phases:
@@ -368,8 +366,6 @@ def flat_error(bench: Bench) -> float | None:
 
 
 def flats_needed(errors: WeightErrors, level: float, variance: float) -> int:
-    """Flats at a level (e-) that add less than `NEGLIGIBLE` to the fringe frames.
-
-    An error of the flat does not change the phase; it only affects weights from neighbours.
-    """
+    """Flats at a level (e-) that add less than `NEGLIGIBLE` to the fringe frames."""
+    # An error of the flat does not change the phase; it only affects weights from neighbours.
     return max(1, ceil(errors.scale * (level + variance) / level**2 / NEGLIGIBLE))

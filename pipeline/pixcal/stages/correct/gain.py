@@ -87,11 +87,9 @@ def measure_gain(maps: Maps, runtime: Runtime) -> dict[str, Any]:
 
 
 def excess(facts: Mapping[str, Any]) -> float:
-    """Difference of the corrected halves of a set over its error; 1 where they agree.
-
-    A correction that does not fit leaves errors that vary with the phases of the frames, and a
-    drift of the bench does so too.
-    """
+    """Difference of the corrected halves of a set over its error; 1 where they agree."""
+    # A correction that does not fit leaves errors that vary with the phases of the frames, and a
+    # drift of the bench does so too.
     halves = facts["halves"]
     if halves is None or not halves["after_expected_px"]:
         return 1.0

@@ -161,12 +161,10 @@ def _add(
     frame: F64,
     sums: F64,
 ) -> None:
-    """Add a tile's samples to ``sums``, whose [0, 0] is window ``first``.
-
-    ``layout``: direction cosines (x, y), first edge and size of windows across and along, px.
-    ``polynomials`` of phase and light: ``c[i, j] Y^i X^j``, (X, Y) being (x, y) less ``frame[:2]``,
-    over ``frame[2]``.
-    """
+    """Add a tile's samples to ``sums``, whose [0, 0] is window ``first``."""
+    # ``layout``: direction cosines (x, y), first edge and size of windows across and along, px.
+    # ``polynomials`` of phase and light: ``c[i, j] Y^i X^j``, (X, Y) being (x, y) less
+    # ``frame[:2]``, over ``frame[2]``.
     ux, uy, edge_u, edge_v, width, length = layout
     carrier, light = polynomials
     row, light_row = np.empty(carrier.shape[0]), np.empty(light.shape[0])

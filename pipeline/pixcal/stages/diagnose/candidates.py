@@ -150,12 +150,10 @@ def _needs(kind: type[Effect], facts: FramesUsed) -> tuple[str, ...]:
 def marginal_candidates(
     candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]], *, fringes: bool = True
 ) -> tuple[Signature, ...]:
-    """Candidates significant in the fitted frames; a slow one only if it is the strongest.
-
-    With fringes only if it is weak, as a strong one shows in other statistics; without them only if
-    it is strong, as a weak one is slow to confirm.
-    A score test that is faint beside the strongest candidate is left out.
-    """
+    """Candidates significant in the fitted frames; a slow one only if it is the strongest."""
+    # With fringes only if it is weak, as a strong one shows in other statistics; without them only
+    # if it is strong, as a weak one is slow to confirm. A score test that is faint beside the
+    # strongest candidate is left out.
     seen = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
     most = max((e.significance for e in seen.values()), default=0.0)
     strongest = most < MAX_SLOW_SIGNIFICANCE if fringes else most > MIN_DARK_SIGNIFICANCE

@@ -167,11 +167,9 @@ def photon_transfer_change(
     neighbours: Sequence[tuple[int, int]] = (),
     maps: DetectorMaps | None = None,
 ) -> float:
-    """Factor on variance over mean of flats by effects, lags included; 1 without effects on it.
-
-    The photon-transfer gain is off by the inverse; a simulation with the effects must not apply it
-    twice.
-    """
+    """Factor on variance over mean of flats by effects, lags included; 1 without effects on it."""
+    # The photon-transfer gain is off by the inverse; a simulation with the effects must not apply
+    # it twice.
     flats = [r for r in recordings if r.kind == "flat" and r.electrons > 0 and r.count > 1]
     detector = bench.detector
     room = (detector.top_adu - detector.bias_adu) * detector.gain_e_per_adu

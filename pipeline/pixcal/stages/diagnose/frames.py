@@ -102,12 +102,10 @@ class Split:
 
 
 def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = ()) -> Split:
-    """Assign blocks of every array and exposure time to the halves (`TURN`).
-
-    A long fringe set contributes `SAMPLES` to each half; without fringes, all frames together do.
-    Flats with full pixels are left out unless all have them. Without fringes, the first flat of an
-    exposure time and the first dark after light are in both halves: they show lag most.
-    """
+    """Assign blocks of every array and exposure time to the halves (`TURN`)."""
+    # A long fringe set contributes `SAMPLES` to each half; without fringes, all frames together do.
+    # Flats with full pixels are left out unless all have them. Without fringes, the first flat of
+    # an exposure time and the first dark after light are in both halves: they show lag most.
     learn, test = {}, {}
     every = {name: _groups(name, table, full_flats) for name, table in tables.items()}
     most = SAMPLES // pixels

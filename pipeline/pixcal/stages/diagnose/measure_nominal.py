@@ -182,10 +182,8 @@ def _frames(
 
 
 def excess_scatter(found: Sequence[FringeEvidence], good: Mask) -> float:
-    """Scatter of offsets between independent frames over their errors, at least 1.
-
-    A simulation must not contain frame-to-frame changes twice, as offsets and by the effect.
-    """
+    """Scatter of offsets between independent frames over their errors, at least 1."""
+    # A simulation must not contain frame-to-frame changes twice, as offsets and by the effect.
     k = float(np.hypot(*found[0].k))
     most = 1.0
     for one, other in itertools.pairwise(found):

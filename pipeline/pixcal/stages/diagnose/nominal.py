@@ -205,10 +205,8 @@ class NominalBench:
     def _electronics(
         self, measured: Measured, seeds: tuple[int, int], change: float, added: float
     ) -> Measured:
-        """With gain and read noise drawn within their errors; samples keep their level.
-
-        ``added``: variance (e-²) of the measured read noise that effects add.
-        """
+        """With gain and read noise drawn within their errors; samples keep their level."""
+        # ``added``: variance (e-²) of the measured read noise that effects add.
         seed, own_seed = seeds
         gain = self.gain.drawn(np.random.default_rng([seed, _GAIN]), change)
         m = measured.maps

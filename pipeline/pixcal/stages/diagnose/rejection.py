@@ -110,10 +110,8 @@ def unhelpful(
     without: Mapping[str, Trial],
     candidates: Mapping[str, Candidate],
 ) -> Rejection | None:
-    """A cause that does not reduce the differences left by the other causes.
-
-    Where much of the gap stays open, also one that reduces none alone: it compensates others.
-    """
+    """A cause that does not reduce the differences left by the other causes."""
+    # Where much of the gap stays open, also one that reduces none alone: it compensates others.
     where = comparison.gap_of(current)
     left = comparison.residual_size(current, where)
     gains = {n: comparison.residual_size(trial, where) - left for n, trial in without.items()}
@@ -132,11 +130,9 @@ def doubtful(
     without: Mapping[str, Trial],
     candidates: Mapping[str, Candidate],
 ) -> Rejection | None:
-    """A cause that closes little of the gap and may be a proxy for another.
-
-    For an unknown cause: it closes little of a large gap, or the largest difference remains. For
-    another law of other causes: these produce much of its significance, or it has none.
-    """
+    """A cause that closes little of the gap and may be a proxy for another."""
+    # For an unknown cause: it closes little of a large gap, or the largest difference remains. For
+    # another law of other causes: these produce much of its significance, or it has none.
     where = comparison.gap_of(current)
     open_still = comparison.residual(current, where)
     closed = {n: comparison.residual(trial, where) - open_still for n, trial in without.items()}

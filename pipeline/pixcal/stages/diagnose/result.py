@@ -59,10 +59,8 @@ def by_domain(
 
 
 def not_compared(measured: Mapping[Key, Curve], data: Mapping[Key, F64]) -> list[str]:
-    """Titles of measured statistics that simulations lack, or have in another form.
-
-    Estimates used as statistics are left out: simulations compute some of them only when needed.
-    """
+    """Titles of measured statistics that simulations lack, or have in another form."""
+    # Estimates used as statistics are left out: simulations compute some of them only when needed.
     known = known_statistics()
     return [
         statistic_named(name).title + ("" if of == DETECTOR else f" of {of}")

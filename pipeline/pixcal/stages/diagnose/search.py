@@ -290,12 +290,10 @@ class Search:
         return self._ask(benches, seeds, label, asked)
 
     def _tried(self) -> tuple[Additions, Additions]:
-        """Add each candidate to the causes: its likeliest variant by law, and its replay.
-
-        A replay may imitate the law of another effect, so it is kept separate. One simulation of
-        each shows which variants are promising; the rest are simulated only if none of these gains
-        enough.
-        """
+        """Add each candidate to the causes: its likeliest variant by law, and its replay."""
+        # A replay may imitate the law of another effect, so it is kept separate. One simulation of
+        # each shows which variants are promising; the rest are simulated only if none of these
+        # gains enough.
         causes, remaining = self._causes, self._remaining
         options = [
             (name, way)

@@ -102,10 +102,8 @@ def _kinds(config: Config, known: Mapping[str, type[Effect]]) -> dict[str, type[
 def on_map(
     effect: Effect, fits: Iterable[FittedSet], shapes: tuple[str, Mapping[str, str]]
 ) -> dict[str, Any]:
-    """Rms and maximum (px) change of the offsets by undoing an effect, and the treatment.
-
-    On maps of every set and window, modes removed; zero if free parameters absorb it.
-    """
+    """Rms and maximum (px) change of the offsets by undoing an effect, and the treatment."""
+    # On maps of every set and window, modes removed; zero if free parameters absorb it.
     treated = treatment_of_kind(type(effect), *shapes)
     action = Treatment(effect, "diagnosis", {}, *treated).action
     square, count, most = 0.0, 0, 0.0

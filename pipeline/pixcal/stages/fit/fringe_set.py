@@ -116,11 +116,9 @@ def fit_set(
 
 
 def _choose(model: str, tiles: TileSums, start: Start) -> tuple[SetFit, str]:
-    """Fit the requested shape; ``auto``: hyperbolic fringes if the map requires them.
-
-    True large-scale structure imitates curvature: polynomial terms beyond the hyperbolic shape
-    measure how much of it is spurious.
-    """
+    """Fit the requested shape; ``auto``: hyperbolic fringes if the map requires them."""
+    # True large-scale structure imitates curvature: polynomial terms beyond the hyperbolic shape
+    # measure how much of it is spurious.
     shapes = fringe_models()
     if model != "auto":
         return _fit_shape(tiles, shapes[model], start), "asked for"

@@ -354,10 +354,8 @@ def _close(
     copied: Mapping[str, bool],
     facts: Mapping[str, dict[str, Any]],
 ) -> list[str]:
-    """Check that no data are missing or were changed meanwhile, and write the tables.
-
-    ``facts``: of reused arrays. Returns warnings on frames with interrupted transfer.
-    """
+    """Check that no data are missing or were changed meanwhile, and write the tables."""
+    # ``facts``: of reused arrays. Returns warnings on frames with interrupted transfer.
     try:
         for files in sources.values():
             for source in files:

@@ -99,11 +99,9 @@ class _Counts(NamedTuple):
         return np.asarray(self.number > max(_SHARE * self.number.sum(), _COUNT))
 
     def alike_above(self, code: int) -> bool:
-        """Whether the codes above one are equally wide, as far as noise tells.
-
-        The logarithm of its counts bends downwards, where pixels differ upwards too, but not to and
-        fro from code to code.
-        """
+        """Whether the codes above one are equally wide, as far as noise tells."""
+        # The logarithm of its counts bends downwards, where pixels differ upwards too, but not to
+        # and fro from code to code.
         number = self.number[self.code > code].astype(float)
         error = np.sqrt(1 / number[:-2] + 4 / number[1:-1] + 1 / number[2:])
         bend = np.diff(np.log(number), 2) / error
@@ -141,10 +139,9 @@ def _spread_pile(found: _Counts, low: Mask, step: float) -> int:
 
 
 def _edge(found: _Counts, step: float) -> int:
-    """Lowest code of noise of about a step, if many lower samples are lacking; else 0.
-
-    The logarithms of the counts of normal noise lie on a parabola, which the codes above continue.
-    """
+    """Lowest code of noise of about a step, if many lower samples are lacking; else 0."""
+    # The logarithms of the counts of normal noise lie on a parabola, which the codes above
+    # continue.
     code, number, total = found.code, found.number, found.number.sum()
     first = int(np.argmax(found.many() & (found.below < _SHARE * total)))
     # Rounding, or dark signal added, after the cut may spread the pile over two codes.

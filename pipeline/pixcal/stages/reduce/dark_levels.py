@@ -34,10 +34,8 @@ class DarkLevels:
 
     @classmethod
     def of(cls, source: Ingested, middle: Window, good: Mask) -> "DarkLevels":
-        """Read the frames; ``good``: (y, x) pixels of the window that count.
-
-        Samples that are not finite do not count, nor do frames and groups without any others.
-        """
+        """Read the frames; ``good``: (y, x) pixels of the window that count."""
+        # Samples that are not finite do not count, nor do frames and groups without any others.
         (y0, _), columns = middle
         rows = middle_rows(middle)
         window, pixels = ((y0 + rows.start, y0 + rows.stop), columns), good[rows]

@@ -175,11 +175,9 @@ def pair_sums(folder: Place, job: Measuring) -> F64:
 def _gain(
     sums: F64, known: Measure | None, lost: float, wander: float, top: float, job: Measuring
 ) -> GainFit | None:
-    """Photon transfer below the level ``top`` (ADU above bias) of saturation, neighbours added.
-
-    ``lost``: variance without light that blocks remove (ADU²). ``wander``: of the bias (ADU).
-    None if the level above bias is unknown, or the error is too large.
-    """
+    """Photon transfer below the level ``top`` (ADU above bias) of saturation, neighbours added."""
+    # ``lost``: variance without light that blocks remove (ADU²). ``wander``: of the bias (ADU).
+    # None if the level above bias is unknown, or the error is too large.
     if not (job.dark and job.flat):
         return None
     noise, error = known or (job.read_noise, _GUESS_ERROR * job.read_noise)
@@ -228,10 +226,8 @@ def _steps(job: Measuring) -> tuple[float, float]:
 
 
 def _exposure_steps(tables: F64, job: Measuring) -> tuple[F64, Mask, Mask]:
-    """Level of each step (ADU) over the columns that have one at all steps, and which to use.
-
-    Also the steps at which some pixels are full, or nearly so.
-    """
+    """Level of each step (ADU) over the columns that have one at all steps, and which to use."""
+    # Also the steps at which some pixels are full, or nearly so.
     if not job.flat:
         return np.zeros(0), np.zeros(0, np.bool_), np.zeros(0, np.bool_)
     level, pixels, lost, nearly = (tables.reshape(-1, len(job.flat), 4)[..., n] for n in range(4))

@@ -136,10 +136,8 @@ def _line_noise(
 
 
 def _top(summary: Summary, job: Measuring, clipped: bool) -> tuple[Measure | None, bool]:
-    """Saturation above bias (ADU, error) and True, or else the highest level and False.
-
-    ``clipped``: whether the converter limits samples, not the wells.
-    """
+    """Saturation above bias (ADU, error) and True, or else the highest level and False."""
+    # ``clipped``: whether the converter limits samples, not the wells.
     peak, end = summary.well, job.saturation - summary.usual.bias
     if peak is not None and (not clipped or peak[0] + 2 * peak[1] < _WELL * end):
         # Wells differ: some pixels may be full far below the next level of the flats.

@@ -51,10 +51,9 @@ class FlatSurvey:
 
     @property
     def lit(self) -> Mask:
-        """Flats (t,) that hold light: all, if the level without light is unknown, or none does.
-
-        A level within the noise of one sample is no flat: the shutter was closed, or the lamp off.
-        """
+        """Flats (t,) that hold light: all, if the level without light is unknown, or none does."""
+        # A level within the noise of one sample is no flat: the shutter was closed, or the lamp
+        # off.
         found = np.abs(self.levels) > _LIT * self.noise
         return found if found.any() else np.ones(len(found), np.bool_)
 
@@ -117,10 +116,8 @@ class FlatSurvey:
         return [int(step) for step in found]
 
     def _parted(self, frames: I64) -> list[I64]:
-        """Split frames of similar levels where a steady lamp was changed slightly.
-
-        A level has two or more successive frames, whose differences measure the lamp's flicker.
-        """
+        """Split frames of similar levels where a steady lamp was changed slightly."""
+        # A level has two or more successive frames, whose differences measure the lamp's flicker.
         frames = np.sort(frames)
         change = np.abs(np.diff(self.levels[frames])) / max(float(self.levels[frames].max()), 1.0)
         if len(change) < MIN_CHANGES:
@@ -142,10 +139,8 @@ class FlatSurvey:
 
 
 def _lowest(flats: Reader, unlit: NDArray[Any] | None) -> float:
-    """Negative sample (ADU) below which no flat of signed 16-bit integers can fall; else -inf.
-
-    Light makes no sample darker. ``unlit``: samples of a frame without light, if there is one.
-    """
+    """Negative sample (ADU) below which no flat of signed 16-bit integers can fall; else -inf."""
+    # Light makes no sample darker. ``unlit``: samples of a frame without light, if there is one.
     if flats.dtype != np.int16 or unlit is None:
         return -math.inf
     low, middle = np.nanquantile(unlit, (MIN_SHARE, 0.5))

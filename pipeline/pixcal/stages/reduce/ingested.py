@@ -76,10 +76,8 @@ class Ingested:
 
     @cached_property
     def _used(self) -> dict[str, list[int]]:
-        """Numbers of the frames that are used: no flats without light.
-
-        Parts of a run, and simulations, keep the flats of the whole.
-        """
+        """Numbers of the frames that are used: no flats without light."""
+        # Parts of a run, and simulations, keep the flats of the whole.
         if self._all_flats is None or self.black is not None:
             return self._whole
         numbers = zip(self._whole["flat"], self._all_flats.lit, strict=True)
@@ -217,10 +215,8 @@ class Ingested:
         return float(flat_survey.code_step([self.arrays[name] for name in sorted(names)]))
 
     def saturation(self, name: str) -> float:
-        """Level (ADU) from which samples of an array are saturated.
-
-        The declared level, else that at which flats pile up, else the largest value of the type.
-        """
+        """Level (ADU) from which samples of an array are saturated."""
+        # The declared level, else that at which flats pile up, else the largest value of the type.
         end = self._ends(name)[1]
         return min(self.detector.saturation_adu or self.saturation_found or end, end)
 

@@ -23,11 +23,9 @@ _FRAMES = 16  # most frames of a level that are read
 
 
 def with_excess_noise(summary: Summary, source: Ingested, job: Measuring) -> Summary:
-    """The summary with the gain of electrons, where a register multiplied them.
-
-    The slope of photon transfer is then F² times that of the light. F² is that of a large
-    multiplication, as only the third moment of the noise is known.
-    """
+    """The summary with the gain of electrons, where a register multiplied them."""
+    # The slope of photon transfer is then F² times that of the light. F² is that of a large
+    # multiplication, as only the third moment of the noise is known.
     gain, dark = summary.gain, job.read_series
     if gain is None or dark is None or len(dark.frames) < MIN_FRAMES:
         return summary

@@ -85,10 +85,8 @@ def _pairs(job: Measuring) -> Iterator[F32]:
 
 
 def dark_rate(folder: Place, job: Measuring) -> float:
-    """Mean dark signal (ADU/s) of pixels that are not hot; zero if it was not measured.
-
-    What the camera subtracts of it is included.
-    """
+    """Mean dark signal (ADU/s) of pixels that are not hot; zero if it was not measured."""
+    # What the camera subtracts of it is included.
     if not job.dark:
         return 0.0
     rate = usual_rate(on_grid(folder, job.shape, ("dark_rate",))[0], job.options.hot_sigma)

@@ -98,10 +98,8 @@ def find_stays(
 
 
 def _best_range(tried: Sequence[tuple[float, F64, F64]]) -> tuple[float, float, float] | None:
-    """Best of `DECADES`, the logarithm of its time, and its error; None if no fit is determined.
-
-    ``tried``: chi-square, (variance factor, logarithm of the time), and errors, of each range.
-    """
+    """Best of `DECADES`, the logarithm of its time, and its error; None if no fit is determined."""
+    # ``tried``: chi-square, (variance factor, logarithm of the time), and errors, of each range.
     best = 1 + min(range(len(tried) - 1), key=lambda n: tried[1 + n][0])
     if tried[0][0] - tried[best][0] < DIFFER:
         best = 0

@@ -259,10 +259,8 @@ def own_levels(series: Sequence[LitSeries], noise: float) -> OwnLevels:
 
 
 def _two_levels(charge: Reals, weight: Reals, shares: F64, amplitudes: F64) -> Reals:
-    """Logarithms (share, amplitude, n) of the likelihoods of two levels relative to one.
-
-    ``charge, weight``: as in `LitSeries`, of the type to compute in.
-    """
+    """Logarithms (share, amplitude, n) of the likelihoods of two levels relative to one."""
+    # ``charge, weight``: as in `LitSeries`, of the type to compute in.
     kind = charge.dtype.type
     found = np.empty((len(shares), len(amplitudes), charge.shape[1]), kind)
     for of_share, upper in zip(found, shares.astype(kind), strict=True):
