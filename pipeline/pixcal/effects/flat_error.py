@@ -117,7 +117,9 @@ class FlatError(Effect):
         pairs = [(iotas[i], alphas[j]) for i in range(n) for j in range(n) if i != j or n == 1]
         weight = int(np.count_nonzero(good))
         near = np.mean([neighbour_products(a, b, good) for a, b in pairs], axis=0)
-        ring = ring_power(_shared_power(pairs, weight))
+        # Mean cross power (y, x); its sum is the mean product of the good pixels.
+        products = [(np.fft.fft2(a) * np.conj(np.fft.fft2(b))).real for a, b in pairs]
+        ring = ring_power(np.asarray(np.mean(products, axis=0) / (weight * pairs[0][0].size)))
         all_of_it, neighbours = near[0][good], ((4 * near[1] - near[2]) / 3)[good]
         alone = float((all_of_it - neighbours).std() / np.sqrt(weight))
         smooth, noise, smooth_error = _smooth(neighbours, ring)
@@ -168,12 +170,6 @@ def _structure(
         out[good] = np.where(np.abs(rest) < limit, rest, 0.0)
         maps.append(out)
     return maps[0], maps[1]
-
-
-def _shared_power(pairs: list[tuple[F64, F64]], pixels: int) -> F64:
-    """Mean cross power (y, x); its sum is the mean product of the good pixels."""
-    products = [(np.fft.fft2(a) * np.conj(np.fft.fft2(b))).real for a, b in pairs]
-    return np.asarray(np.mean(products, axis=0) / (pixels * pairs[0][0].size))
 
 
 def _smooth(neighbours: F64, ring: "Ring") -> tuple[float, float, float]:

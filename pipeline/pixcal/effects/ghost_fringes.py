@@ -171,7 +171,13 @@ class GhostFringes(Effect):
         middle = (evidence.origin[1] + (nx - 1) / 2, evidence.origin[0] + (ny - 1) / 2)
         waves: list[GhostWave] = []
         errors: dict[str, float] = {}
-        tied = _tied(found.waves)
+        *single, both = (TiedWaves.of(law, found.waves) for law in LAWS)
+        best = min(single, key=lambda tied: tied.misfit)
+        static = sum(abs(w.static) ** 2 / w.errors[0] ** 2 for w in found.waves)
+        # Two ghosts have more free numbers, and must explain much more than one. Crosstalk causes
+        # no static fringes.
+        two = best.misfit > 2 * both.misfit + TWO_GHOSTS * len(found.waves) < static
+        tied = both if two else best
         columns = [abs(f.k[0]) >= abs(f.k[1]) for f in evidence.fringes.values()]
         alike = max(sum(columns), len(columns) - sum(columns))
         taken = tied.shrunk(found.waves, alike)
@@ -243,17 +249,6 @@ class TiedWaves:
             by_law.with_amplitudes(share * one.amplitudes + (1 - share) * by_law.amplitudes)
             for one, by_law in zip(measured, self.waves, strict=True)
         ]
-
-
-def _tied(waves: Sequence[WaveFit]) -> TiedWaves:
-    """Waves by the law that they follow."""
-    *single, both = (TiedWaves.of(law, waves) for law in LAWS)
-    best = min(single, key=lambda tied: tied.misfit)
-    static = sum(abs(w.static) ** 2 / w.errors[0] ** 2 for w in waves)
-    # Two ghosts have more free numbers, and must explain much more than one. Crosstalk causes no
-    # static fringes.
-    two = best.misfit > 2 * both.misfit + TWO_GHOSTS * len(waves) < static
-    return both if two else best
 
 
 def _of_a_beam(waves: Sequence[WaveFit], tied: TiedWaves, evidence: Evidence) -> bool:

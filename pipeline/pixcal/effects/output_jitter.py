@@ -98,7 +98,10 @@ class OutputJitter(Effect):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Edges at which the means of lines part anew in each frame, and levels between them."""
-        found = _outputs(evidence)
+        stacks = [s for s in unlit_stacks(evidence, "bias", "dark") if len(s.adu) >= MIN_FRAMES]
+        gain = np.float32(evidence.gain)
+        rests = [(s.adu - s.adu.mean(axis=0)) * gain for s in stacks]
+        found = find_outputs(rests, [s.time_s for s in stacks], evidence.good)
         if found is None:
             return None
         size, error = np.array([found.size, found.error]) * [1.0, HOUR_S]
@@ -115,14 +118,6 @@ class OutputJitter(Effect):
             found.sigmas,
             "steps between outputs that change in each frame without light",
         )
-
-
-def _outputs(evidence: Evidence) -> "Outputs | None":
-    """Outputs in the frames without light, with edges in window coordinates."""
-    stacks = [s for s in unlit_stacks(evidence, "bias", "dark") if len(s.adu) >= MIN_FRAMES]
-    gain = np.float32(evidence.gain)
-    rests = [(s.adu - s.adu.mean(axis=0)) * gain for s in stacks]
-    return find_outputs(rests, [s.time_s for s in stacks], evidence.good)
 
 
 @dataclass(frozen=True)
@@ -210,7 +205,10 @@ def _steps(lines: Sequence[F64], width: int, dof: int) -> F64:
     square = np.zeros(len(places))
     for own in lines:
         # Noise may depend on position.
-        noise = _line_noise(own)[None]
+        # Variance (n,) of line means (t, n), from differences of neighbours, insensitive to steps.
+        change = np.square(np.diff(own, axis=1)).mean(axis=0) / 2
+        near = np.pad(change, (NARROWEST, NARROWEST + 1), mode="reflect")
+        noise = np.asarray(np.median(sliding_window_view(near, 2 * NARROWEST + 1), axis=1))[None]
         expected = _means(noise, places, width)[0] + _means(noise, places - width, width)[0]
         steps = _means(own, places, width) - _means(own, places - width, width)
         steps /= np.sqrt(np.maximum(expected, 1e-12))
@@ -219,13 +217,6 @@ def _steps(lines: Sequence[F64], width: int, dof: int) -> F64:
     found = np.zeros(size + 1)
     found[places] = square * dof / max(float(np.median(square)), 1e-9)
     return found
-
-
-def _line_noise(lines: F64) -> F64:
-    """Variance (n,) of line means (t, n), from differences of neighbours, insensitive to steps."""
-    change = np.square(np.diff(lines, axis=1)).mean(axis=0) / 2
-    near = np.pad(change, (NARROWEST, NARROWEST + 1), mode="reflect")
-    return np.asarray(np.median(sliding_window_view(near, 2 * NARROWEST + 1), axis=1))
 
 
 def _means(lines: F64, first: Indices, count: int) -> F64:

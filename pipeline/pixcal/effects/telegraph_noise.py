@@ -125,7 +125,11 @@ class TelegraphNoise(Effect):
         series = tuple(_series(evidence))
         if not series:
             return None
-        found = find_telegraph(series, partial(_lit, evidence), _rejected_by_fit(evidence))
+        # Pixels that the fit excluded for their noise.
+        noisy = np.zeros(evidence.good.shape, bool)
+        for fringes in evidence.fringes.values():
+            noisy |= evidence.good & np.isfinite(fringes.theta).all(axis=0) & ~fringes.good
+        found = find_telegraph(series, partial(_lit, evidence), np.flatnonzero(noisy))
         if found is None:
             return None
         return _estimate(cls, found, evidence)
@@ -278,14 +282,6 @@ def _lit(evidence: Evidence, pixels: Indices) -> list[LitSeries]:
         fitted = freedom.of_time.T.astype(float)
         found.append(LitSeries(charge, weight, fringes.frame, period, np.flatnonzero(own), fitted))
     return found
-
-
-def _rejected_by_fit(evidence: Evidence) -> Indices:
-    """Pixels that the fit excluded for their noise."""
-    noisy = np.zeros(evidence.good.shape, bool)
-    for fringes in evidence.fringes.values():
-        noisy |= evidence.good & np.isfinite(fringes.theta).all(axis=0) & ~fringes.good
-    return np.flatnonzero(noisy)
 
 
 def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Series:

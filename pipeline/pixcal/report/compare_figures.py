@@ -109,19 +109,16 @@ def _scales(axes: Axes, view: ComponentView) -> None:
             style: Any = {"fmt": marker, "color": colour, "ms": 6, "label": label}
             axes.errorbar(at[which], line("px", key)[which], line("error_px", key)[which], **style)
     axes.set_yscale("log")
-    _round_off(axes, np.concatenate([expected, common[seen], difference]))
-    names = [str(s["side_px"]) for s in scales]
-    axes.set_xticks(at, [*names[:-1], f"≥{names[-1]}"])
-    axes.set(xlabel="scale (px)", ylabel=f"rms at this scale ({unit.label})", title="by scale")
-    finish(axes, legend="upper right")
-
-
-def _round_off(axes: Axes, values: F64) -> None:
-    """Limits and plain numbers of a logarithmic axis that spans a decade or two."""
+    # Limits and plain numbers of a logarithmic axis that spans a decade or two.
+    values = np.concatenate([expected, common[seen], difference])
     good = values[np.isfinite(values) & (values > 0)]
     if len(good):
         axes.set_ylim(0.45 * good.min(), 3 * good.max() * (good.max() / good.min()) ** 0.22)
     plain_ticks(axes.yaxis, *axes.get_ylim())
+    names = [str(s["side_px"]) for s in scales]
+    axes.set_xticks(at, [*names[:-1], f"≥{names[-1]}"])
+    axes.set(xlabel="scale (px)", ylabel=f"rms at this scale ({unit.label})", title="by scale")
+    finish(axes, legend="upper right")
 
 
 def _places(figure: SubFigure, axes: Axes, view: ComponentView) -> None:

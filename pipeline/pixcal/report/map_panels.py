@@ -68,18 +68,14 @@ def ticks(low: float, high: float, length: float, *, upwards: bool, log: bool = 
     return [(float(at), exact(value)) for at, value in zip(places, values, strict=True)]
 
 
-def data_url(picture: Image.Image) -> str:
-    """A picture as a PNG that is part of the page."""
-    out = io.BytesIO()
-    picture.save(out, "PNG")
-    return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode("ascii")
-
-
 def _image(classes: U8, colours: Sequence[str]) -> str:
     """Numbers of colours (y upwards) as a picture."""
     picture = Image.fromarray(np.ascontiguousarray(classes[::-1]))
     picture.putpalette([round(255 * v) for c in colours for v in to_rgb(c)])
-    return data_url(picture)
+    # A picture as a PNG that is part of the page.
+    out = io.BytesIO()
+    picture.save(out, "PNG")
+    return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode("ascii")
 
 
 def scaled(image: NDArray[np.floating], low: float, high: float, *, log: bool = False) -> U8:
@@ -214,16 +210,12 @@ def flags(masks: Mapping[str, FlagSummary]) -> tuple[list[Panel], Legend]:
 def _flags(title: str, summary: FlagSummary, most: float) -> Panel:
     if summary.block == 1:
         colours = [UNFLAGGED, *FLAGS.values(), SEVERAL]
-        return _panel(title, _classes(summary.image), colours, summary)
+        # 0 for good, 1 + bit for one flag, one more than all bits for several.
+        bits = np.unpackbits(summary.image[..., None], axis=-1, bitorder="little").astype(np.uint8)
+        several = np.uint8(len(FLAGS) + 1)
+        number = (bits * np.arange(1, 9, dtype=np.uint8)).sum(axis=-1, dtype=np.uint8)
+        return _panel(title, np.where(bits.sum(axis=-1) > 1, several, number), colours, summary)
     shown = scaled(100 * summary.share, 0, most)
     panel = _panel(title, shown, [*BAR_COLOURS, MASKED], summary)
     label = f"masked (%) of {summary.block} × {summary.block} px"
     return _with_bar(panel, label, 0, most, "neither")
-
-
-def _classes(image: U8) -> U8:
-    """0 for good, 1 + bit for one flag, one more than all bits for several."""
-    bits = np.unpackbits(image[..., None], axis=-1, bitorder="little").astype(np.uint8)
-    several = np.uint8(len(FLAGS) + 1)
-    number = (bits * np.arange(1, 9, dtype=np.uint8)).sum(axis=-1, dtype=np.uint8)
-    return np.where(bits.sum(axis=-1) > 1, several, number)

@@ -21,7 +21,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.estimators.maps.structure import flattened, without_outliers
 from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData, neighbour_sums
 from pixcal.kernels.robust import SIGMA_OF_MAD, robust_sigma
-from pixcal.model.arrays import F32, F64, Indices, Mask
+from pixcal.model.arrays import F32, F64, Mask
 
 # degree of the smooth surfaces that maps of the nominal bench may contain
 DEGREES = {"offset": 3, "contrast": 2, "light": 3}
@@ -340,12 +340,9 @@ class StackDeviations(_Deviations):
 def band_power(series: F64, *, squares: bool = True) -> F64:
     """Sums of squares (s, band) of cosine modes of series (s, t) per octave, or mode counts."""
     power = dct(series, norm="ortho", axis=1)[:, 1:] ** 2 if squares else series[:, 1:]
-    return np.asarray(np.add.reduceat(power, _octaves(power.shape[1]), axis=1))
-
-
-def _octaves(modes: int) -> Indices:
+    modes = power.shape[1]
     starts = 2 ** np.arange(2, max(int(np.log2(max(modes, 8))), 3)) - 4
-    return np.asarray(starts[starts < modes])
+    return np.asarray(np.add.reduceat(power, starts[starts < modes], axis=1))
 
 
 def _inverse(variance: F64) -> F64:

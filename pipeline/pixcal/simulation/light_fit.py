@@ -300,7 +300,7 @@ def _least_squares(
     whole, left = np.zeros((2, len(signals[0])))
     for one, data, own in zip(lit, rest, signals, strict=True):
         largest = np.abs(own).max(axis=(2, 3))
-        for kind in (k for k in kinds if _shows(largest, k)):
+        for kind in (k for k in kinds if (largest[:, k] > LEAST * largest.max(axis=1)).any()):
             free = np.concatenate([polynomial(one.good.shape, degree), one.gauge])
             stitched = one.stitched if kind == PHASE else None
             # A number of one set does not change the maps of other sets.
@@ -320,11 +320,6 @@ def _least_squares(
     found.values[determined] = fit.values / size
     found.covariance[np.ix_(determined, determined)] = fit.covariance / np.outer(size, size)
     return replace(found, gain=fit.gain)
-
-
-def _shows(largest: F64, kind: int) -> bool:
-    """Whether signals show in a kind of map, given the largest value (n, 3) of each."""
-    return bool((largest[:, kind] > LEAST * largest.max(axis=1)).any())
 
 
 def _gain(

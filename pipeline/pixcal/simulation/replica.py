@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.beams import Light
 from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.scene import DetectorMaps, FrameStates, Rows
@@ -87,7 +87,17 @@ class Replica:
         self._recordings: dict[str | int, Recording] = dict(set_recordings(evidence).items())
         self._frames: dict[str | int, Indices] = {s.name: s.frame for s in sets}
         for n, stack in enumerate(evidence.stacks):
-            self._recordings[n] = _of_stack(self._bench, n, stack, evidence, starts[n])
+            exposure = stack.exptime_s if np.isfinite(stack.exptime_s) else 0.0
+            electrons = 0.0
+            if stack.kind == "flat":
+                good = evidence.good & (evidence.flat > 0)
+                light = (stack.adu.mean(axis=0) - evidence.bias) * evidence.gain
+                light = (light - evidence.dark_rate * exposure)[good] / evidence.flat[good]
+                electrons = float(np.median(light)) if light.size else 0.0
+            count, period = int(np.ptp(stack.frame)) + 1, _period(stack.time_s)
+            self._recordings[n] = Recording(
+                self._bench, stack.kind, n, count, exposure, starts[n], period, electrons
+            )
             self._frames[n] = stack.frame - stack.frame[0]
 
     def simulated_samples(
@@ -191,20 +201,6 @@ def _of_set(bench: Bench, number: int, found: FringeEvidence, start_s: float) ->
     exposure = found.exptime_s if np.isfinite(found.exptime_s) else 0.0
     count, period = int(found.frame[-1]) + 1, _period(found.time_s)
     return Recording(bench, "fringes", number, count, exposure, start_s, period)
-
-
-def _of_stack(
-    bench: Bench, number: int, stack: Stack, evidence: Evidence, start_s: float
-) -> Recording:
-    exposure = stack.exptime_s if np.isfinite(stack.exptime_s) else 0.0
-    electrons = 0.0
-    if stack.kind == "flat":
-        good = evidence.good & (evidence.flat > 0)
-        light = (stack.adu.mean(axis=0) - evidence.bias) * evidence.gain
-        light = (light - evidence.dark_rate * exposure)[good] / evidence.flat[good]
-        electrons = float(np.median(light)) if light.size else 0.0
-    count, period = int(np.ptp(stack.frame)) + 1, _period(stack.time_s)
-    return Recording(bench, stack.kind, number, count, exposure, start_s, period, electrons)
 
 
 def _bench(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Bench:

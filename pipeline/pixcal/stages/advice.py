@@ -256,7 +256,9 @@ def _strength(cause: Json, name: str, unit: str) -> str:
         return ""
     if isinstance(value[0], Mapping):
         if "value" not in value[0]:
-            return _parts(name, value)
+            largest = max(map(_share, value))
+            number_of = f"{len(value)} {name if len(value) > 1 else name.removesuffix('s')}"
+            return f"{number_of}, largest {100 * largest:.2g} %" if largest else ""
         axis = "" if name.endswith("tracks") else label
         return f"{axis}{_replay(value, unit)}"
     numbers = [abs(v) for v in value if isinstance(v, int | float)]
@@ -280,13 +282,6 @@ def _replay(tracks: Sequence[Json], unit: str) -> str:
     if abs(level) <= _LEVEL * rms:
         return text
     return f"{text}, about a mean of {_measured(level, None, unit)}"
-
-
-def _parts(name: str, parts: Sequence[Json]) -> str:
-    """How many parts there are and the largest share; nothing where they have none."""
-    largest = max(map(_share, parts))
-    number_of = f"{len(parts)} {name if len(parts) > 1 else name.removesuffix('s')}"
-    return f"{number_of}, largest {100 * largest:.2g} %" if largest else ""
 
 
 def _share(part: Json) -> float:

@@ -88,7 +88,12 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         }
         for batches in sets.values():
             for region in filter(None, (config.region, *config.regions)):
-                _check_region(region, batches.window)
+                y0, y1, x0, x1 = region
+                if not (0 <= y0 < y1 <= batches.window[0] and 0 <= x0 < x1 <= batches.window[1]):
+                    raise InputError(
+                        f"--region {region_name(region)}: not inside the window, which is "
+                        f"0:{batches.window[0]},0:{batches.window[1]} (y0:y1,x0:x1, ends excluded)"
+                    )
 
         def body(made: Build) -> None:
             cube.create_group(made.folder / "allan.zarr")
@@ -100,15 +105,6 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             write_json(made.folder / "allan.json", whole)
 
         return make(run_dir, STAGES["allan"], result_options(config), inputs, body)
-
-
-def _check_region(region: Region, window: tuple[int, int]) -> None:
-    y0, y1, x0, x1 = region
-    if not (0 <= y0 < y1 <= window[0] and 0 <= x0 < x1 <= window[1]):
-        raise InputError(
-            f"--region {region_name(region)}: not inside the window, which is "
-            f"0:{window[0]},0:{window[1]} (y0:y1,x0:x1, ends excluded)"
-        )
 
 
 def _measure_set(
@@ -177,19 +173,16 @@ def _maps_task(batches: Batches, adev: ArrayWriter, expected: ArrayWriter, squar
         series = batches.read("batch_delta", (y, x)).reshape(batches.n, -1)
         shape = (len(lengths), y[1] - y[0], x[1] - x[0])
         deviations[:, *part] = allan_deviation(series, lengths).reshape(shape)
-        white[part] = _root_mean_square(batches.read("batch_sigma", (y, x)))
+        # Over the batches present; NaN without any.
+        sigma = batches.read("batch_sigma", (y, x))
+        total, count = np.zeros(sigma.shape[1:]), np.zeros(sigma.shape[1:])
+        for plane in sigma:
+            there = np.isfinite(plane)
+            total += np.where(there, plane, 0).astype(float) ** 2
+            count += there
+        white[part] = np.sqrt(np.where(count > 0, total, np.nan) / np.maximum(count, 1))
     adev.write((0, y0, x0), deviations)
     expected.write((y0, x0), white)
-
-
-def _root_mean_square(sigma: F32) -> F64:
-    """Over the batches present; NaN without any."""
-    total, count = np.zeros(sigma.shape[1:]), np.zeros(sigma.shape[1:])
-    for plane in sigma:
-        there = np.isfinite(plane)
-        total += np.where(there, plane, 0).astype(float) ** 2
-        count += there
-    return np.sqrt(np.where(count > 0, total, np.nan) / np.maximum(count, 1))
 
 
 def _measure_region(
@@ -211,7 +204,10 @@ def _measure_region(
         return _as_json(batches, [], stability.NO_CURVE, [], reason) | common | {"pixels": 0}
     chosen = [lengths[n] for n in quantiles]
     low, median, high = np.array(list(quantiles.values()), float).T
-    noise = noise_levels(folder / "expected", region)
+    expected_of_batch = partial(_positive, folder / "expected", None, region)
+    noise, count = quantiles_of_parts(expected_of_batch, NOISE_LEVELS)
+    if not count:
+        raise DamagedError(folder / "expected", "no errors of batches")
     white = stability.white_population(present, chosen, noise if pixels > 1 else None)
     shared = stability.shared_noise([grams[n] for n in quantiles], pixels)
     curve = stability.fit_curve(chosen, median, np.log(high / low) / 2, pixels, shared, white)
@@ -312,11 +308,3 @@ def _positive(path: Path, lengths: Range | None, region: Region) -> Iterator[F32
         values = reader.read(*([lengths] if lengths else []), rows, (x0, x1))
         # Zero means no noise.
         yield values[(values > 0) & (values < np.inf)]
-
-
-def noise_levels(path: Path, region: Region) -> F64:
-    """Quantiles of the expected deviation of one batch over a region, px."""
-    levels, count = quantiles_of_parts(partial(_positive, path, None, region), NOISE_LEVELS)
-    if not count:
-        raise DamagedError(path, "no errors of batches")
-    return levels

@@ -136,7 +136,11 @@ def hot_pixels(
     if not exposures or not np.any(evidence.dark_rate):
         return None
     signal = evidence.dark_rate * max(exposures)
-    return hot_pixels_of(signal, _unsaturated(evidence), evidence.origin, links, known)
+    # Pixels far from saturation in every dark.
+    usable = np.ones(evidence.good.shape, bool)
+    for stack in evidence.of_kind("dark"):
+        usable &= stack.adu.mean(axis=0) < 0.9 * evidence.saturation_adu
+    return hot_pixels_of(signal, usable, evidence.origin, links, known)
 
 
 def hot_pixels_of(
@@ -189,14 +193,6 @@ def hot_pixels_of(
     sigma = np.hypot(noise / charge[:, None, None], UNSURE * others)
     value, sigma = np.where(clean[at], value, 0.0), np.where(clean[at], sigma, np.inf)
     return HotPixels(y, x, charge * 1e-3, value, sigma)
-
-
-def _unsaturated(evidence: Evidence) -> Mask:
-    """Pixels far from saturation in every dark."""
-    usable = np.ones(evidence.good.shape, bool)
-    for stack in evidence.of_kind("dark"):
-        usable &= stack.adu.mean(axis=0) < 0.9 * evidence.saturation_adu
-    return usable
 
 
 def _patches(rest: F64, warm: F64, y: Indices, x: Indices, overlap: float) -> tuple[F64, Mask]:

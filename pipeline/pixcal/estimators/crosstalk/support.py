@@ -114,7 +114,15 @@ def _period(
     """The shortest period that is good enough for all links together, and for the maps."""
     scores = []
     for classes, information in present.every_period():
-        directions = _directions(classes)
+        # Numbers that shares may be made of, (u, direction): each has some shares alike.
+        # There, back and both, of each class of every period that divides the one at hand.
+        every = []
+        for coarse in classes.divisors():
+            groups = (coarse.groups_of(classes) == np.arange(coarse.count)[:, None]).astype(float)
+            there, back = np.zeros((2, coarse.count, 2 * classes.count))
+            there[:, ::2] = back[:, 1::2] = groups
+            every += [there + back, there, back]
+        directions = np.concatenate(every).T
         score = pattern(classes) - WORTH * (classes.count - 1)
         for normal, right in zip(*total(information), strict=True):
             basis, gain = _greedy(normal, right, directions)
@@ -122,18 +130,6 @@ def _period(
         scores.append((score, classes))
     enough = max(score for score, _ in scores) - critical
     return next(classes for score, classes in scores if score >= enough)
-
-
-def _directions(classes: PixelClasses) -> F64:
-    """Numbers that shares may be made of, (u, direction): each has some shares alike."""
-    # There, back and both, of each class of every period that divides the one at hand.
-    every = []
-    for coarse in classes.divisors():
-        groups = (coarse.groups_of(classes) == np.arange(coarse.count)[:, None]).astype(float)
-        there, back = np.zeros((2, coarse.count, 2 * classes.count))
-        there[:, ::2] = back[:, 1::2] = groups
-        every += [there + back, there, back]
-    return np.concatenate(every).T
 
 
 def _best_gains(normal: F64, right: F64) -> F64:

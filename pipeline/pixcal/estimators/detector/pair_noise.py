@@ -156,7 +156,11 @@ def _blocks(first: F32, second: F32, without: tuple[str, ...], **guess: float) -
     if not np.isfinite(first + second).any():
         return _NO_BLOCKS
     for name in without:
-        second = second + _common(first - second, name)
+        # Median of each line, to be broadcast; zero where a line has no sample.
+        difference = first - second
+        rows = np.ascontiguousarray(difference.T if name == "row" else difference)
+        median = np.nan_to_num(median_and_deviation(rows)[0])
+        second = second + (median[:, None] if name == "row" else median[None])
     blocks = pair_statistics(first, second, **guess)
     for name in without:
         across = 0 if name == "row" else 1
@@ -164,13 +168,6 @@ def _blocks(first: F32, second: F32, without: tuple[str, ...], **guess: float) -
         blocks[:, 2] += taken
         blocks[:, 3:] += np.outer(taken, LAGS[:, across] == 0)
     return blocks
-
-
-def _common(difference: F32, line: str) -> F32:
-    """Median of each line, to be broadcast; zero where a line has no sample."""
-    rows = np.ascontiguousarray(difference.T if line == "row" else difference)
-    median = np.nan_to_num(median_and_deviation(rows)[0])
-    return median[:, None] if line == "row" else median[None]
 
 
 class LineNoise:

@@ -249,9 +249,6 @@ class _SetFit:
 
     def _weighted_dots(self, rest: F32) -> F64:
         weighted = self._freedom.weight * rest
-        return np.array([_dot(left, weighted) for left in self._left])
-
-
-def _dot(a: F32, b: F32) -> float:
-    """Sum of the products: of each frame in float32, of the frames in float64."""
-    return float(np.einsum("tn,tn->t", a, b).sum(dtype=float))
+        return np.array(
+            [float(np.einsum("tn,tn->t", left, weighted).sum(dtype=float)) for left in self._left]
+        )

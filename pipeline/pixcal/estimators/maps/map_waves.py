@@ -118,7 +118,15 @@ def find_waves(evidence: Evidence) -> Waves | None:
     if best.significance > SIGNIFICANT:
         maps: Maps = ways[best.in_flats]
         for _ in range(MOST - 1):
-            maps = _less(maps, waves[-len(sets) :])
+            # Maps minus given waves.
+            remaining = dict(maps)
+            for w in waves[-len(sets) :]:
+                six = np.array([w.static, w.forward, w.backward]).view(float)
+                remaining[w.set] = [
+                    replace(m, data=m.data - np.tensordot(six, m.signals(np.array(w.q)), 1))
+                    for m in remaining[w.set]
+                ]
+            maps = remaining
             more = _strongest(maps, allowed, best.in_flats)
             if more.significance < SIGNIFICANT:
                 break
@@ -171,7 +179,10 @@ def _strongest(maps: Maps, allowed: Mapping[str, Mask], in_flats: bool) -> Waves
             gains[m.kind] = gains.get(m.kind, 0.0) + _plain_gain(m, q)
     by_map = {kind: sigmas_of_chi2(gain, dof) for kind, gain in gains.items()}
     order = sorted(by_map, key=lambda kind: -by_map[kind])
-    first = _best_of(gains[order[0]], trials, dof)
+    # Significance (standard deviations) of the best chi-square of a number of waves.
+    log_rate = np.log(max(trials, 1.0)) + np.log(dof / 2) - gains[order[0]] / 2
+    log_chance = log_rate if log_rate < -20 else np.log(-np.expm1(-np.exp(log_rate)))
+    first = -float(ndtri_exp(min(float(log_chance), -1e-300)))
     significance = float(min(first, by_map[order[1]]))
     if order[0] == LIGHT:
         # Equal ghosts of both fibres change neither visibility nor phase.
@@ -182,18 +193,6 @@ def _strongest(maps: Maps, allowed: Mapping[str, Mask], in_flats: bool) -> Waves
         significance,
         tuple(kind for kind in order if by_map[kind] > SIGNIFICANT) or tuple(order[:2]),
     )
-
-
-def _less(maps: Maps, waves: Sequence[WaveFit]) -> Maps:
-    """Maps minus given waves."""
-    remaining = dict(maps)
-    for w in waves:
-        six = np.array([w.static, w.forward, w.backward]).view(float)
-        remaining[w.set] = [
-            replace(m, data=m.data - np.tensordot(six, m.signals(np.array(w.q)), 1))
-            for m in remaining[w.set]
-        ]
-    return remaining
 
 
 def _power(maps: Sequence[_Map], allowed: Mask) -> F64:
@@ -284,10 +283,3 @@ def _plain_gain(m: _Map, q: F64) -> float:
     e = np.exp(1j * (q[0] * x + q[1] * y))
     signals = np.stack([e.real, e.imag])
     return map_fit.fit_maps([MapPart.of(signals, m.data, m.free, m.good)]).gain
-
-
-def _best_of(gain: float, trials: float, dof: int) -> float:
-    """Significance (standard deviations) of the best chi-square of a number of waves."""
-    log_rate = np.log(max(trials, 1.0)) + np.log(dof / 2) - gain / 2
-    log_chance = log_rate if log_rate < -20 else np.log(-np.expm1(-np.exp(log_rate)))
-    return -float(ndtri_exp(min(float(log_chance), -1e-300)))

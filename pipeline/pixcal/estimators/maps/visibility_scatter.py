@@ -24,7 +24,9 @@ def visibility_products(evidence: Evidence, sets: Sequence[FringeEvidence]) -> P
     for at, (m, n) in enumerate(pairs):
         first, second = maps[m][:2] if m == n else (both[m], both[n])
         product, errors[at] = _of_pixels(first, second, maps[m][2] & maps[n][2])
-        products[at] = product - _bias_variance(evidence) / (
+        # Variance of the subtracted bias, e-², which is common to all frames.
+        counts = [len(s.adu) for s in evidence.of_kind("bias")]
+        products[at] = product - (evidence.read_noise**2 / sum(counts) if counts else 0.0) / (
             mean_light(sets[m]) * mean_light(sets[n])
         )
     return pairs, products, errors
@@ -35,12 +37,6 @@ def mean_light(found: FringeEvidence) -> float:
     light = found.theta[0][found.good]
     # Of the inverse squares, since pixels in little light change most; dead corners do not count.
     return float(np.mean(np.maximum(light, 0.1 * np.median(light)) ** -2.0) ** -0.5)
-
-
-def _bias_variance(evidence: Evidence) -> float:
-    """Variance of the subtracted bias, e-², which is common to all frames."""
-    counts = [len(s.adu) for s in evidence.of_kind("bias")]
-    return evidence.read_noise**2 / sum(counts) if counts else 0.0
 
 
 def _two_halves(found: FringeEvidence) -> tuple[F64, F64, Mask]:

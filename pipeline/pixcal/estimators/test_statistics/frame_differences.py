@@ -35,20 +35,16 @@ def differences(evidence: Evidence, stack: Stack) -> F32:
     count = len(light) // 2 * 2
     steps = light[1:count:2] - light[:count:2]
     if stack.kind == "flat":
-        steps = _without_gradient(steps, evidence)
+        # Differences (t, y, x) of flats without changes of the light's gradient.
+        # The gradient of the sky rotates from frame to frame; light is no part of the detector.
+        basis = _gradient(evidence)
+        flat = steps.reshape(len(steps), -1)
+        steps = np.asarray((flat - flat @ basis @ basis.T).reshape(steps.shape))
     steps -= frame_means(steps, good)[:, None, None].astype(np.float32)
     # Root mean squares, as medians of integers are quantised.
     rest = steps / np.sqrt((steps[:, good] ** 2).mean())
     rest[np.abs(rest) > OUTLIER_SIGMA] = 0
     return np.asarray(rest * good, np.float32)
-
-
-def _without_gradient(steps: F32, evidence: Evidence) -> F32:
-    """Differences (t, y, x) of flats without changes of the light's gradient."""
-    # The gradient of the sky rotates from frame to frame; light is no part of the detector.
-    basis = _gradient(evidence)
-    flat = steps.reshape(len(steps), -1)
-    return np.asarray((flat - flat @ basis @ basis.T).reshape(steps.shape))
 
 
 @cached_on_evidence

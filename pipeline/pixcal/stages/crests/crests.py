@@ -168,9 +168,12 @@ def _from_first_frame(
         phase, sigma, light = _window_phases(accumulate(0, windows, carrier), windows)
         _check(np.isfinite(sigma))
         followed = _follow(windows, phase, sigma, carrier)
-        carrier = replace(
-            carrier, phase=followed, light=_brightened(windows, light, sigma, carrier)
-        )
+        # Logarithm of the previous illumination times the light of the windows with fringes.
+        use = np.isfinite(sigma) & (light > 0)
+        y, x = carrier.scaled(*(c[use] for c in windows.centres))
+        basis, powers = _design(y, x, _highest_degree(windows, len(y)))
+        fit = np.linalg.lstsq(basis, np.log(light[use]), rcond=1e-12)[0]
+        carrier = replace(carrier, phase=followed, light=_plus(carrier.light, powers, fit))
         kx, ky = carrier.vector(*np.array(carrier.centre))
         vector = float(kx), float(ky)
         windows = Windows.lay(frame, vector, segment)
@@ -218,15 +221,6 @@ def _highest_degree(windows: Windows, number: int) -> int:
     while degree > 1 and 0.75 * (degree + 1) * (degree + 2) > number:
         degree -= 1
     return degree
-
-
-def _brightened(windows: Windows, light: F64, sigma: F64, carrier: CrestCarrier) -> F64:
-    """Logarithm of the previous illumination times the light of the windows with fringes."""
-    use = np.isfinite(sigma) & (light > 0)
-    y, x = carrier.scaled(*(c[use] for c in windows.centres))
-    basis, powers = _design(y, x, _highest_degree(windows, len(y)))
-    fit = np.linalg.lstsq(basis, np.log(light[use]), rcond=1e-12)[0]
-    return _plus(carrier.light, powers, fit)
 
 
 def _follow(windows: Windows, phase: F64, sigma: F64, carrier: CrestCarrier) -> F64:

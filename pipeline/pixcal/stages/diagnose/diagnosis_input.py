@@ -156,7 +156,10 @@ def _frames_used(
 
 def _memory(half: FrameSubset, pixels: int, runtime: Runtime) -> tuple[Runtime, Runtime, bool]:
     """Workers for simulations and for estimates; whether an estimate fits beside simulations."""
-    largest, evidence = _samples(half, pixels)
+    # Samples of a window: in the largest fringe set and in all; without fringes in all frames.
+    counts = [len(frames) for name, frames in half.items() if "/" in name]
+    counts = counts or [sum(map(len, half.values()))]
+    largest, evidence = pixels * max(counts), pixels * sum(counts)
     frames = sum(len(frames) for name, frames in half.items() if "/" not in name)
     held = EVIDENCE_BYTES * evidence + CALIBRATION_BYTES * pixels * frames
     need, estimates = held + LOOK_BYTES * largest, ESTIMATE_BYTES * largest
@@ -190,13 +193,6 @@ def _evidence(
 
     halves = list(zip(("fitted", "held-out"), raws, strict=True))
     return run_tasks(of_half, halves, runtime.here, label=f"window {number}")
-
-
-def _samples(half: FrameSubset, pixels: int) -> tuple[int, int]:
-    """Samples of a window: in the largest fringe set and in all; without fringes in all frames."""
-    counts = [len(frames) for name, frames in half.items() if "/" in name]
-    counts = counts or [sum(map(len, half.values()))]
-    return pixels * max(counts), pixels * sum(counts)
 
 
 def _enough(half: FrameSubset) -> None:

@@ -96,7 +96,15 @@ class Description:
         """Contents of ``diagnosis.json``; ``places``: deviations of the windows, `by_domain`."""
         found, final, verdict = self.found, self.final, self._verdict()
         causes = [self._cause(name) for name in found.accepted]
-        where = self._where()
+        # Statistics that differ, the largest effect first; then those only with effects.
+        before, after, size = final.before, final.after, final.sizes.size
+        keys = sorted(self.where, key=lambda k: (-abs(size[k]), k))
+        keys += sorted(flagged(after) - self.where, key=lambda k: after[k].log_chance)
+        where = [self._entry(key, before[key], after[key]) for key in keys]
+        not_tested: Json = {}  # effects that these frames cannot show, by the frames that could
+        for candidate in found.candidates.values():
+            if candidate.needs and candidate.needs != (FRINGES,):
+                not_tested.setdefault(" or ".join(candidate.needs), []).append(candidate.name)
         return {
             "schema": SCHEMA,
             "pixcal": __version__,
@@ -112,7 +120,7 @@ class Description:
                 "places": list(places),
             },
             "candidates": [self._candidate(c) for c in found.candidates.values()],
-            "not_tested": self._not_tested(),
+            "not_tested": not_tested,
             "not_compared": not_compared(self.measured, self.data),
             "more_would_tell": self._more_would_tell(where, verdict),
             "statistics": len(final.before),
@@ -194,14 +202,6 @@ class Description:
         largest = max(where, key=lambda entry: abs(entry["z_after"]))
         return recommend_closer_look(self.facts.missing_frames, largest["domain"])
 
-    def _not_tested(self) -> Json:
-        """Effects that these frames cannot show, by the frames that could."""
-        groups: Json = {}
-        for candidate in self.found.candidates.values():
-            if candidate.needs and candidate.needs != (FRINGES,):
-                groups.setdefault(" or ".join(candidate.needs), []).append(candidate.name)
-        return groups
-
     def _strongest_evidence(self, without: Trial) -> list[dict[str, str]]:
         """Statistics whose likelihood an effect raises most, best first."""
         gains = likelier(self.data, without.expected, self.found.final.expected)
@@ -253,13 +253,6 @@ class Description:
         low = mean - error if usual is None else np.maximum(mean - error, -3)
         ends = (("value", mean), ("low", low), ("high", mean + error))
         return {name: _natural(values, usual).tolist() for name, values in ends}
-
-    def _where(self) -> list[Json]:
-        """Statistics that differ, the largest effect first; then those only with effects."""
-        before, after, size = self.final.before, self.final.after, self.final.sizes.size
-        keys = sorted(self.where, key=lambda k: (-abs(size[k]), k))
-        keys += sorted(flagged(after) - self.where, key=lambda k: after[k].log_chance)
-        return [self._entry(key, before[key], after[key]) for key in keys]
 
     def _entry(self, key: Key, before: Difference, after: Difference) -> Json:
         at, curve = before.worst if key in self.where else after.worst, self.curves[key]

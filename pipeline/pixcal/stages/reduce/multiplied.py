@@ -32,7 +32,8 @@ def with_excess_noise(summary: Summary, source: Ingested, job: Measuring) -> Sum
     slope, variance = 1 / gain.gain, max(gain.read_variance[0], job.quantum**2 / 12)
 
     def of(group: Group, level: float) -> Skew | None:
-        window = tuple(((n - m) // 2, (n + m) // 2) for n, m in _sizes(job))
+        sizes = [(n, min(n, _SIDE)) for n in job.shape]
+        window = tuple(((n - m) // 2, (n + m) // 2) for n, m in sizes)
         used = group.frames[:_FRAMES]
         frames = np.stack([*frames_of(source, group.array, used, (window[0], window[1]))])
         good = np.ones(frames.shape[1:], np.bool_)
@@ -48,8 +49,3 @@ def with_excess_noise(summary: Summary, source: Ingested, job: Measuring) -> Sum
     if points[0] is None or not is_multiplied((p for p in points if p is not None), slope):
         return summary
     return replace(summary, gain=replace(gain, excess=(EXCESS, EXCESS * EXCESS_ERROR)))
-
-
-def _sizes(job: Measuring) -> list[tuple[int, int]]:
-    """Length of the detector, and of its middle, along each axis."""
-    return [(n, min(n, _SIDE)) for n in job.shape]

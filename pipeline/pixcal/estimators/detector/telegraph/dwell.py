@@ -70,7 +70,10 @@ def find_stays(
         chosen, shown = _chosen(stays, seen)
         variance = _excess(seen) * seen.sigma**2 * chosen.sum() / max(float(chosen @ shown), 1e-9)
         variance *= 4 * upper * (1 - upper)
-        powers = kept ** LAGS[used, None] - _of_mean(kept, count)
+        # Variance of the subtracted mean of ``count`` frames, over that of one.
+        k = np.minimum(kept, 1 - 1e-9)
+        both = (1 + k) / (1 - k) / count - 2 * k * (1 - k**count) / (count * (1 - k)) ** 2
+        powers = kept ** LAGS[used, None] - np.asarray(both)
         return np.asarray(variance * (powers @ chosen) / max(chosen.sum(), 1e-9))
 
     def fitted(decades: float) -> tuple[float, F64, F64]:
@@ -131,13 +134,6 @@ def _products(series: LitSeries) -> tuple[F64, F64]:
             sums[n] = (noise[later] * noise[later - lag]).mean(axis=0) + missing
             weights[n] = (root[later] * root[later - lag]).mean(axis=0)
     return sums, weights
-
-
-def _of_mean(kept: F64, count: int) -> F64:
-    """Variance of the subtracted mean of ``count`` frames, over that of one."""
-    k = np.minimum(kept, 1 - 1e-9)
-    both = (1 + k) / (1 - k) / count - 2 * k * (1 - k**count) / (count * (1 - k)) ** 2
-    return np.asarray(both)
 
 
 def _excess(seen: Moments) -> float:
