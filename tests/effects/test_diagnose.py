@@ -360,7 +360,7 @@ def test_an_effect_of_the_users_own_may_be_in_the_nominal_bench(
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"only": ("colour",)}, "unknown effect; known are"),
+        ({"only": ("lagg",)}, "did you mean 'lag'?"),
         ({"without": ("colour",)}, "unknown effect"),
         (
             {"only": ("lag", "ipc"), "without": ("lag",)},

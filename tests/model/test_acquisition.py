@@ -92,6 +92,9 @@ MISTAKES: list[tuple[list[Any], Any, list[str]]] = [
     (["frames", "fringes", 1, "files"], ["/x"], ["frames.fringes[1]", "files[0]", "relative"]),
     (["frames", "fringes", 1, "baseline_mm"], [0, 0], ["frames.fringes[1]", "baseline_mm"]),
     (["frames", "fringes", 1, "baseline_mm"], [6], ["frames.fringes[1].baseline_mm", "2 values"]),
+    (["frames", "fringes", 1, "baseline_mm"], 6.0, ["baseline_mm", "such as [a, b], in mm"]),
+    (["frames", "fringes", 1, "baseline_mm"], [0, 6e3], ["fringes[1].baseline_mm", "0.0096 px"]),
+    (["optics", "distance_mm"], 0.4, ["frames.fringes[0].baseline_mm", "units"]),
     (["frames"], {}, ["frames", "no files"]),
 ]
 

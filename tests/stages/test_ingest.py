@@ -295,11 +295,11 @@ def test_another_acquisition_is_refused(tmp_path: Path) -> None:
     save(folder / "v/f2.fits", other)
     with pytest.raises(InputError) as caught:
         ingest.run(folder, run, ingest.Config(), SYNC)
-    for word in (str(run / "ingest"), "the files of fringes/vertical", "--out", "--overwrite"):
+    for word in (str(run / "ingest"), "changed: fringes/vertical", "--out", "--overwrite"):
         assert word in str(caught.value)
     assert "acquisition.yaml" not in str(caught.value)
     describe(folder, period=0.15)
-    with pytest.raises(InputError, match=r"acquisition \(acquisition\.yaml, the files of fringes"):
+    with pytest.raises(InputError, match=r"\(changed: fringes/vertical, acquisition\.yaml\)"):
         ingest.run(folder, run, ingest.Config(), SYNC)
     second = ingest.run(folder, run, ingest.Config(overwrite=True), SYNC)
     assert (read(run)[2] == other).all()

@@ -201,7 +201,9 @@ def test_what_must_have_been_run(tmp_path: Path) -> None:
 def test_without_fringes_no_command_is_advised_that_needs_them(tmp_path: Path, stage: str) -> None:
     with build(tmp_path, "ingest", 1, {}, {}) as made:
         write_json(made.folder / "acquisition.json", {"frames": {"fringes": []}})
-    with pytest.raises(InputError, match=f"lists no fringes, so there is no {stage}$"):
+    with pytest.raises(
+        InputError, match=f"no {stage}: its acquisition.yaml lists no frames.fringes$"
+    ):
         require(tmp_path, stage)
 
 

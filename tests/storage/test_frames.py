@@ -73,7 +73,7 @@ def test_one_file_without_stamp_means_names() -> None:
     found, warnings = table([frame_file("a", 60001.0), frame_file("b"), frame_file("c", 60000.0)])
     assert found["file"] == ["a", "b", "c"]
     assert found["mjd"] == [60001.0, None, 60000.0]
-    assert "1 of 3 files have no time stamp (b)" in warnings[0]
+    assert "no readable time stamp in 1 of 3 files (b)" in warnings[0]
 
 
 def test_same_stamps_are_ordered_by_name() -> None:
@@ -81,6 +81,14 @@ def test_same_stamps_are_ordered_by_name() -> None:
     found, warnings = table(files)
     assert found["file"] == ["f2", "f10", "f1", "f3"]
     assert "2 time stamps are the same as the one before (f2 and f10)" in " ".join(warnings)
+
+
+@pytest.mark.parametrize(("exptime", "count"), [(0.9, 0), (1.5, 0), (900.0, 1)])
+def test_exposures_longer_than_the_steps_of_time_are_not_in_seconds(
+    exptime: float, count: int
+) -> None:
+    files = [frame_file(f"f{n}", 60000 + n * SECOND, 1, exptime) for n in range(4)]
+    assert sum("EXPTIME 900 is longer" in one for one in table(files)[1]) == count
 
 
 def test_one_stamp_for_all_is_none() -> None:

@@ -5,6 +5,7 @@ that is not part of pixcal is such a file anywhere (`pixcal.simulation.own_effec
 docs/reference/effects/ tell what each effect is, and how it is measured and corrected.
 """
 
+import difflib
 import importlib
 import pkgutil
 from collections.abc import Iterable, Mapping
@@ -40,6 +41,17 @@ def known_effects(own: Iterable[Path] = ()) -> dict[str, type[Effect]]:
     return known
 
 
+def check_known(name: str, known: Mapping[str, type[Effect]], where: str) -> None:
+    """Raise InputError if there is no effect of this name."""
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1)
+        meant = f"did you mean {near[0]!r}? Known" if near else "known"
+        raise InputError(
+            f"{where}: unknown effect {name!r:.80}; {meant} are {', '.join(known)}; give the file "
+            "of your own effect with --own"
+        )
+
+
 def parse_effects(
     plain: Mapping[str, Any], where: str, known: Mapping[str, type[Effect]] | None = None
 ) -> tuple[Effect, ...]:
@@ -50,11 +62,7 @@ def parse_effects(
     known = effects() if known is None else known
     found = []
     for name, values in plain.items():
-        if name not in known:
-            raise InputError(
-                f"{where}: effects: unknown effect {name!r:.80}; known are {', '.join(known)}; "
-                "give the file of your own effect with --own"
-            )
+        check_known(name, known, f"{where}: effects")
         parameters = {} if values is None else values
         found.append(parse(known[name], parameters, where, key=f"effects.{name}"))
     return tuple(found)

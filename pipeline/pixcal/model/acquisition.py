@@ -13,6 +13,9 @@ from pixcal.model.errors import InputError
 from pixcal.model.yaml_file import read_yaml
 
 SCHEMA = "pixcal/acquisition/1"
+# shortest period along x and y: below 2 px fringes are aliased to wider ones of another direction,
+# and nominal vectors are accurate to some 10 %
+SHORTEST_PX = 2.2
 
 
 @dataclass(frozen=True)
@@ -114,6 +117,15 @@ class Acquisition:
         check_names("frames.fringes", [s.name for s in self.frames.fringes])
         if self.frames.fringes and self.optics is None:
             raise InputError("optics: missing; with fringes give its wavelength_nm and distance_mm")
+        for number, one in enumerate(self.frames.fringes):
+            shift = max(map(abs, one.baseline_mm)) * self.detector.pitch_um
+            period = 1e-3 * self.fibres.wavelength_nm * self.fibres.distance_mm / shift
+            if period < SHORTEST_PX:
+                raise InputError(
+                    f"frames.fringes[{number}].baseline_mm: wavelength_nm × distance_mm / (1000 × "
+                    f"pitch_um × baseline_mm) is a fringe period of {period:.2g} px, below "
+                    f"{SHORTEST_PX:g} px along x or y; check these four numbers and their units"
+                )
         kinds = (self.frames.bias, self.frames.dark, self.frames.flat, self.frames.fringes)
         if not any(kinds):
             raise InputError("frames: no files are listed; give globs")

@@ -180,7 +180,9 @@ def _value(hint: Any, value: Any, place: _Place, meta: Any) -> Any:
 
 def _items(hints: tuple[Any, ...], values: Any, place: _Place, meta: Any) -> tuple[Any, ...]:
     if not isinstance(values, (list, tuple)):
-        raise place.wrong(f"expected a list, found {_kind(values)}")
+        unit = f", in {meta['unit']}" if meta.get("unit") else ""
+        example = "[a, b]" if hints[-1] is not Ellipsis else "[a]"
+        raise place.wrong(f"expected a list such as {example}{unit}, found {_kind(values)}")
     if hints[-1] is Ellipsis:
         hints = hints[:1] * len(values)
     if len(values) != len(hints):

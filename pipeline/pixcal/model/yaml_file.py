@@ -41,7 +41,10 @@ class _StrictLoader(yaml.SafeLoader):
         for key_node, value_node in node.value:
             key, line = key_node.value, key_node.start_mark.line + 1
             if key_node.tag != "tag:yaml.org,2002:str":
-                raise yaml.YAMLError(f"line {line}: keys must be words")
+                raise yaml.YAMLError(
+                    f"line {line}: the key {key or 'nothing'!r:.80} is not a name; in numbers "
+                    "write a decimal point, not a comma"
+                )
             if key in section:
                 raise yaml.YAMLError(f"line {line}: key {key!r:.80} is given twice")
             section[key] = self.construct_object(value_node, deep=True)
@@ -93,7 +96,8 @@ def _reason(error: Exception) -> str:
     """The fault of a text and its place, in one line."""
     if isinstance(error, yaml.MarkedYAMLError) and error.problem and error.problem_mark:
         mark = error.problem_mark
-        return f"{error.problem} (line {mark.line + 1}, column {mark.column + 1})"
+        tab = "; indent by spaces, not by tabs" if "'\\t'" in error.problem else ""
+        return f"{error.problem} (line {mark.line + 1}, column {mark.column + 1}){tab}"
     return reason_of(error)
 
 

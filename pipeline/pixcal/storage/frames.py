@@ -92,6 +92,17 @@ def tabulate(
             warnings.append(
                 f"a cube overlaps the next file in time, judging by its {late.time_source}"
             )
+        overlaps = [
+            (a.file.exptime_s, b.time_s - a.time_s)
+            for a, b in pairwise(frames)
+            if 0 < 2 * (b.time_s - a.time_s) < (a.file.exptime_s or 0.0)
+        ]
+        if 2 * len(overlaps) >= len(frames):
+            exptime, gap = overlaps[0]
+            warnings.append(
+                f"EXPTIME {exptime:g} is longer than the {gap:.3g} s to the next time stamp; "
+                "write it in seconds"
+            )
     else:
         frames = _counted_frames(ordered, frame_period_s)
     return frames, [f"{array}: {sentence}" for sentence in warnings]
@@ -118,8 +129,8 @@ def _order(files: Sequence[FrameFile]) -> tuple[list[FrameFile], bool, list[str]
         return named, False, []
     if len(stamps) < len(named):
         without = next(file.source.name for file in named if file.mjd is None)
-        missing = f"{len(named) - len(stamps)} of {len(named)} files"
-        return named, False, [f"{missing} have no time stamp ({without}); ordered by file name"]
+        missing = f"{len(named) - len(stamps)} of {len(named)} files ({without})"
+        return named, False, [f"no readable time stamp in {missing}; ordered by file name"]
     if len(named) > 1 and len(set(stamps)) == 1:
         return named, False, ["all files have the same time stamp; ordered by file name"]
     warnings = []

@@ -33,7 +33,7 @@ def require(run: Path, name: str) -> Manifest:
         raise
     if manifest is None:
         if stage.of_fringes and without_fringes(run):
-            raise InputError(f"{run}: the acquisition lists no fringes, so there is no {name}")
+            raise InputError(f"{run}: no {name}: its acquisition.yaml lists no frames.fringes")
         raise InputError(f"{folder}: not there yet; run '{command}' first")
     if manifest.stage != name or manifest.format not in (stage.format, *stage.earlier):
         raise InputError(

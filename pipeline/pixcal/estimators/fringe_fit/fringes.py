@@ -8,7 +8,6 @@ from typing import TypeVar
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from pixcal.kernels.optics import interfringe
 from pixcal.kernels.robust import median
 from pixcal.model.arrays import C128, F32, F64, Mask
 from pixcal.model.errors import InputError
@@ -18,9 +17,6 @@ MIN_FRINGES = 1.5  # fewest fringes across a window for the search of a peak
 # fewest fringes for maps with correct errors: with 1.3 to 1.8 the gauge mistakes true offsets for
 # fringes, and errors were 2 to 4 times SIGMA (measured on 80 x 80 px)
 MIN_FRINGES_FOR_MAPS = 1.95
-# shortest period along x and y: below 2 px fringes are aliased to wider ones of another direction,
-# and nominal vectors are accurate to some 10 %
-SHORTEST_PX = 2.2
 # least cosine between the fringes' axis and the nominal one: the nominal vector gives the sign
 MOST_TURNED = 0.5
 RESOLVED = 1e-7  # last step to the peak of the spectrum, rad/px
@@ -79,15 +75,9 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
     """Fringe vector (kx, ky), rad/px, of a tile, from maps (n, y, x) over their mean light.
 
     The highest peak of the summed power spectra, with the sign of the ``nominal`` vector. Raises
-    InputError if no peak stands out, or fringes are fewer than `MIN_FRINGES`, narrower than
-    `SHORTEST_PX`, or lie across the nominal ones.
+    InputError if no peak stands out, or fringes are fewer than `MIN_FRINGES` or lie across the
+    nominal ones.
     """
-    if max(map(abs, nominal)) * SHORTEST_PX > 2 * np.pi:
-        raise InputError(
-            f"baseline_mm and optics give a fringe period of {interfringe(nominal):.2g} px, "
-            f"below {SHORTEST_PX:g} px along x or y; correct the numbers, or "
-            "use a shorter baseline"
-        )
     shape = maps.shape[1:]
     window = np.hanning(shape[0] + 2)[1:-1, None] * np.hanning(shape[1] + 2)[None, 1:-1]
     weight = window * good

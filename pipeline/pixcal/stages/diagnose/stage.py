@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.effects import known_effects, parse_effects
+from pixcal.effects import check_known, known_effects, parse_effects
 from pixcal.engine.malloc import keep_arrays
 from pixcal.engine.run import Runtime
 from pixcal.estimators.fringe_fit.modes import solve_modes
@@ -77,11 +77,7 @@ def _diagnose(
 
 def _kinds(config: Config, known: Mapping[str, type[Effect]]) -> dict[str, type[Effect]]:
     for name in (*config.only, *config.without):
-        if name not in known:
-            raise InputError(
-                f"--effects {name!r:.80}: unknown effect; known are {', '.join(known)}; give "
-                "the file of your own effect with --own"
-            )
+        check_known(name, known, "--effects")
         if name in config.only and name in config.without:
             raise InputError(
                 f"--effects: {name} is a candidate and left out; write either '{name}' or '-{name}'"

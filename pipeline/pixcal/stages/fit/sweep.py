@@ -74,7 +74,7 @@ def load_run(run_dir: Path, command: str = "") -> Acquisition:
     acquisition = read_acquisition(run_dir)
     if command and not acquisition.frames.fringes:
         raise InputError(
-            f"{run_dir}: the acquisition lists no fringes; {command} needs frames.fringes"
+            f"{run_dir}: its acquisition.yaml lists no frames.fringes, which {command} needs"
         )
     return acquisition
 

@@ -132,12 +132,12 @@ def _refuse_other(
 ) -> None:
     """Refuse to replace an ingest of another acquisition, and name the differences."""
     arrays = sorted(inputs.keys() | earlier.inputs.keys())
-    other = [f"the files of {a}" for a in arrays if inputs.get(a) != earlier.inputs.get(a)]
+    other = [a for a in arrays if inputs.get(a) != earlier.inputs.get(a)]
     if earlier.config != plain:
-        other.insert(0, "acquisition.yaml")
+        other.append("acquisition.yaml")
     raise InputError(
-        f"{out / STAGE.name}: made from another acquisition ({', '.join(other) or 'format'} "
-        "changed since); choose another --out, or replace it with --overwrite"
+        f"{out / STAGE.name}: made from another acquisition (changed: "
+        f"{', '.join(other) or 'format'}); choose another --out, or replace it with --overwrite"
     )
 
 

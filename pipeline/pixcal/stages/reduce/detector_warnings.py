@@ -44,17 +44,16 @@ def detector_warnings(
     if saturation is not None:
         warnings.append(
             f"flats saturate at {saturation:.0f} ADU, where their samples pile up: "
-            f"{(~summary.usable).sum()} of {len(summary.usable)} levels are excluded from gain "
-            "and linearity; declare detector.saturation_adu if it is another level"
+            f"gain and linearity exclude {(~summary.usable).sum()} of {len(summary.usable)} "
+            "levels; if they saturate elsewhere, declare detector.saturation_adu"
         )
     if summary.gain is not None:
         warnings += _gain_warnings(summary.gain, summary, gain, filtered)
     if summary.full.any():
         assert summary.well is not None
         warnings.append(
-            f"the wells are full at {summary.well[0]:.0f} ADU above bias: {summary.full.sum()} of "
-            f"{len(summary.levels)} levels of flats are at or near full well and are excluded from "
-            "gain and linearity"
+            f"the wells are full at {summary.well[0]:.0f} ADU above bias: gain and linearity "
+            f"exclude {summary.full.sum()} of {len(summary.levels)} levels of flats, at or near it"
         )
     warnings += _linearity_warnings(summary)
     noise = summary.declared.read_noise_e

@@ -95,7 +95,7 @@ def _group_darks(found: Exposures, times: Mapping[str, list[float | None]]) -> N
     found.dark += _groups("dark", dark)
     unknown = sum(t is None for t in dark)
     if unknown:
-        found.warnings.append(f"{unknown} of {len(dark)} dark frames have no EXPTIME: not used")
+        found.warnings.append(f"no EXPTIME in {unknown} of {len(dark)} dark frames: not used")
     if not found.dark:
         found.warnings.append(
             "no bias and no dark frames: bias and dark signal are taken as zero, the gain is not "
@@ -133,11 +133,11 @@ def _group_flats(found: Exposures, times: list[float | None], steps: Sequence[in
                 "headers (for TIFF and PNG into headers.csv)"
             )
     elif unknown:
-        found.warnings.append(f"{unknown} of {len(times)} flat frames have no EXPTIME: not used")
+        found.warnings.append(f"no EXPTIME in {unknown} of {len(times)} flat frames: not used")
     elif unexposed:
         found.warnings.append(
-            f"{unexposed} of {len(times)} flat frames have an exposure time of 0 s: not used; list "
-            "them under frames.bias if they hold no light"
+            f"EXPTIME is 0 s in {unexposed} of {len(times)} flat frames: not used; list them under "
+            "frames.bias if they hold no light"
         )
     if all(len(group.frames) < 2 for group in found.flat):
         found.warnings.append(
@@ -151,7 +151,7 @@ def _time_fringes(found: Exposures, name: str, times: list[float | None]) -> Non
     found.fringes[name] = np.array([t or 0.0 for t in times], np.float32)
     if found.has_rate and unknown:
         found.warnings.append(
-            f"{name}: {unknown} of {len(times)} frames have no EXPTIME: their dark signal is taken "
+            f"{name}: no EXPTIME in {unknown} of {len(times)} frames: their dark signal is taken "
             "as zero"
         )
     if len(found.dark) == 1 and found.dark[0].array == "dark":
@@ -159,6 +159,6 @@ def _time_fringes(found: Exposures, name: str, times: list[float | None]) -> Non
         other = sum(t is not None and abs(t - expected) > _SAME * expected for t in times)
         if other:
             found.warnings.append(
-                f"{name}: {other} of {len(times)} frames do not have the exposure time of "
-                f"the darks, {expected:g} s, whose mean is subtracted as bias and dark signal"
+                f"{name}: the mean of the darks, {expected:g} s, is subtracted as bias and dark "
+                f"signal, but EXPTIME differs in {other} of {len(times)} frames"
             )
