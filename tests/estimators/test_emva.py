@@ -92,6 +92,21 @@ def test_saturation_is_where_the_variance_falls():
     np.testing.assert_allclose(points[:, 2], points[:, 1] * np.sqrt(2e-4))
 
 
+def test_few_samples_of_low_variance_are_no_saturation():
+    # A single level of flats that reaches a little into the next bin.
+    rng = np.random.default_rng(3)
+    dof = np.array([2e4, 8.0])
+    found = 0
+    for _ in range(300):
+        variance = 2e4 * rng.chisquare(dof) / dof
+        found += (
+            saturation(transfer_points(np.stack([dof, dof * 2.2e4, dof * variance], 1))) is not None
+        )
+    assert found <= 3
+    full = transfer_points(np.stack([dof, dof * [2.2e4, 2.3e4], dof * [2e4, 30.0]], axis=1))
+    assert saturation(full) is not None
+
+
 def test_many_bins_are_put_together_without_loss():
     sums = np.abs(np.random.default_rng(1).standard_normal((512, 3))) + 0.1
     points = transfer_points(sums, most=50)

@@ -148,7 +148,7 @@ def saturation(points: F64) -> Measure | None:
         return None
     # The variance of few pixels may be high by chance.
     peak = int((points[:, 1] - 2 * points[:, 2]).argmax())
-    fallen = points[peak + 1 :][points[peak + 1 :, 1] < _FALL * points[peak, 1], 0]
+    fallen = _fallen(points, peak, _FALL)
     if not len(fallen):
         return None
     level = float(points[peak, 0])
@@ -158,9 +158,16 @@ def saturation(points: F64) -> Measure | None:
 def full_level(points: F64) -> float:
     """Lowest level (ADU) of full pixels, which have only read noise; infinite without any."""
     # With few levels the curve's maximum may lie far below.
-    peak = int(points[:, 1].argmax()) if len(points) else 0
-    full = points[peak + 1 :][points[peak + 1 :, 1] < _FULL * points[peak : peak + 1, 1], 0]
+    full = _fallen(points, int(points[:, 1].argmax()), _FULL) if len(points) else points
     return float(full[0]) if len(full) else math.inf
+
+
+def _fallen(points: F64, peak: int, share: float) -> F64:
+    """Levels beyond a peak where the variance is below ``share`` of it, and not by chance."""
+    level, variance, error = points[peak + 1 :].T
+    # 3-sigma limit of a chi-square (Wilson and Hilferty 1931), without scatter where it is zero.
+    part = error / np.maximum(variance, 1e-30)
+    return np.asarray(level[variance < share * points[peak, 1] * (1 - part - part**2 / 9) ** 3])
 
 
 def dynamic_range(full_well: Measure, read_noise: Measure) -> tuple[float, float, float]:
