@@ -178,6 +178,20 @@ def test_strong_jumps_show_in_fringes_alone(
     assert TelegraphNoise.estimate(replace(evidence, stacks=(), fringes={})) is None
 
 
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("amplitude", [32.0, 60.0])
+def test_few_bias_frames_and_fringes_add_what_the_others_miss(
+    acquired: Callable[..., Evidence], amplitude: float
+) -> None:
+    few = {"frames.bias": 10, "frames.darks": []}
+    evidence = acquired(few, {"telegraph_noise": {"share": 0.03, "amplitude_e": amplitude}})
+    alone = [replace(evidence, stacks=()), replace(evidence, fringes={})]
+    least = max(5.0, *(TelegraphNoise.detect(e) or 0.0 for e in alone))
+    found = TelegraphNoise.estimate(evidence)
+    assert found is not None
+    assert found.significance >= least
+
+
 def with_noise(evidence: Evidence, gain: np.ndarray) -> Evidence:
     """Pixels as noisy as before, times a map."""
     stacks = []
@@ -225,7 +239,7 @@ def test_it_is_found_in_noise_of_less_than_a_step_of_the_converter(
     nothing = TelegraphNoise.estimate(acquired(coarse, effects))
     assert nothing is not None
     assert nothing.significance < 4
-    truth = {"share": 0.03, "amplitude_e": 90.0}
+    truth = {"share": 0.03, "amplitude_e": 50.0}
     found = TelegraphNoise.estimate(acquired(coarse, {**effects, "telegraph_noise": truth}))
     assert found is not None
     assert found.significance > 5

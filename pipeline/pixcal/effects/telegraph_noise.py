@@ -1,6 +1,5 @@
 """Random telegraph noise: pixels whose level jumps between two values."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
@@ -122,7 +121,7 @@ class TelegraphNoise(Effect):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Pixels noisier than the rest whose noise is telegraph noise by its shape."""
-        series = tuple(_series(evidence))
+        series = _series(evidence)
         if not series:
             return None
         # Pixels that the fit excluded for their noise.
@@ -136,7 +135,7 @@ class TelegraphNoise(Effect):
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
-        return significance(tuple(_series(evidence)))
+        return significance(_series(evidence))
 
 
 def _estimate(cls: type[TelegraphNoise], found: Telegraph, evidence: Evidence) -> Estimate:
@@ -229,16 +228,15 @@ def _states(seed: int, frames: int, kept: bytes, upper: bytes) -> U8:
     return np.concatenate(packed)
 
 
-def _series(evidence: Evidence) -> Iterator[Series]:
+def _series(evidence: Evidence) -> tuple[Series, ...]:
     dark = [s for s in evidence.stacks if s.kind != "flat" and len(s.adu) >= _MIN_FRAMES]
+    found = tuple(s for stack in dark if (s := _of_stack(stack, evidence)) is not None)
     if sum(len(s.adu) for s in dark) >= _ENOUGH or not evidence.fringes:
-        for stack in dark:
-            if (series := _of_stack(stack, evidence)) is not None:
-                yield series
-        return
-    for fringes in evidence.fringes.values():
-        if len(fringes.g) >= _ENOUGH:
-            yield _of_fringes(fringes, evidence)
+        return found
+    # A few frames without light show small jumps, hundreds of fringes large and rare ones.
+    fringes = evidence.fringes.values()
+    lit = tuple(_of_fringes(f, evidence) for f in fringes if len(f.g) >= _ENOUGH)
+    return max(lit, found, key=lambda series: significance(series) or -np.inf)
 
 
 def _of_stack(stack: Stack, evidence: Evidence) -> Series | None:
