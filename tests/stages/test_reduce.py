@@ -497,6 +497,26 @@ def test_a_pixel_that_is_saturated_without_light_is_hot(tmp_path: Path) -> None:
     assert read(tmp_path, "calibration.zarr/mask")[3, 4] & PixelFlag.HOT
 
 
+def test_a_pixel_that_is_full_without_light_has_the_rate_of_the_shortest_such_dark(
+    tmp_path: Path,
+) -> None:
+    camera = Camera(15, SMALL)
+    camera.dark[3, 4] = 1e6
+    darks = [camera.take(9, seconds) for seconds in (1, 30)]
+    small(
+        tmp_path,
+        {
+            "bias": (camera.take(9, 0), [0.0] * 9),
+            "dark": (np.concatenate(darks), [1.0] * 9 + [30.0] * 9),
+        },
+    )
+    bias, rate = (
+        read(tmp_path, f"calibration.zarr/{name}")[3, 4] for name in ("bias", "dark_rate")
+    )
+    assert rate == pytest.approx(GAIN * (FULL - bias), rel=0.001)
+    assert bias == pytest.approx(camera.bias[3, 4], abs=4 * READ / GAIN / 3)
+
+
 def test_pixels_that_differ_are_not_noisy_under_dark_signal(tmp_path: Path) -> None:
     camera = Camera(14)
     camera.read = READ * camera.rng.lognormal(0, 0.2, SHAPE)

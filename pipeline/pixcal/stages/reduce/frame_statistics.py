@@ -182,7 +182,13 @@ def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined])
     """Measure bias and dark signal, and the typical variance of a sample in this column."""
     maps = column.maps
     times = [group.exptime for group in job.dark]
-    line = calibration.dark_line([c.mean for c in combined], [c.kept for c in combined], times)
+    counts = [c.kept.astype(float) for c in combined]
+    beyond = np.zeros(counts[0].shape, np.bool_)
+    for n in np.argsort(times):
+        # A pixel that is full without light tells no more at longer exposures.
+        counts[n][beyond] = 0
+        beyond |= combined[n].mean >= job.full
+    line = calibration.dark_line([c.mean for c in combined], counts, times)
     maps["bias"], maps["dark_rate"] = line.bias, line.rate
     rate = np.nan_to_num(line.rate) + job.subtracted[0]
     charges = [np.maximum(rate * time, 0) for time in times]
