@@ -124,6 +124,15 @@ def test_rows_lit_otherwise_at_each_step_are_not_nonlinear_but_their_bent_pixels
     assert np.argwhere(nonlinear(steps, step_levels(steps), 0.03)).tolist() == [[30, 4]]
 
 
+def test_light_that_an_iris_shutter_slopes_is_not_nonlinear_but_a_bent_pixel_is() -> None:
+    steps, _ = ladder(np.random.default_rng(9), (101, 100))
+    y, x = np.mgrid[:101, :100]
+    for step in steps:
+        step.signal[:] *= 1 + 0.02 / step.exptime * np.hypot(y - 150, x - 120) / 200
+        step.signal[30, 4] *= 1 - 0.3 * step.exptime
+    assert np.argwhere(nonlinear(steps, step_levels(steps), 0.03)).tolist() == [[30, 4]]
+
+
 def test_a_pixel_that_bends_is_nonlinear() -> None:
     steps, _ = ladder(np.random.default_rng(7), (50, 60))
     for step in steps:

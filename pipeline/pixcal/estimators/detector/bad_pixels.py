@@ -202,7 +202,7 @@ def nonlinear(steps: Sequence[ExposureLevel], levels: F64, limit: float) -> Mask
 
 
 def _departing(share: F64, error: F64, weight: F64, limit: float) -> Mask:
-    """Where shares (step, y, x) of the level depart from the curve of equally bright pixels."""
+    """Where shares (step, y, x) of the level depart from those of neighbours equally bright."""
     total = weight.sum(axis=0)
     for _ in range(_CURVES):
         mean = (weight * share).sum(axis=0) / total
@@ -222,13 +222,16 @@ def _line_medians(values: F64, axis: int) -> F64:
 
 
 def _common(off: F64, brightness: F64, used: Mask) -> F64:
-    """Part of departures (step, y, x) that pixels of equal brightness (y, x) share."""
+    """Part of departures (step, y, x) that pixels of equal brightness (y, x) share, and its slope."""
+    # An iris shutter gives a slope over the tile.
     seen = lit(brightness)
     if not seen.any():
         return np.zeros_like(off)
     usual, scale = median_and_sigma(brightness[seen])
     x = (brightness - usual) / scale if scale > 0 else 0 * brightness
     powers = np.vander(np.nan_to_num(np.clip(x, -_FARTHEST, _FARTHEST)).ravel(), _DEGREE + 1)
+    places = np.indices(brightness.shape).reshape(2, -1).T / max(brightness.shape) - 0.5
+    powers = np.hstack([powers, places])
     some = np.arange(0, x.size, max(x.size // _SAMPLE, 1) | 1)
     some = some[seen.ravel()[some]]
     picked = powers[some]
@@ -241,8 +244,8 @@ def _common(off: F64, brightness: F64, used: Mask) -> F64:
 
 
 def _curve(powers: F64, products: F64, values: F64, usable: Mask) -> F64:
-    """Polynomial through values (n,) without outliers; all zero through too few."""
-    # ``powers, products``: (n, power), (n, power * power) of the places, and products of each two.
+    """Sum of terms that fits values (n,) without outliers; all zero for too few values."""
+    # ``powers, products``: (n, term), (n, term * term) of each value, and products of each two.
     terms = np.zeros(powers.shape[1])
     kept = usable
     for _ in range(_CLIPPINGS):
