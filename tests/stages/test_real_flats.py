@@ -290,6 +290,20 @@ def test_wells_that_end_just_below_the_highest_code_are_not_the_converters_end(
     assert any(warning.startswith(said) for warning in report["warnings"])
 
 
+def test_wells_that_end_where_the_converter_could_clip_noise_are_no_bent_response(
+    tmp_path: Path,
+) -> None:
+    gain = 0.14
+    well = 0.98 * gain * (65535 - 200.4)
+    flats = ladder([(t, 1) for t in (0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.09, 1.3)], 4)
+    made = {**CAMERA, "gain": gain, "top": 65535}
+    camera = Detector(**made, flats=flats, response=lambda e: np.minimum(e, well))
+    _, report = reduced(camera, 6, tmp_path)
+    assert report["linearity"]["max_deviation_percent"] < 0.2
+    found = report["figures_of_merit"]["saturation"]
+    assert abs(well / gain - found["value"]) < 2 * found["error"]
+
+
 def test_flats_with_full_wells_are_not_diagnosed() -> None:
     tables = {
         "bias": {"exptime_s": [0.0] * 4},

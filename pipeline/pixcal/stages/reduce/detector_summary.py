@@ -105,7 +105,11 @@ def summarise(job: Measuring, folder: Place, source: Ingested) -> Summary:
     sums = pair_sums(folder, job)
     # Full pixels saturate the flats even if the converter does not saturate.
     points = transfer_points(add_neighbours(sums[1], sums[0])[0])
-    well = saturation(points)
+    well, below = saturation(points), usable & ~nearly
+    if well is None and below.any() and (usable & nearly).any():
+        # Photon transfer leaves out levels that the converter's end may clip.
+        ends = levels[below].max(), levels[usable & nearly].max()
+        well = float(sum(ends)) / 2, float(ends[1] - ends[0]) / 2
     rate = read_noise.dark_rate(folder, job)
     times = np.array([group.exptime for group in job.flat])
     charged = levels + rate * times if job.flats_timed and job.flat else levels
