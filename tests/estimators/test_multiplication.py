@@ -51,3 +51,16 @@ def test_two_frames_have_no_third_moment() -> None:
     frames = np.ones((2, *SHAPE), np.float32)
     assert skew(frames, 1.0, 1.0, 1.0, np.ones(SHAPE, np.bool_)) is None
     assert not is_multiplied([], 1.0)
+
+
+def test_a_lamp_that_flickers_over_a_bright_spot_leaves_the_third_moment_of_single_electrons() -> (
+    None
+):
+    rng = np.random.default_rng(4)
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    spot = 0.3 + np.exp(-((y - 75) ** 2 + (x - 80) ** 2) / 1800)
+    level = 2000 / spot.mean()
+    frames = rng.poisson(level * spot * np.array([1.1, 0.95, 0.95])[:, None, None])
+    one = skew(frames.astype(np.float32), 2000.0, READ**2, 1.0, np.ones(SHAPE, np.bool_))
+    assert one is not None
+    assert one.cumulant == pytest.approx(2000, abs=4 * one.error)

@@ -50,7 +50,11 @@ def skew(frames: F32, level: float, variance: float, slope: float, good: Mask) -
     if count < MIN_FRAMES:
         return None
     used = frames[:, good]
-    rest = used - used.mean(axis=0)
+    pattern = used.mean(axis=0)
+    rest = used - pattern
+    # A lamp that flickers changes bright pixels the more.
+    pattern -= pattern.mean()
+    rest -= np.outer(rest @ pattern, pattern / max(float(pattern @ pattern), 1e-30))
     limit = _CLIP * np.sqrt(variance + slope * max(level, 0.0)) + _ELECTRONS * slope
     away = np.abs(rest - np.median(rest, axis=1, keepdims=True))
     rest = rest[:, (away < limit).all(axis=0)]
