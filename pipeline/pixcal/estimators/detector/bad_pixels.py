@@ -222,7 +222,7 @@ def _line_medians(values: F64, axis: int) -> F64:
 
 
 def _common(off: F64, brightness: F64, used: Mask) -> F64:
-    """Part of departures (step, y, x) that pixels of equal brightness (y, x) share, and its slope."""
+    """Part of departures (step, y, x) common to pixels of equal brightness (y, x), and a slope."""
     # An iris shutter gives a slope over the tile.
     seen = lit(brightness)
     if not seen.any():
