@@ -62,7 +62,8 @@ def skew(frames: F32, level: float, variance: float, slope: float, good: Mask) -
         return None
     rest -= rest.mean(axis=1, keepdims=True)
     unbiased = count / ((count - 1) * (count - 2))
-    cubes = unbiased * (rest.astype(float) ** 3).sum(axis=0)
+    # Three factors: a third power takes 80 times as long.
+    cubes = unbiased * np.einsum("tp,tp,tp->p", rest, rest, rest, dtype=float)
     return Skew(level, float(cubes.mean()), float(cubes.std() / np.sqrt(rest.shape[1])))
 
 
