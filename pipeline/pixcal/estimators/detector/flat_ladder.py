@@ -167,7 +167,7 @@ def unproven_ladder(evidence: Evidence) -> Ladder | None:
     error = np.hypot(LAMP, flicker(evidence)[0] / np.sqrt(counts))
     # Where the flat varies, bright pixels are more nonlinear than the mean.
     flat = evidence.flat[evidence.good] / evidence.flat[evidence.good].mean()
-    moments = float((flat**2).mean()), float((flat**3).mean())
+    moments = float((flat**2).mean()), float((flat**2 * flat).mean())
     found = _of_one_lamp(times, levels, error, moments)
     return None if found is None or found.wander > STEADY else found
 

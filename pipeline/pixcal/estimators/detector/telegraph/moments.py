@@ -90,7 +90,7 @@ def moments_of(series: Series, *, hits: bool = False) -> Moments | None:
     x = np.nan_to_num(x - np.nanmean(x, axis=0))
     square = np.maximum((x**2).sum(axis=0), 1e-12)
     variance = square / (n - 1)
-    kurtosis = n * (x**4).sum(axis=0) / square**2 - 3
+    kurtosis = n * ((x * x) ** 2).sum(axis=0) / square**2 - 3
     kurtosis = (n - 1) / ((n - 2) * (n - 3)) * ((n + 1) * kurtosis + 6)
     products, pairs = np.full((len(LAGS), x.shape[1]), np.nan), []
     for own, lag in zip(products, LAGS, strict=True):
