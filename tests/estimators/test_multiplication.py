@@ -64,3 +64,19 @@ def test_a_lamp_that_flickers_over_a_bright_spot_leaves_the_third_moment_of_sing
     one = skew(frames.astype(np.float32), 2000.0, READ**2, 1.0, np.ones(SHAPE, np.bool_))
     assert one is not None
     assert one.cumulant == pytest.approx(2000, abs=4 * one.error)
+
+
+def test_noise_of_rows_is_one_sample_a_row() -> None:
+    rng = np.random.default_rng(5)
+    pulls = []
+    for _ in range(30):
+        frames = 10 * rng.standard_normal((4, *SHAPE)) + 20 * rng.standard_normal((4, SHAPE[0], 1))
+        one = skew(frames.astype(np.float32), 0.0, 500.0, 1.0, np.ones(SHAPE, np.bool_))
+        assert one is not None
+        pulls.append(one.cumulant / one.error)
+    assert 0.6 < np.std(pulls) < 1.4
+
+
+def test_noise_below_a_step_does_not_tell() -> None:
+    frames = np.rint(np.random.default_rng(6).normal(0.25, 0.3, (4, *SHAPE))).astype(np.float32)
+    assert skew(frames, 0.0, 0.09, 0.01, np.ones(SHAPE, np.bool_), 1.0) is None

@@ -32,7 +32,9 @@ class Skew(NamedTuple):
     error: float
 
 
-def skew(frames: F32, level: float, variance: float, slope: float, good: Mask) -> Skew | None:
+def skew(
+    frames: F32, level: float, variance: float, slope: float, good: Mask, quantum: float = 0.0
+) -> Skew | None:
     """Third cumulant of the noise of frames (t, y, x) of one scene; None without enough samples.
 
     Parameters
@@ -45,9 +47,11 @@ def skew(frames: F32, level: float, variance: float, slope: float, good: Mask) -
         Variance without light (ADU²), and how it rises with the level (ADU).
     good : (y, x) bool
         Pixels to use.
+    quantum : float
+        Step of the samples, ADU. Rounding has a third cumulant where the noise is below a step.
     """
     count = len(frames)
-    if count < MIN_FRAMES:
+    if count < MIN_FRAMES or variance + slope * level < quantum**2 / 2:
         return None
     used = frames[:, good]
     pattern = used.mean(axis=0)
@@ -57,14 +61,19 @@ def skew(frames: F32, level: float, variance: float, slope: float, good: Mask) -
     rest -= np.outer(rest @ pattern, pattern / max(float(pattern @ pattern), 1e-30))
     limit = _CLIP * np.sqrt(variance + slope * max(level, 0.0)) + _ELECTRONS * slope
     away = np.abs(rest - np.median(rest, axis=1, keepdims=True))
-    rest = rest[:, (away < limit).all(axis=0)]
-    if rest.shape[1] < _MIN_PIXELS:
+    kept = (away < limit).all(axis=0)
+    if kept.sum() < _MIN_PIXELS:
         return None
+    rest = rest[:, kept]
     rest -= rest.mean(axis=1, keepdims=True)
     unbiased = count / ((count - 1) * (count - 2))
     # Three factors: a third power takes 80 times as long.
     cubes = unbiased * np.einsum("tp,tp,tp->p", rest, rest, rest, dtype=float)
-    return Skew(level, float(cubes.mean()), float(cubes.std() / np.sqrt(rest.shape[1])))
+    # Noise that a row or a column shares is one sample of it.
+    mean = float(cubes.mean())
+    lines = (np.arange(len(cubes)), *np.argwhere(good)[kept].T)
+    squares = max(float((np.bincount(of, cubes - mean) ** 2).sum()) for of in lines)
+    return Skew(level, mean, squares**0.5 / len(cubes))
 
 
 def is_multiplied(points: Iterable[Skew], slope: float) -> bool:

@@ -37,7 +37,7 @@ def with_excess_noise(summary: Summary, source: Ingested, job: Measuring) -> Sum
         used = group.frames[:_FRAMES]
         frames = np.stack([*frames_of(source, group.array, used, (window[0], window[1]))])
         good = np.ones(frames.shape[1:], np.bool_)
-        return skew(frames.astype(np.float32), level, variance, slope, good)
+        return skew(frames.astype(np.float32), level, variance, slope, good, job.quantum)
 
     groups = [(dark, 0.0)]
     groups += [
