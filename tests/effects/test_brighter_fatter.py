@@ -196,8 +196,7 @@ def test_its_size_is_found(acquired: Callable[..., Evidence], size: float) -> No
     # The falloff, which is found too, takes half of what is known of the size.
     assert abs(found.effect.shift_px_per_e - size) < 4 * found.errors["shift_px_per_e"] < 2e-8
     own = found.together[0]["shift_px_per_e"] if found.together else found.errors["shift_px_per_e"]
-    # The fit is of first order: three times the shift by the mean light, 22 ke-, are left out.
-    assert own < 2.5e-9 + 3 * size**2 * 2.5e4
+    assert own < 2.5e-9
     assert found.significance > 8
     value, error = of_noise(evidence)
     assert abs(value - size) < 4 * error

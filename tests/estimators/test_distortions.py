@@ -7,9 +7,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pixcal.estimators.diagnosis.distortions import Distortion, Freedom, fit_distortions
+from pixcal.estimators.diagnosis.distortions import (
+    Distortion,
+    Freedom,
+    distortion_sums,
+    fit_distortions,
+)
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid
+from pixcal.kernels.boundaries import boundary_shifts, moved_charge
 
 F32 = NDArray[np.float32]
 RNG = np.random.default_rng(31)
@@ -141,6 +147,21 @@ def test_sets_of_which_one_denies_the_size_disagree(fringes: FringeEvidence) -> 
         assert fit_distortions(sets, distortion, 1)[2].rejected == rejected
 
 
+def test_charge_moves_from_the_light_before_it_moved(fringes: FringeEvidence) -> None:
+    """From the fitted fringes, which lost contrast by it, 3 % more would have to move."""
+    truth = np.array([0.0, 1.0, 0.0])
+
+    def distortion(_: FringeEvidence, signal: F32, sizes: NDArray[np.float64]) -> F32:
+        shifts = [boundary_shifts(falloff) for falloff in (0.35, 0.5, 0.7)]
+        return moved_charge(signal, 1e-6 * np.tensordot(sizes, shifts, 1))
+
+    whole = replace(fringes, good=np.ones_like(fringes.good))
+    normal, right = distortion_sums(
+        [bent(whole, distortion, truth, np.zeros(()))], distortion, 3, 0
+    )
+    assert right[1] / normal[1, 1] == pytest.approx(1, rel=2e-3)
+
+
 def bent(
     fringes: FringeEvidence, distortion: Distortion, truth: NDArray[Any], noise: NDArray[Any]
 ) -> FringeEvidence:
@@ -148,5 +169,7 @@ def bent(
     signal = fringes.model
     changed = signal + distortion(fringes, signal, truth)
     electrons = (changed + np.sqrt(fringes.variance) * noise).astype(np.float32)
-    theta = np.linalg.lstsq(fringes.g, changed.reshape(T, -1), rcond=None)[0]
+    weighted = fringes.g.T / fringes.variance.reshape(T, -1).T[:, None]  # (n, 3, t)
+    normal, right = weighted @ fringes.g, weighted @ changed.reshape(T, -1).T[..., None]
+    theta = np.linalg.solve(normal, right)[..., 0].T
     return replace(fringes, electrons=electrons, theta=theta.reshape(3, NY, NX))

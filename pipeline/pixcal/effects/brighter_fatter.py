@@ -5,12 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixcal.estimators.detector.neighbours import SharedCharge, shared_charge
-from pixcal.estimators.detector.response import (
-    FALLOFFS_PX,
-    Boundaries,
-    boundaries_alone,
-    boundaries_beside,
-)
+from pixcal.estimators.detector.response import Boundaries, boundaries_alone, boundaries_beside
 from pixcal.estimators.diagnosis.evidence import Evidence, central_crop
 from pixcal.kernels.boundaries import REACH, boundary_shifts, moved_charge
 from pixcal.kernels.significance import sigmas_of_chi2
@@ -27,7 +22,6 @@ _NEEDED = 12.0  # chi-square of three terms above which they are needed: one in 
 _APART = 9.0  # chi-square above which shifts along x and y differ
 _MAX_ALONG_Y = 10.0  # largest ratio of the shift along y to that along x
 _MAX_SHIFT = 1e-3  # px/e-; wells of a few thousand electrons have 1e-5 and more
-_SECOND_ORDER = 3.0  # relative error of the fitted shift, for a boundary shifted by 1 px
 _TURNS = 4  # iterations of the inverse; each cuts the error to a few per cent
 
 
@@ -97,36 +91,33 @@ class BrighterFatter(Effect):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """From the covariance of neighbours and the second harmonic of the fringes."""
         evidence = central_crop(evidence)
-        explaining = _explaining(evidence, cls().falloff_px) if evidence.fringes else None
-        falloff = cls().falloff_px if explaining is None else explaining.falloff_px
-        # Noise is weak evidence; with another falloff it might seem to contradict the harmonics.
-        falloff = min(FALLOFFS_PX, key=lambda px: abs(np.log(px / falloff)))
+        alone = _explaining(evidence, cls().falloff_px) if evidence.fringes else None
+        # With another falloff than that of the harmonics, noise might seem to contradict them.
+        falloff = cls().falloff_px if alone is None else alone.falloff_px
         noise = shared_charge(evidence, boundary_shifts(falloff))
         if noise is None:
             return None
         size, variance = noise.size, noise.variance
         significance = float(size / np.sqrt(variance))
         why = "covariance of neighbours that rises with the square of the level"
-        if evidence.fringes:
-            shift, of_shift, _ = boundaries_beside(evidence, falloff)
-            if abs(shift - size) < _DISAGREE * np.sqrt(variance + of_shift):
-                known = size, variance
-                size, variance, gain = boundaries_beside(evidence, falloff, known)
-                significance = float(np.copysign(np.sqrt(max(gain, 0.0)), size))
-                why += ", and a second harmonic of the fringes that depends on their direction"
         along_y = 1.0
         if not evidence.fringes:
             size, variance, along_y, significance = _by_axis(noise)
-        error = float(np.sqrt(variance))
-        errors: dict[str, float] = {"shift_px_per_e": error}
+        else:
+            shift, of_shift, _ = boundaries_beside(evidence, falloff)
+            if _agree(noise, shift, of_shift):
+                known = size, variance + (_LAW_ERROR * shift) ** 2
+                size, variance, gain = boundaries_beside(evidence, falloff, known)
+                significance = float(np.copysign(np.sqrt(max(gain, 0.0)), size))
+                why += ", and a second harmonic of the fringes that depends on their direction"
+        errors: dict[str, float] = {"shift_px_per_e": float(np.sqrt(variance))}
         together: tuple[dict[str, float], ...] = ()
-        alone = None
-        if explaining is not None and significance > _HINTED:
-            alone = _beside_noise(explaining, evidence)
-        if alone is not None:
-            falloff, size, along_y = alone.falloff_px, alone.shift, alone.along_y
-            errors, together = _errors(alone, evidence)
-            why += "; no nonlinearity is needed in addition"
+        if alone is not None and significance > _HINTED:
+            mean = alone.shift * (1 + alone.along_y) / 2
+            if _agree(noise, mean, alone.shift_error**2):
+                size, along_y = alone.shift, alone.along_y
+                errors, together = _errors(alone)
+                why += "; no nonlinearity is needed in addition"
         effect = cls(float(np.clip(size, 0, _MAX_SHIFT)), falloff, along_y)
         return Estimate(effect, errors, significance, why, together)
 
@@ -152,33 +143,19 @@ def _explaining(evidence: Evidence, otherwise_px: float) -> Boundaries | None:
     return found if found.against <= max(_NEEDED, found.shapes) else None
 
 
-def _beside_noise(found: Boundaries, evidence: Evidence) -> Boundaries | None:
-    """The boundaries, unless the noise of neighbours contradicts them."""
-    noise = shared_charge(evidence, boundary_shifts(found.falloff_px))
-    if noise is None:
-        return None
-    apart = abs(found.shift * (1 + found.along_y) / 2 - noise.size)
-    errors = found.shift_error, noise.variance**0.5, _LAW_ERROR * noise.size
-    return found if apart < _DISAGREE * float(np.linalg.norm(errors)) else None
+def _agree(noise: SharedCharge, shift: float, variance: float) -> bool:
+    """Whether a shift by the harmonics does not contradict the noise of neighbours."""
+    variance += noise.variance + (_LAW_ERROR * shift) ** 2
+    return (shift - noise.size) ** 2 < _DISAGREE**2 * variance
 
 
-def _errors(
-    found: Boundaries, evidence: Evidence
-) -> tuple[dict[str, float], tuple[dict[str, float], ...]]:
-    """Errors of all parameters, and their correlated steps.
-
-    The fit of the harmonics is of first order in the shift of a boundary.
-    """
-    light = max(float(np.median(f.theta[0][f.good])) for f in evidence.fringes.values())
-    second_order = _SECOND_ORDER * abs(found.shift) * light
-    own = {"shift_px_per_e": float(np.hypot(found.shift_error, second_order * found.shift))}
+def _errors(found: Boundaries) -> tuple[dict[str, float], tuple[dict[str, float], ...]]:
+    """Errors of all parameters, and their correlated steps."""
     ratio = {"along_y": found.along_y_error} if found.along_y_error else {}
-    together = [d for d in (own, ratio) if d]
+    together = [d for d in ({"shift_px_per_e": found.shift_error}, ratio) if d]
     if np.isfinite(found.falloff_error):
         steps = {"shift_px_per_e": found.with_falloff, "falloff_px": found.falloff_error}
-        steps |= dict.fromkeys(ratio, found.along_y_with_falloff)
-        times = float(np.hypot(1, second_order * found.falloff_px / found.falloff_error))
-        together.append({name: times * step for name, step in steps.items()})
+        together.append(steps | dict.fromkeys(ratio, found.along_y_with_falloff))
     names = dict.fromkeys(name for part in together for name in part)
     errors = {n: float(np.linalg.norm([part.get(n, 0.0) for part in together])) for n in names}
     return errors, tuple(together)

@@ -22,8 +22,10 @@ from pixcal.model.arrays import F32, F64
 UNIT = 1e-7  # unit of the fitted shift of boundaries (px per electron)
 # Shifts of any falloff between the first and the last are a sum of these, to 10⁻⁵ within `REACH`.
 FALLOFFS_PX = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
-_FINE_PX = np.geomspace(FALLOFFS_PX[0], FALLOFFS_PX[-1], 61)
-_BESIDE = 5  # half-width of the parabola about the best falloff, fine steps
+_TRIED = 61  # falloffs, from the first to the last
+# Parabolas about the best falloff, the next about the top of the last and as narrow as its error;
+# half-width of the first, of the logarithm.
+_PARABOLAS, _WIDEST = 3, 0.17
 LOOSE = 0.02  # prior 1-sigma of the departure from a response, over full scale
 # response fitted with boundaries: level (e-) at which its powers are one, and their number
 LEVEL, POWERS = 5e4, 3
@@ -143,17 +145,19 @@ def boundaries_alone(
     sums = _boundary_sums(evidence)
     if len(sums) < 2 or not by_axis:
         sums = [(sum(n for n, _ in sums), sum(r for _, r in sums))]  # type: ignore[list-item]
-    coarse, fine_shifts = (
-        np.stack([boundary_shifts(falloff).ravel() for falloff in falloffs], axis=1)
-        for falloffs in (FALLOFFS_PX, _FINE_PX.tolist())
-    )
-    # Powers, and shifts of `_FINE_PX` from those of `FALLOFFS_PX`.
-    fine = block_diag(np.eye(POWERS), np.linalg.lstsq(coarse, fine_shifts, rcond=None)[0].T)
-    sums = [(fine @ normal @ fine.T, fine @ right) for normal, right in sums]
-    found = np.array([_alone(sums, POWERS + n) for n in range(len(_FINE_PX))])
     shifts = [(normal[POWERS:, POWERS:], right[POWERS:]) for normal, right in sums]
     of_any_shape = sum(float(right @ inverse_normal(normal) @ right) for normal, right in shifts)
-    return _best_falloff(found, otherwise_px, of_any_shape)
+    return _best_falloff(
+        lambda falloff: _alone(_of_falloff(sums, falloff)), otherwise_px, of_any_shape
+    )
+
+
+def _of_falloff(sums: Sequence[tuple[F64, F64]], falloff_px: float) -> list[tuple[F64, F64]]:
+    """Sums for the powers and boundaries of one falloff, from those of `FALLOFFS_PX`."""
+    fitted = np.stack([boundary_shifts(falloff).ravel() for falloff in FALLOFFS_PX], axis=1)
+    shares = np.linalg.lstsq(fitted, boundary_shifts(falloff_px).ravel(), rcond=None)[0]
+    taken = block_diag(np.eye(POWERS), shares)
+    return [(taken @ normal @ taken.T, taken @ right) for normal, right in sums]
 
 
 @cached_on_evidence
@@ -167,16 +171,9 @@ def _boundary_sums(evidence: Evidence) -> list[tuple[F64, F64]]:
         for of_columns in (True, False)
     ]
 
-    def by_itself(normal: F64, right: F64) -> F64:
-        explained = right**2 / np.diag(normal)
-        best = POWERS + int(np.argmax(explained[POWERS:]))
-        sizes = np.zeros(len(right))
-        sizes[best] = right[best] / normal[best, best]
-        return sizes
-
     return [
         distortions.distortion_sums(
-            own, signal, POWERS + len(every), by_itself, margin=_margin(evidence)
+            own, signal, POWERS + len(every), POWERS, margin=_margin(evidence)
         )
         for own in across
         if own
@@ -186,14 +183,14 @@ def _boundary_sums(evidence: Evidence) -> list[tuple[F64, F64]]:
 def boundaries_beside(
     evidence: Evidence, falloff_px: float, known: tuple[float, float] | None = None
 ) -> tuple[float, float, float]:
-    """Boundaries of a falloff (of `FALLOFFS_PX`), fitted with a free response.
+    """Boundaries of a falloff, fitted with a free response.
 
     ``known``: mean shift per electron (px) and its variance, from the noise of neighbours. Returns
     both of the mean of boundaries between columns and between rows, and the chi-square that they
     explain beyond the response, less one for a second axis, which has a shift of its own.
     """
-    sums = _boundary_sums(evidence)
-    normal, right = _joint(sums, POWERS + FALLOFFS_PX.index(falloff_px))
+    sums = _of_falloff(_boundary_sums(evidence), falloff_px)
+    normal, right = _joint(sums)
     mean = np.zeros(len(right))
     mean[POWERS:] = 1 / len(sums)
     if known is not None:
@@ -206,54 +203,54 @@ def boundaries_beside(
     return UNIT * size, UNIT**2 * variance, max(gain, 0.0) - len(sums) + 1
 
 
-def _joint(sums: Sequence[tuple[F64, F64]], at: int) -> tuple[F64, F64]:
-    """Normal equations: powers common to all sums, and a shift of each."""
+def _joint(sums: Sequence[tuple[F64, F64]]) -> tuple[F64, F64]:
+    """Normal equations: powers common to all sums of `_of_falloff`, and a shift of each."""
     n = POWERS + len(sums)
     joint, right = np.zeros((n, n)), np.zeros(n)
     for number, (normal, own) in enumerate(sums):
-        places, taken = [*range(POWERS), POWERS + number], [*range(POWERS), at]
-        joint[np.ix_(places, places)] += normal[np.ix_(taken, taken)]
-        right[places] += own[taken]
+        places = [*range(POWERS), POWERS + number]
+        joint[np.ix_(places, places)] += normal
+        right[places] += own
     return joint, right
 
 
-def _alone(
-    sums: Sequence[tuple[F64, F64]], at: int
-) -> tuple[float, float, float, float, float, float]:
+def _alone(sums: Sequence[tuple[F64, F64]]) -> F64:
     """Shift, variance, chi-square explained, and that by an added response; axis ratio, error."""
-    information = np.array([normal[at, at] for normal, _ in sums])
-    rights = np.array([right[at] for _, right in sums])
+    information = np.array([normal[-1, -1] for normal, _ in sums])
+    rights = np.array([right[-1] for _, right in sums])
     sizes = rights / information
     gain = float(sizes @ rights)
-    joint, right = _joint(sums, at)
+    joint, right = _joint(sums)
     beside = float(right @ inverse_normal(joint) @ right) - gain
     ratio = float(sizes[-1] / sizes[0])
     relative = 1 / np.sqrt(information) / sizes
     error = abs(ratio) * float(np.linalg.norm(relative)) if len(sums) > 1 else 0.0
-    return UNIT * float(sizes[0]), UNIT**2 / float(information[0]), gain, beside, ratio, error
+    return np.array([UNIT * sizes[0], UNIT**2 / information[0], gain, beside, ratio, error])
 
 
-def _best_falloff(found: F64, otherwise_px: float, of_any: float) -> Boundaries:
-    """From a parabola about the best; ``of_any``: chi-square of boundaries of any shape."""
-    best = int(np.clip(np.argmax(found[:, 2]), _BESIDE, len(found) - 1 - _BESIDE))
-    near = np.array([best - _BESIDE, best, best + _BESIDE])
-    at = np.log(_FINE_PX[near] / _FINE_PX[best])
-    bends = np.polyfit(at, found[near] - found[best], 2).T
-    curved, slope, _ = bends[2]
-    error = 1 / np.sqrt(-curved) if curved < 0 else np.inf
-    if error > MAX_LOG_ERROR:
-        falloff, falloff_error, rises = otherwise_px, np.inf, np.zeros(len(bends))
-        values = found[np.argmin(np.abs(_FINE_PX - otherwise_px))]
-    else:
-        top = float(-slope / (2 * curved))
+def _best_falloff(of: Callable[[float], F64], otherwise_px: float, of_any: float) -> Boundaries:
+    """From parabolas about the best; ``of_any``: chi-square of boundaries of any shape."""
+    tried = np.log(np.geomspace(FALLOFFS_PX[0], FALLOFFS_PX[-1], _TRIED))
+    best, error = tried[np.argmax([of(falloff)[2] for falloff in np.exp(tried)])], np.inf
+    for _ in range(_PARABOLAS):
+        half = min(error, _WIDEST)
+        middle = np.clip(best, tried[0] + half, tried[-1] - half)
+        at = half * np.array([-1.0, 0.0, 1.0])
+        bends = np.polyfit(at, [of(falloff) for falloff in np.exp(middle + at)], 2).T
+        curved, slope, _ = bends[2]
+        if curved >= 0:
+            error = np.inf
+            break
+        error, top = 1 / np.sqrt(-curved), middle - slope / (2 * curved)
+        best = np.clip(top, tried[0], tried[-1])
+    falloff, falloff_error, rises = otherwise_px, np.inf, np.zeros(len(bends))
+    if error < MAX_LOG_ERROR:
         # Limited to the range tried; the distance from the maximum adds to the error.
-        there = float(np.clip(top, *np.log(_FINE_PX[[0, -1]] / _FINE_PX[best])))
-        error = float(np.hypot(error, top - there))
-        falloff = float(_FINE_PX[best] * np.exp(there))
+        error = float(np.hypot(error, top - best))
+        falloff = float(np.exp(best))
         falloff_error = falloff * error
-        values = found[best] + [np.polyval(bend, there) for bend in bends]
-        rises = error * np.array([np.polyval(np.polyder(bend), there) for bend in bends])
-    size, variance, gain, against, ratio, own = values.tolist()
+        rises = error * np.array([np.polyval(np.polyder(b), best - middle) for b in bends])
+    size, variance, gain, against, ratio, own = of(falloff).tolist()
     shift = size, variance**0.5, float(rises[0])
     axes = ratio, own, float(rises[4])
     return Boundaries(falloff, falloff_error, *shift, against, of_any - gain, *axes)

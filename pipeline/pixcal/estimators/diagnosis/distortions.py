@@ -32,6 +32,8 @@ _NEGLIGIBLE = 1e-6
 # less than this many standard errors
 _ROUNDS = 8
 _STILL = 0.1
+# Rounds of the fit of one size; each cuts the error of a charge to the share that it moves.
+_ROUNDS_OF_FIRST = 4
 
 # share of the chi-square of separate sizes above which common ones are rejected
 MAX_DISAGREEMENT = 0.25
@@ -167,7 +169,7 @@ def fit_distortions(
     prior : (float64 array, float64 array) prior values of the sizes, and their information (inverse
         variance; zero without a prior)
     """
-    fits = [_SetFit(fringes, distortion, count, margin) for fringes in sets]
+    fits = [_SetFit(fringes, distortion, np.eye(count), margin) for fringes in sets]
     known, information = (np.zeros(count), np.zeros(count)) if prior is None else prior
     covariance = inverse_normal(sum(fit.normal for fit in fits) + np.diag(information), 1e-7)
     sizes = np.zeros(count)
@@ -187,21 +189,22 @@ def distortion_sums(
     sets: Sequence[FringeEvidence],
     distortion: Distortion,
     count: int,
-    near: Callable[[F64, F64], F64],
+    first: int,
     *,
     margin: int = 0,
 ) -> tuple[F64, F64]:
     """Normal matrix (count, count) and right-hand side (count,) of sizes that all sets share.
 
     Parameters as in `fit_distortions`. Rows and columns of the sums serve for a subset of sizes.
-    ``near`` gives approximate sizes (count,) from a set's own sums; the distortion is linearised
-    about these.
+    The distortion is linearised about what its ``first`` size alone explains in each set.
     """
     normal, right = np.zeros((count, count)), np.zeros(count)
     for fringes in sets:
-        fit = _SetFit(fringes, distortion, count, margin)
-        about = near(fit.normal, fit.right(np.zeros(count)))
-        fit.right(about)  # from here on the signal is without these
+        about = np.zeros(count)
+        fit = _SetFit(fringes, distortion, np.eye(count)[[first]], margin)
+        for _ in range(_ROUNDS_OF_FIRST):
+            about[first] += fit.right(about)[0] / fit.normal[0, 0]
+        fit.linearise(np.eye(count), about)
         normal, right = normal + fit.normal, right + fit.right(about) + fit.normal @ about
     return normal, right
 
@@ -218,10 +221,10 @@ def _agreement(fits: Sequence["_SetFit"], rights: Sequence[F64]) -> Agreement:
 
 
 class _SetFit:
-    """One set: residuals, the freedom of the fit, and the normal matrix without distortion."""
+    """One set: residuals, the freedom of the fit, and the normal matrix of steps of the sizes."""
 
     def __init__(
-        self, fringes: FringeEvidence, distortion: Distortion, count: int, margin: int
+        self, fringes: FringeEvidence, distortion: Distortion, steps: F64, margin: int
     ) -> None:
         self._fringes, self._distortion = fringes, distortion
         self._freedom = Freedom(fringes, margin=margin)
@@ -230,9 +233,14 @@ class _SetFit:
         seen = np.isfinite(fringes.electrons) & ~fringes.good
         self._fitted = np.nan_to_num(np.where(seen, fringes.electrons, fringes.model))
         self._signal = self._fitted
-        plain = distortion(fringes, self._signal, np.zeros(count))
-        slopes = (distortion(fringes, self._signal, one) - plain for one in np.eye(count))
-        self._left = [self._freedom.left_over(self._freedom.of_good(slope)) for slope in slopes]
+        self.linearise(steps, np.zeros(steps.shape[1]))
+
+    def linearise(self, steps: F64, sizes: F64) -> None:
+        """Derivatives for steps (n, count) from sizes, of the signal that `right` last left."""
+        freedom, given = self._freedom, (self._fringes, self._signal)
+        plain = self._distortion(*given, sizes)
+        slopes = (self._distortion(*given, sizes + step) - plain for step in steps)
+        self._left = [freedom.left_over(freedom.of_good(slope)) for slope in slopes]
         self.normal = np.array([self._weighted_dots(rest) for rest in self._left])
 
     def right(self, sizes: F64) -> F64:
