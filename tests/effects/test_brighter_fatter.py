@@ -193,8 +193,9 @@ def test_its_size_is_found(acquired: Callable[..., Evidence], size: float) -> No
     found = BrighterFatter.estimate(evidence)
     assert found is not None
     assert isinstance(found.effect, BrighterFatter)
-    # The falloff, which is found too, takes half of what is known of the size.
-    assert abs(found.effect.shift_px_per_e - size) < 4 * found.errors["shift_px_per_e"] < 2e-8
+    # Falloff and ratio are found too: a ratio of 1 within 0.2 leaves 0.4 of the size open.
+    assert abs(found.effect.shift_px_per_e - size) < 4 * found.errors["shift_px_per_e"]
+    assert found.errors["shift_px_per_e"] < 0.4 * size
     own = found.together[0]["shift_px_per_e"] if found.together else found.errors["shift_px_per_e"]
     assert own < 2.5e-9
     assert found.significance > 8
@@ -233,10 +234,10 @@ def test_by_itself_its_falloff_is_found_with_its_size(
     found = BrighterFatter.estimate(acquired(None, {"brighter_fatter": changes}))
     assert found is not None
     assert isinstance(found.effect, BrighterFatter)
-    assert abs(found.effect.falloff_px - falloff) < 4 * found.errors["falloff_px"] < 0.4 * falloff
+    assert abs(found.effect.falloff_px - falloff) < 4 * found.errors["falloff_px"] < 0.8 * falloff
     assert abs(found.effect.shift_px_per_e - 2e-7) < 4 * found.errors["shift_px_per_e"] < 1e-7
     # A longer reach does with a smaller shift.
-    own, both = found.together
+    own, _, both = found.together
     assert both["shift_px_per_e"] * both["falloff_px"] < 0
     assert found.errors["shift_px_per_e"] == pytest.approx(
         np.hypot(own["shift_px_per_e"], both["shift_px_per_e"])
@@ -283,11 +284,13 @@ def test_boundaries_that_move_otherwise_between_rows_are_found(
 def test_with_one_period_along_each_axis_fringes_get_what_they_showed(
     acquired: Callable[..., Evidence],
 ) -> None:
-    """Falloff and ratio cannot both be known; what moves under these fringes is."""
+    """Falloff and ratio are hardly told apart, and their errors say so; what moves is known."""
     evidence = acquired(None, {"brighter_fatter": OTHERWISE_BETWEEN_ROWS})
     found = BrighterFatter.estimate(evidence)
     assert found is not None
     assert isinstance(found.effect, BrighterFatter)
+    for name, value in OTHERWISE_BETWEEN_ROWS.items():
+        assert abs(getattr(found.effect, name) - value) < 3 * found.errors[name] < value / 2
     y, x = np.mgrid[:40, :50]
     for fringes in evidence.fringes.values():
         light = (2e4 * (1 + 0.9 * np.cos(fringes.k[0] * x + fringes.k[1] * y))).astype(np.float32)

@@ -138,8 +138,6 @@ def _by_axis(noise: SharedCharge) -> tuple[float, float, float, float]:
 def _explaining(evidence: Evidence, otherwise_px: float) -> Boundaries | None:
     """Boundaries that explain all harmonics; None if a nonlinear response is also needed."""
     found = boundaries_alone(evidence, otherwise_px)
-    if found.against > _NEEDED:
-        found = boundaries_alone(evidence, otherwise_px, by_axis=True)
     return found if found.against <= max(_NEEDED, found.shapes) else None
 
 

@@ -29,6 +29,9 @@ _PARABOLAS, _WIDEST = 3, 0.17
 LOOSE = 0.02  # prior 1-sigma of the departure from a response, over full scale
 # response fitted with boundaries: level (e-) at which its powers are one, and their number
 LEVEL, POWERS = 5e4, 3
+# Prior 1-sigma of the shift along y over that along x, about 1: with one period along each axis a
+# falloff may do for it.
+_RATIO_ERROR = 0.2
 MAX_LOG_ERROR = 0.5  # largest error of the logarithm of a measured falloff
 
 
@@ -127,24 +130,19 @@ class Boundaries:
     # with any function of distance, would fit better
     against: float
     shapes: float
-    # shift of boundaries between rows over that between columns, its error (zero where it was
-    # held), and its change for one error of the falloff
+    # shift of boundaries between rows over that between columns, its error (zero for fringes along
+    # one axis), and its change for one error of the falloff
     along_y: float
     along_y_error: float
     along_y_with_falloff: float
 
 
-def boundaries_alone(
-    evidence: Evidence, otherwise_px: float, *, by_axis: bool = False
-) -> Boundaries:
+def boundaries_alone(evidence: Evidence, otherwise_px: float) -> Boundaries:
     """Moving boundaries alone, without a nonlinear response, with the best-fitting falloff.
 
-    ``otherwise_px``: falloff (of `FALLOFFS_PX`) where harmonics do not constrain it. ``by_axis``:
-    shifts of boundaries between rows and between columns may differ.
+    ``otherwise_px``: falloff where harmonics do not constrain it.
     """
     sums = _boundary_sums(evidence)
-    if len(sums) < 2 or not by_axis:
-        sums = [(sum(n for n, _ in sums), sum(r for _, r in sums))]  # type: ignore[list-item]
     shifts = [(normal[POWERS:, POWERS:], right[POWERS:]) for normal, right in sums]
     of_any_shape = sum(float(right @ inverse_normal(normal) @ right) for normal, right in shifts)
     return _best_falloff(
@@ -170,7 +168,6 @@ def _boundary_sums(evidence: Evidence) -> list[tuple[F64, F64]]:
         tuple(f for f in sets if (abs(f.k[0]) >= abs(f.k[1])) == of_columns)
         for of_columns in (True, False)
     ]
-
     return [
         distortions.distortion_sums(
             own, signal, POWERS + len(every), POWERS, margin=_margin(evidence)
@@ -216,16 +213,19 @@ def _joint(sums: Sequence[tuple[F64, F64]]) -> tuple[F64, F64]:
 
 def _alone(sums: Sequence[tuple[F64, F64]]) -> F64:
     """Shift, variance, chi-square explained, and that by an added response; axis ratio, error."""
-    information = np.array([normal[-1, -1] for normal, _ in sums])
-    rights = np.array([right[-1] for _, right in sums])
-    sizes = rights / information
-    gain = float(sizes @ rights)
     joint, right = _joint(sums)
-    beside = float(right @ inverse_normal(joint) @ right) - gain
-    ratio = float(sizes[-1] / sizes[0])
-    relative = 1 / np.sqrt(information) / sizes
-    error = abs(ratio) * float(np.linalg.norm(relative)) if len(sums) > 1 else 0.0
-    return np.array([UNIT * sizes[0], UNIT**2 / information[0], gain, beside, ratio, error])
+    own, rights = joint[POWERS:, POWERS:], right[POWERS:]
+    if len(sums) > 1:
+        apart = np.array([1.0, -1.0]) * np.trace(own) / (_RATIO_ERROR * rights.sum())
+        own += np.outer(apart, apart)
+    covariance = np.linalg.inv(own)
+    sizes = covariance @ rights
+    gain = sizes @ rights
+    beside = right @ inverse_normal(joint) @ right - gain
+    ratio = sizes[-1] / sizes[0]
+    slope = np.array([-ratio, 1.0]) / sizes[0] if len(sums) > 1 else np.zeros(1)
+    error = np.sqrt(slope @ covariance @ slope)
+    return np.array([UNIT * sizes[0], UNIT**2 * covariance[0, 0], gain, beside, ratio, error])
 
 
 def _best_falloff(of: Callable[[float], F64], otherwise_px: float, of_any: float) -> Boundaries:
