@@ -12,8 +12,8 @@ import pixcal
 from pixcal.effects import effects, known_effects
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import InputError, PixcalError
-from pixcal.simulation.forward import ForwardModel
-from pixcal.simulation.own_effect import STEPS, effect_of_file
+from pixcal.simulation.forward import STEPS, ForwardModel
+from pixcal.simulation.own_effect import effect_of_file
 from pixcal.stages.evidence import load_evidence
 from pixcal_cli.main import cli
 

@@ -278,18 +278,8 @@ class Lag(Effect):
         spread, spread_error = uneven.spread(common.keep, share, common.share_error)
         level_e = max(float(np.nanquantile(f.electrons[::7], 0.99)) for f in fringes)
         whole = cls(share, common.decay_frames, 0.0, (), level_e, common.later)
-        by_band = by_level(part, common, share, level_e) if sure else None
-        of_level: dict[str, float] = {}
-        if by_band is not None:
-            whole, of_level = replace(whole, bands=by_band.bands), dict(by_band.errors)
-            if by_band.capacity_e:
-                whole = replace(
-                    whole,
-                    share=by_band.share,
-                    decay_frames=by_band.decay_frames,
-                    later=(),
-                    capacity_e=by_band.capacity_e,
-                )
+        values, of_level = by_level(part, common, share, level_e) if sure else ({}, {})
+        whole = replace(whole, **values)
         quiet, quiet_error = _quiet(part, whole) if sure else (0.0, 1.0)
         decay = whole.decay_frames if whole.capacity_e else min(common.decay_frames, MAX_DECAY)
         return _estimate(

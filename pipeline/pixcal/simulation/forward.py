@@ -23,6 +23,8 @@ from pixcal.simulation.recording import Recording
 from pixcal.simulation.shot import Shot
 
 DOMAINS = ("space", "time", "intensity", "noise")  # where an effect may show
+# steps of the exposure: each returns its first argument, changed
+STEPS = ("states", "detector", "light", "pixels", "photons", "charge", "signal", "readout")
 T = TypeVar("T")
 
 

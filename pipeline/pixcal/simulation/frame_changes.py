@@ -20,7 +20,7 @@ from pixcal.estimators.frame_series.spectral_line import Line
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.arrays import F64
 from pixcal.model.bench import Bench
-from pixcal.simulation.forward import ForwardModel, field_of, numbers, with_numbers
+from pixcal.simulation.forward import STEPS, ForwardModel, field_of, numbers, with_numbers
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import set_recordings
 
@@ -206,5 +206,4 @@ def unit_of(model: ForwardModel, name: str) -> str:
 
 def acts_on_frames_alone(kind: type[ForwardModel]) -> bool:
     """Whether a model changes the states of frames, and nothing else."""
-    steps = ("states", "detector", "light", "pixels", "photons", "charge", "signal", "readout")
-    return [s for s in steps if getattr(kind, s) is not getattr(ForwardModel, s)] == ["states"]
+    return [s for s in STEPS if getattr(kind, s) is not getattr(ForwardModel, s)] == ["states"]

@@ -17,9 +17,8 @@ import numpy as np
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError, PixcalError
 from pixcal.simulation.effect import DOMAINS, Effect, Estimate, LightStart, Stage
+from pixcal.simulation.forward import STEPS
 
-# steps of the exposure: each returns its first argument, changed
-STEPS = ("states", "detector", "light", "pixels", "photons", "charge", "signal", "readout")
 OTHERS = ("__post_init__", "check", "predict", "undo", "undo_samples", "noise_factor")
 MAX_AROUND = 4096  # rows around a piece, or frames before one, that an effect may ask for
 

@@ -6,9 +6,10 @@ leaves harmonics of the phases in the residuals. Gauss-Newton steps fit the loss
 predicts to both, together with a nonlinear response.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -39,20 +40,12 @@ _NO_INFLUENCE = 1e-9  # relative error below which a parameter does not influenc
 Loss = Callable[[F64, F32], F32]
 
 
-@dataclass(frozen=True)
-class LagByLevel:
-    """A lag whose share depends on the level, or is limited by the room in traps."""
+def by_level(
+    evidence: Evidence, lag: CommonLag, share: float, level_e: float
+) -> tuple[dict[str, Any], dict[str, float]]:
+    """Parameters of a lag whose share depends on the level, or is limited by traps; their errors.
 
-    share: float  # mean
-    bands: tuple[float, ...]  # factors of the share in each band of the level
-    errors: Mapping[str, float]  # of the bands and, with traps, of their decay and capacity
-    decay_frames: float = 0.0
-    capacity_e: float = 0.0  # zero: no limit
-
-
-def by_level(evidence: Evidence, lag: CommonLag, share: float, level_e: float) -> LagByLevel | None:
-    """Shares of bands of the level, or traps of limited capacity; None if the share is even.
-
+    Both are empty if the share is even.
     ``share``: mean one; ``level_e``: full scale, e-.
     """
 
@@ -73,20 +66,20 @@ def by_level(evidence: Evidence, lag: CommonLag, share: float, level_e: float) -
     few, fit = (LossFit(central_crop(evidence, MAX_SAMPLES // n), level_e) for n in (8, 2))
     bands, traps = fit.by_level(few, banded, trapped, share, share * level_e)
     if bands is None:
-        return None
-    shares, errors, more = bands.value, bands.errors, {}
+        return {}, {}
+    shares, errors = bands.value, bands.errors
+    values: dict[str, Any] = {}
+    more: dict[str, float] = {}
     if traps is not None:
         shares, (*of_bands, of_keep, of_most) = np.maximum(traps.value[:-2], 0), traps.errors
         keep = _kept(traps.value[-2])
         errors, decay = np.array(of_bands), float(-1 / np.log(keep))
         share = min(float(np.mean(shares)), 0.5)
-        more = {"decay_frames": of_keep * decay**2 / keep, "capacity_e": of_most}
-    named = {f"bands[{n}]": float(e / share) for n, e in enumerate(errors)}
-    named |= {name: float(error) for name, error in more.items()}
-    factors = tuple(float(v) for v in np.clip(shares / share, 0, _LARGEST))
-    if traps is None:
-        return LagByLevel(share, factors, named)
-    return LagByLevel(share, factors, named, decay, float(traps.value[-1]))
+        more = {"decay_frames": float(of_keep * decay**2 / keep), "capacity_e": float(of_most)}
+        values = {"share": share, "decay_frames": decay, "capacity_e": float(traps.value[-1])}
+        values["later"] = ()
+    values["bands"] = tuple(float(v) for v in np.clip(shares / share, 0, _LARGEST))
+    return values, {f"bands[{n}]": float(e / share) for n, e in enumerate(errors)} | more
 
 
 def _kept(keep: float) -> float:

@@ -180,23 +180,6 @@ class Addition:
 Additions = dict[str, Addition]  # likeliest addition of each candidate, by its name
 
 
-@dataclass
-class Accepted:
-    """Causes accepted so far."""
-
-    current: Trial  # the bench with all of them
-    # fraction of each remaining candidate's significance that the causes do not produce
-    shares: dict[str, float]
-    effects: dict[str, Effect] = field(default_factory=dict)  # by name, in the order of acceptance
-    # by the name of a cause, the candidates that fit about as well
-    alike: dict[str, tuple[str, ...]] = field(default_factory=dict)
-
-    @property
-    def bench(self) -> Effects:
-        """Effects of the bench with all causes."""
-        return tuple(self.effects.values())
-
-
 @dataclass(frozen=True)
 class SearchResult:
     """Accepted causes, and the simulations that the decisions rest on."""

@@ -17,7 +17,6 @@ from pixcal.model.arrays import F64
 from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose import rejection
 from pixcal.stages.diagnose.candidates import (
-    Accepted,
     Addition,
     Additions,
     Candidate,
@@ -76,7 +75,12 @@ class Search:
         self._ask, self._estimates, self._most = simulate, estimates, most
         self._made: dict[frozenset[Effect], int] = {}  # simulations of each bench
         self.comparison = Comparison(reference, data)
-        self._causes = Accepted(self.comparison.nominal, {})
+        self._current = self.comparison.nominal  # the bench with all causes accepted so far
+        # fraction of each remaining candidate's significance that the causes do not produce
+        self._shares: dict[str, float] = {}
+        self._effects: dict[str, Effect] = {}  # causes by name, in the order of acceptance
+        # by the name of a cause, the candidates that fit about as well
+        self._alike: dict[str, tuple[str, ...]] = {}
         # all candidates, and those that may still be accepted
         self._candidates: Mapping[str, Candidate] = {}
         self._remaining: dict[str, Candidate] = {}
@@ -85,14 +89,18 @@ class Search:
         """Search, and fill in ``reason`` of rejected candidates."""
         remaining = {n: c for n, c in candidates.items() if c.estimate and not c.reason}
         self._candidates, self._remaining = candidates, remaining
-        self._causes = Accepted(self.comparison.nominal, dict.fromkeys(remaining, 1.0))
+        self._shares = dict.fromkeys(remaining, 1.0)
         self._accept_all()
-        if len(self._causes.effects) < MAX_CAUSES and self._exchange():
+        if len(self._effects) < MAX_CAUSES and self._exchange():
             self._accept_all()
-        if len(self._causes.effects) == MAX_CAUSES:
+        if len(self._effects) == MAX_CAUSES:
             for candidate in remaining.values():
                 candidate.reason = f"not tested: the search stops after {MAX_CAUSES} causes"
         return self._prune_causes()
+
+    @property
+    def _bench(self) -> Effects:
+        return tuple(self._effects.values())
 
     @property
     def _left(self) -> int:
@@ -100,12 +108,12 @@ class Search:
         return self._most - sum(self._made.values())
 
     def _accept_all(self) -> None:
-        while len(self._causes.effects) < MAX_CAUSES and self._accept_one():
+        while len(self._effects) < MAX_CAUSES and self._accept_one():
             pass
 
     def _accept_one(self) -> bool:
         """Accept the candidate that the held-out frames favour most; False if they favour none."""
-        causes, remaining, candidates = self._causes, self._remaining, self._candidates
+        remaining, candidates = self._remaining, self._candidates
         self._reject_insignificant()
         self._reject_undecided()
         if not remaining:
@@ -115,22 +123,22 @@ class Search:
         if effect is None or self._unexplainable(laws, replays):
             return False
         del remaining[best]
-        confirmed = self._confirmed((*causes.bench, effect), asked=[*remaining])
+        confirmed = self._confirmed((*self._bench, effect), asked=[*remaining])
         if isinstance(confirmed, str):
             candidates[best].reason = f"cannot be simulated: {confirmed}"
             return True
-        causes.current = confirmed
-        causes.effects[best] = effect
-        candidates[best].share = causes.shares[best]
+        self._current = confirmed
+        self._effects[best] = effect
+        candidates[best].share = self._shares[best]
         candidates[best].reason = ""
         enough = max(gains[best] - MIN_LOGLIK_GAIN, MIN_LOGLIK_GAIN)
-        causes.alike[best] = tuple(n for n, g in gains.items() if n != best and g > enough)
+        self._alike[best] = tuple(n for n, g in gains.items() if n != best and g > enough)
         self._leave_explained(best)
         return True
 
     def _unexplainable(self, laws: Additions, replays: Additions) -> bool:
         """Reject all candidates if they leave most of the gap, each alone and all together."""
-        if self._causes.effects:
+        if self._effects:
             return False
         alone = [(one.name, one.trial) for one in (*laws.values(), *replays.values())]
         # One simulation was enough for candidates without promise.
@@ -159,26 +167,26 @@ class Search:
 
     def _leave_explained(self, cause: str) -> None:
         """Leave out candidates whose significance comes mostly from the causes."""
-        shares = self._causes.shares = self._unexplained()
+        shares = self._shares = self._unexplained()
         for name in [n for n, share in shares.items() if share < 1 - SIMILAR]:
             self._candidates[name].reason = rejection.similar_to(cause)
             del self._remaining[name], shares[name]
 
     def _exchange(self) -> bool:
         """If the data still differ, replace a cause by two other candidates."""
-        causes, remaining, candidates = self._causes, self._remaining, self._candidates
-        options = rejection.exchanges(causes.effects, candidates)
-        count = len(causes.effects) + 1
+        remaining, candidates = self._remaining, self._candidates
+        options = rejection.exchanges(self._effects, candidates)
+        count = len(self._effects) + 1
         left = self._left - CONFIRM_SIMULATIONS * (1 + count * (count + 1) // 2)
-        if not options or len(options) + 1 > left or not self.comparison.differs(causes.current):
+        if not options or len(options) + 1 > left or not self.comparison.differs(self._current):
             return False
         benches = [tuple(one.effects.values()) for one in options]
         # Choose by one simulation of each, then by a few, before the choice is confirmed.
         for seeds, needed in ((1, 0.0), (SCREEN_SIMULATIONS, MIN_LOGLIK_GAIN_WEAK)):
-            tried = self._simulate([causes.bench, *benches], seeds, "exchanged", ())
+            tried = self._simulate([self._bench, *benches], seeds, "exchanged", ())
             likely = [
                 -np.inf if isinstance(c, str) else self.comparison.trial(b, c).log_likelihood
-                for b, c in zip([causes.bench, *benches], tried, strict=True)
+                for b, c in zip([self._bench, *benches], tried, strict=True)
             ]
             place = int(np.argmax(likely[1:]))
             if likely[1 + place] < likely[0] + needed:
@@ -187,14 +195,14 @@ class Search:
         (best,) = options
         trial = self._confirmed(tuple(best.effects.values()))
         if isinstance(trial, str) or trial.log_likelihood < (
-            causes.current.log_likelihood + MIN_LOGLIK_GAIN_WEAK
+            self._current.log_likelihood + MIN_LOGLIK_GAIN_WEAK
         ):
             return False
-        causes.current, causes.effects = trial, dict(best.effects)
-        causes.alike = {name: causes.alike.get(name, ()) for name in causes.effects}
+        self._current, self._effects = trial, dict(best.effects)
+        self._alike = {name: self._alike.get(name, ()) for name in self._effects}
         candidates[best.out].reason = best.reason
         for name, one in candidates.items():
-            if name in causes.effects:
+            if name in self._effects:
                 one.reason = ""
             elif name != best.out and one.usable:
                 remaining[name] = one
@@ -244,13 +252,13 @@ class Search:
 
     def _reject_insignificant(self) -> None:
         """Leave out candidates whose significance does not exceed what the causes produce."""
-        causes, remaining, sizes = self._causes, self._remaining, self._sizes()
+        remaining, sizes = self._remaining, self._sizes()
         least = SIGNIFICANT
-        if self.comparison.differs(causes.current):
+        if self.comparison.differs(self._current):
             strong = max(sizes.values(), default=0.0) >= SIGNIFICANT
             least = MIN_SIGMA_IN_GAP if strong else MIN_SIGMA_WEAK
-        names = " and ".join(causes.effects)
-        verb = "are" if len(causes.effects) > 1 else "is"
+        names = " and ".join(self._effects)
+        verb = "are" if len(self._effects) > 1 else "is"
         beside = f" once {names} {verb} included" if names else ""
         for name, size in sizes.items():
             estimate = remaining[name].estimate
@@ -261,13 +269,12 @@ class Search:
 
     def _sizes(self) -> dict[str, float]:
         """Significance of the remaining candidates that the causes do not produce."""
-        shares = self._causes.shares
-        return {n: c.significance * shares.get(n, 1.0) for n, c in self._remaining.items()}
+        return {n: c.significance * self._shares.get(n, 1.0) for n, c in self._remaining.items()}
 
     def _reject_undecided(self) -> None:
         """Leave out the weakest candidates if simulations do not suffice for all."""
-        causes, remaining, sizes = self._causes, self._remaining, self._sizes()
-        count = len(causes.effects) + 1
+        remaining, sizes = self._remaining, self._sizes()
+        count = len(self._effects) + 1
         weighed = (
             count * (2 * CONFIRM_SIMULATIONS + SCREEN_SIMULATIONS)
             + count * (count - 1) // 2 * CONFIRM_SIMULATIONS
@@ -275,7 +282,7 @@ class Search:
         left = self._left - CONFIRM_SIMULATIONS - weighed
         for name in sorted(sizes, key=lambda n: -sizes[n]):
             candidate = remaining[name]
-            left -= SCREEN_SIMULATIONS * (len(candidate.variants(causes.shares.get(name, 1.0))) + 1)
+            left -= SCREEN_SIMULATIONS * (len(candidate.variants(self._shares.get(name, 1.0))) + 1)
             if left < 0:
                 candidate.reason = (
                     f"not decided: too few of the search's {self._most} simulations are left"
@@ -294,14 +301,14 @@ class Search:
         # A replay may imitate the law of another effect, so it is kept separate. One simulation of
         # each shows which variants are promising; the rest are simulated only if none of these
         # gains enough.
-        causes, remaining = self._causes, self._remaining
+        remaining = self._remaining
         options = [
             (name, way)
             for name, one in remaining.items()
-            for way in one.variants(causes.shares.get(name, 1.0))
+            for way in one.variants(self._shares.get(name, 1.0))
         ]
         once = self._added(options, 1, "candidates")
-        if not causes.effects:
+        if not self._effects:
             for name, addition in likeliest(once).items():
                 remaining[name].alone = addition.trial
         least = PROMISING * max((one.gain for one in once), default=0.0)
@@ -334,11 +341,11 @@ class Search:
         drop: bool = True,
     ) -> list[Addition]:
         """Variants added to the causes, with their gains; ``drop`` those that were refused."""
-        causes, candidates = self._causes, self._candidates
-        beside = self._start(causes.bench, simulations)
-        start = self.comparison.allowing_for_laws(beside, causes.current)
-        benches = [(*causes.bench, effect) for _, effect in options]
-        label = f"{label}, round {len(causes.effects) + 1}"
+        candidates = self._candidates
+        beside = self._start(self._bench, simulations)
+        start = self.comparison.allowing_for_laws(beside, self._current)
+        benches = [(*self._bench, effect) for _, effect in options]
+        label = f"{label}, round {len(self._effects) + 1}"
         simulated = self._simulate(benches, simulations, label, ())
         made: list[Addition] = []
         refused: dict[str, str] = {}
@@ -350,7 +357,7 @@ class Search:
             if simulations == 1:
                 sure = min(sure, MAX_SINGLE_SIMULATION_SIGMA)
             trial = self.comparison.trial(bench, curves, sure, beside)
-            trial = self.comparison.allowing_for_laws(trial, causes.current)
+            trial = self.comparison.allowing_for_laws(trial, self._current)
             gain = trial.log_likelihood - start.log_likelihood
             if candidates[name].in_maps_alone:
                 # Chance acts alike on all statistics of a pattern: together they are no less likely
@@ -382,7 +389,7 @@ class Search:
         """Fraction of each remaining candidate's significance that the causes do not produce."""
         if not self._remaining:
             return {}
-        produced = self._estimates(self._causes.bench, list(self._remaining))
+        produced = self._estimates(self._bench, list(self._remaining))
         return {
             name: float(np.clip(1 - max(produced.get(name, 0.0), 0.0) / c.significance, 0, 1))
             for name, c in self._remaining.items()
@@ -390,7 +397,7 @@ class Search:
 
     def _prune_causes(self) -> SearchResult:
         """Leave each cause out in turn, and reject redundant and doubtful ones."""
-        candidates, effects, current = self._candidates, self._causes.effects, self._causes.current
+        candidates, effects, current = self._candidates, self._effects, self._current
         self._weigh_alone(effects)
         while True:
             without = self._each_left_out(effects)
@@ -414,7 +421,7 @@ class Search:
             effects |= {one: e for one in effects for e in current.effects if e.name == one}
             without = self._each_left_out(effects)
         self._weigh_alone(effects)
-        alike = self._causes.alike
+        alike = self._alike
         alike = {n: tuple(a for a in alike[n] if a not in effects) for n in effects}
         return SearchResult(
             self.comparison.nominal,

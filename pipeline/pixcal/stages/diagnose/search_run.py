@@ -15,7 +15,7 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.stages.diagnose.candidates import SearchResult
 from pixcal.stages.diagnose.diagnosis_input import DiagnosisInput
-from pixcal.stages.diagnose.result import by_domain
+from pixcal.stages.diagnose.result import Description, by_domain
 from pixcal.stages.diagnose.search import (
     CONFIRM_SIMULATIONS,
     SCREEN_SIMULATIONS,
@@ -29,20 +29,10 @@ REFERENCES = 16  # simulations of the nominal bench
 LEARN_SEED = 900_000
 
 
-@dataclass(frozen=True)
-class SearchRun:
-    """A search and its inputs."""
-
-    inputs: DiagnosisInput
-    trials: Trials
-    reference: Reference
-    data: Mapping[Key, F64]  # curves of the data on the reference's scales
-    found: SearchResult
-
-
-def run_search(inputs: DiagnosisInput, scratch: Path) -> SearchRun:
+def run_search(inputs: DiagnosisInput, scratch: Path) -> tuple[Description, list[dict[str, Any]]]:
     """Simulate the nominal bench, and search for causes among the candidates.
 
+    Also the deviations of each window (`_places`).
     ``scratch``: keeps simulations to resume. Raises InputError if the nominal bench cannot be
     simulated.
     """
@@ -64,7 +54,9 @@ def run_search(inputs: DiagnosisInput, scratch: Path) -> SearchRun:
         trials, reference, data = simulated(effects.signatures)
     services, most = _SearchServices(inputs, trials), affordable(trials.samples)
     search = Search(reference, data, services.simulate, services.again, most)
-    return SearchRun(inputs, trials, reference, data, search.run(effects.candidates))
+    found = search.run(effects.candidates)
+    described = Description(found, data, inputs.measured, reference, inputs.facts)
+    return described, _places(inputs, trials, found)
 
 
 @dataclass(frozen=True)
@@ -108,9 +100,9 @@ class _SearchServices:
         return {name: size for name, size in found.items() if size is not None}
 
 
-def places(made: SearchRun) -> list[dict[str, Any]]:
+def _places(inputs: DiagnosisInput, trials: Trials, found: SearchResult) -> list[dict[str, Any]]:
     """Deviations of each window alone; empty if one window covers the detector."""
-    inputs, trials, base = made.inputs, made.trials, made.inputs.effects.base
+    base = inputs.effects.base
     if len(inputs.windows) == 1 and inputs.windows[0].part == whole_of(inputs.windows[0].whole):
         return []
     places = []
@@ -119,8 +111,8 @@ def places(made: SearchRun) -> list[dict[str, Any]]:
         data = own.on_scale(inputs.each[number])
         nominal = compare(data, expect_nominal(own))
         final = nominal
-        if made.found.accepted:
-            bench = (*base, *made.found.final.effects)
+        if found.accepted:
+            bench = (*base, *found.final.effects)
             final = compare(
                 data, expect_with(own, trials.of_window(number, bench, CONFIRM_SIMULATIONS))
             )

@@ -26,8 +26,8 @@ from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.candidates import Considered
 from pixcal.stages.diagnose.diagnosis_input import prepare_input
 from pixcal.stages.diagnose.fitted_set import FittedSet
-from pixcal.stages.diagnose.result import Description, rounded
-from pixcal.stages.diagnose.search_run import places, run_search
+from pixcal.stages.diagnose.result import rounded
+from pixcal.stages.diagnose.search_run import run_search
 from pixcal.stages.diagnose.trial import Effects
 from pixcal.stages.treatment import Treatment, fitted_shapes, treatment_of_kind
 from pixcal.storage.artefact import Build
@@ -60,16 +60,15 @@ def _diagnose(
     keep_arrays()
     inputs = prepare_input(run_dir, runtime, Considered(kinds, base))
     with naming("--nominal" if base else f"{run_dir}: the nominal simulation failed"):
-        own = run_search(inputs, made.scratch)
-    found = Description(own.found, own.data, inputs.measured, own.reference, inputs.facts)
-    diagnosis = found.diagnosis(places(own))
-    named = {effect.name: effect for effect in own.found.final.effects}
+        described, places = run_search(inputs, made.scratch)
+    diagnosis = described.diagnosis(places)
+    named = {effect.name: effect for effect in described.found.final.effects}
     fits = [fit for window in inputs.windows for fit in window.bench.fits]
     shapes = fitted_shapes(run_dir)
     for cause in diagnosis["causes"]:
         cause["on_map"] = on_map(named[cause["effect"]], fits, shapes)
     write_json(made.folder / "diagnosis.json", diagnosis)
-    write_json(made.folder / "curves.json", list(found.curves.values()))
+    write_json(made.folder / "curves.json", list(described.curves.values()))
     made.summary.update(
         verdict=diagnosis["verdict"], causes=[cause["effect"] for cause in diagnosis["causes"]]
     )
