@@ -16,7 +16,6 @@ from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.frame_order import follows
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
-from pixcal.kernels.two_way import left_over
 from pixcal.model.arrays import F32, F64
 
 Distortion = Callable[[FringeEvidence, F32, F64], F32]
@@ -24,6 +23,7 @@ Distortion = Callable[[FringeEvidence, F32, F64], F32]
 # alternating projections: for fringes of full contrast 0.5 % of the remainder still lies in free
 # directions, and each further one halves that
 _TURNS = 4
+_AT_ONCE = 16  # frames processed together, to stay in the cache
 
 _INDEPENDENT = 1e-3
 _NEGLIGIBLE = 1e-6
@@ -76,11 +76,24 @@ class TwoWay:
 
     def left_over(self, change: F32) -> F32:
         """Part of a change (t, n) of the samples orthogonal to the freedom; 0 without weight."""
+        # Projected in turn onto the residuals of the frames and of the pixels.
         inverse = np.ascontiguousarray(np.moveaxis(self.pixel_inverse, 0, -1), np.float32)
         covariance = self.frame_covariance.astype(np.float32)
-        return left_over(
-            change, self.weight, self.of_place, covariance, self.of_time, inverse, _TURNS
-        )
+        rest = np.where(self.weight > 0, change, np.float32(0))
+        share = np.zeros((len(self.of_time), rest.shape[1]), np.float32)
+        for _ in range(_TURNS):
+            sums = np.zeros_like(share)
+            for first in range(0, len(rest), _AT_ONCE):
+                frames = slice(first, first + _AT_ONCE)
+                rows, own, times = rest[frames], self.weight[frames], self.of_time[:, frames]
+                rows -= times.T @ share
+                dots = (own * rows) @ self.of_place.T
+                rows -= np.einsum("tij,tj->ti", covariance[frames], dots) @ self.of_place
+                sums += times @ (own * rows)
+            share = np.einsum("ikn,kn->in", inverse, sums)
+        rest -= self.of_time.T @ share
+        rest[self.weight == 0] = 0
+        return rest
 
     def taken_by_pixels(self) -> F32:
         """Share (t, n) of the variance that the pixels' free parameters absorb."""

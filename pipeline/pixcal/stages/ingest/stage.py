@@ -28,8 +28,12 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import DamagedError, InputError, RemoteError
 from pixcal.model.options import Ingest as Config
 from pixcal.stages.ingest.arrays import FRAMES_A_PIECE, Writers, find_kept, take_over
-from pixcal.stages.ingest.cut_frames import cut_from, cut_warning
-from pixcal.stages.ingest.repeated_frames import repeat_warning, repeats_of
+from pixcal.stages.ingest.frames_to_leave_out import (
+    cut_from,
+    cut_warning,
+    repeat_warning,
+    repeats_of,
+)
 from pixcal.stages.steps import run_steps
 from pixcal.storage import frame_decoding
 from pixcal.storage.artefact import Build, discard
