@@ -222,7 +222,7 @@ class Shown:
 
     def tables(self, title: str) -> list[Table]:
         made = []
-        for part in re.findall(r"<table>(.*?)</table>", self.page, re.DOTALL):
+        for part in re.findall(r"<table[^>]*>(.*?)</table>", self.page, re.DOTALL):
             rows = [
                 [words(cell) for cell in re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row, re.DOTALL)]
                 for row in re.findall(r"<tr>(.*?)</tr>", part, re.DOTALL)
@@ -287,7 +287,7 @@ def test_no_gap_is_said_at_once_and_what_came_nearest_is_shown() -> None:
     last = "Not tested: outliers of A (no counterpart in the simulations)."
     assert diagnosis(contents(found)).marked("p", "advice") == [last]
     nearest = table(shown, "Largest deviations, none of them significant")
-    assert [row[1] for row in nearest.rows] == ["title of b", "title of a"]
+    assert [row[1] for row in nearest.rows] == ["title of b (values)", "title of a (values)"]
     assert "with causes" not in text_of(shown)
     (card,) = (c for c in cards(contents(found)) if c.title == "diagnosis")
     assert (card.value, card.level) == ("no gap", "good")
@@ -358,7 +358,7 @@ def test_parameters_of_any_shape_are_listed() -> None:
         ["on", "yes"],
         ["kind", "slow"],
     ]
-    assert "Common to all: every 4." in text_of(shown)
+    assert "The same in all rows: every = 4." in text_of(shown)
     first, rest = shown.tables("coupl")
     assert list(first.header) == ["dy", "share"]
     assert first.rows[3] == ["4", "0.0400 ± 0.0010"]
@@ -405,7 +405,11 @@ def test_every_difference_is_listed_once_the_worst_of_each_domain_first() -> Non
             sizes = [float(row[5]) for row in rows if row[0] == domain]
             assert sizes == sorted(sizes, reverse=True)
     listed = [row[1] for row in (*first.rows, *rest.rows)]
-    assert sorted(listed) == sorted(c["title"] for c in curves)
+    assert sorted(listed) == sorted(f"{c['title']} (values)" for c in curves)
+    # On a phone the cells are stacked, each after its heading.
+    (part,) = re.findall(r'<table class="stacked">.{9,30}Statistics.*?</table>', shown.page, re.S)
+    (row, *_) = re.findall(r"<tbody>\n<tr>(.*?)</tr>", part, re.DOTALL)
+    assert re.findall(r'data-head="(.*?)"', row) == list(first.header)
 
 
 @pytest.mark.usefixtures("without_figures")
@@ -436,7 +440,7 @@ def test_what_remains_is_named_and_what_is_new_is_a_warning() -> None:
     assert "69\u00a0% of the gap" in shown.answer
     assert "31\u00a0% (90\u00a0% interval 25 to 36\u00a0%), mostly in time, " in shown.answer
     rest = table(shown, "Statistics that still differ")
-    assert [row[1] for row in rest.rows] == ["title of stays", "title of new"]
+    assert [row[1] for row in rest.rows] == ["title of stays (values)", "title of new (values)"]
     assert rest.rows[0][-2:] == ["8.0", "79\u00a0%"]
     assert rest.rows[1][-2:] == ["5.0", "new"]
     assert "Of these, 1 did not differ before" in text_of(shown)

@@ -38,7 +38,7 @@ def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
     plain_ticks(left.xaxis, low, high, most=5)
     right.errorbar(level, variance / line, error / line, **style)
     right.axhline(1, color=INK, lw=1.2)
-    right.set_ylabel("variance over the line")
+    right.set_ylabel("variance / straight line")
     right.margins(y=0.15)
     right.locator_params(axis="x", nbins=6)
     for axes in (left, right):

@@ -96,7 +96,7 @@ def parameters(cause: Facts) -> Iterator[tuple[str, Table]]:
         if is_table(value):
             table, same = _list_of(name, value, errors)
             meaning = cause["meanings"].get(name, "")
-            about = [f"{name}: {meaning}." if meaning else "", f"Common to all: {same}."]
+            about = [f"{name}: {meaning}." if meaning else "", f"The same in all rows: {same}."]
             yield " ".join(filter(None, about if same else about[:1])), table
 
 
@@ -130,7 +130,7 @@ def _list_of(name: str, entries: Sequence[Facts], errors: Facts) -> tuple[Table,
     same = [k for k in keys if len(entries) > 1 and alike(k)]
     columns = [k for k in keys if k not in same]
     rows = [[cell(n, k) for k in columns] for n in range(len(entries))]
-    return Table(name, columns, rows), ", ".join(f"{k} {_in_short(entries[0][k])}" for k in same)
+    return Table(name, columns, rows), ", ".join(f"{k} = {_in_short(entries[0][k])}" for k in same)
 
 
 def _is_long(value: Any) -> bool:
@@ -186,7 +186,7 @@ def worst_of_each_domain(curves: Sequence[Facts]) -> tuple[list[Facts], list[Fac
 def statistics(title: str, curves: Sequence[Facts], causes: Any) -> Table:
     """A row for each statistic: its worst value, measured and simulated."""
     after = ["with causes", "significance (σ)", "residual"] if causes else []
-    header = ["domain", "statistic", "where", "measured", "nominal", "difference/scatter"]
+    header = ["domain", "statistic", "where", "measured", "nominal", "difference / scatter"]
     header += ["significance (σ)", *after]
     return Table(title, header, [_row(c, bool(causes)) for c in curves])
 
@@ -197,7 +197,8 @@ def _row(curve: Facts, causes: bool) -> list[str]:
     of = "" if curve["set"] == DETECTOR else f"set {curve['set']}: "
     digits = digits_apart(measured, nominal)
     value = f"{number(measured, digits)} {unit(curve['unit'])}".strip()
-    row = [curve["domain"], curve["title"], of + place(curve, at), value]
+    title = curve["title"] if curve["unit"] else f"{curve['title']} ({curve['quantity']})"
+    row = [curve["domain"], title, of + place(curve, at), value]
     row += [number(nominal, digits), times(curve["size"]), f"{curve['significance']:.1f}"]
     if causes:
         left = percent(curve["left"]) if curve["in_gap"] else "new"

@@ -126,8 +126,8 @@ def histogram(maps: Sequence[MapContents]) -> Figure:
     """Histograms of the offsets, beside normal distributions and the widths of the noise."""
     figure, ((axes,),) = axes_grid((WIDE, 3.8))
     unit = unit_for([offset.delta.robust_std for offset in maps], "px")
-    for offset, colour in zip(maps, LINES, strict=False):
-        _histogram(axes, offset, unit, colour)
+    for n, (offset, colour) in enumerate(zip(maps, LINES, strict=False)):
+        _histogram(axes, offset, unit, colour, (n / len(maps), (n + 1) / len(maps)))
     axes.set_yscale("log")
     axes.set_ylim(bottom=0.5)
     legend = "upper right" if axes.get_legend_handles_labels()[0] else ""
@@ -135,7 +135,10 @@ def histogram(maps: Sequence[MapContents]) -> Figure:
     return figure
 
 
-def _histogram(axes: Axes, offset: MapContents, unit: Unit, colour: str) -> None:
+def _histogram(
+    axes: Axes, offset: MapContents, unit: Unit, colour: str, part: tuple[float, float]
+) -> None:
+    """A histogram; the band of the noise takes a ``part`` of the height, lest it hide another."""
     delta, symbol = offset.delta, SYMBOLS[offset.name]
     values = delta.sample.astype(float) * unit.factor
     spread, middle = delta.robust_std * unit.factor, delta.median * unit.factor
@@ -149,11 +152,12 @@ def _histogram(axes: Axes, offset: MapContents, unit: Unit, colour: str) -> None
     at = np.linspace(edges[0], edges[-1], 400)
     top = len(values) * (edges[1] - edges[0]) / (np.sqrt(2 * np.pi) * spread)
     normal = top * np.exp(-(((at - middle) / spread) ** 2) / 2)
-    label = f"normal, σ = {spread:.3g} (robust)"
+    label = f"normal, robust σ = {spread:.3g} {unit.label}"
     axes.plot(at, np.maximum(normal, 0.1), color=colour, lw=1.0, ls="--", label=label)
     if np.isfinite(noise) and noise > 0:
-        label = f"noise, ±1σ = ±{noise:.3g}"
-        axes.axvspan(middle - noise, middle + noise, color=colour, alpha=0.25, lw=0, label=label)
+        label = f"noise, ±1σ = ±{noise:.3g} {unit.label}"
+        ends = middle - noise, middle + noise
+        axes.axvspan(*ends, *part, color=colour, alpha=0.35, lw=0, label=label)
 
 
 def power(maps: Sequence[MapContents], vectors: Mapping[str, tuple[float, float]]) -> Figure:

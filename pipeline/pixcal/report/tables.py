@@ -20,7 +20,7 @@ from pixcal.report.text import (
 
 _GAIN_WORDS = {
     "chi2_reduced": "reduced chi-square",
-    "neighbours": "covariances included, at lags (rows, columns)",
+    "neighbours": "covariance included at (rows, columns)",
     "used_from": "gain used:",
     "with_rounding": "with rounding",
 }
@@ -94,9 +94,9 @@ def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
             declared, used = (number(entry.get(k), 4) for k in ("declared", "used"))
             measured = with_error(entry.get("measured"), entry.get("error"))
             others = {
-                words: entry[k] if words.startswith("neighbours") else number(entry[k], 4)
+                words: " ".join(map(str, map(tuple, v))) if isinstance(v, list) else number(v, 4)
                 for k, words in _GAIN_WORDS.items()
-                if entry.get(k)
+                if (v := entry.get(k))
             }
             rows.append([label, declared, measured, used, _listed(others)])
     if rows:
@@ -128,6 +128,8 @@ def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
             ["flat frames at full well", number(len(end["full_frames"]))],
         ]
         yield Table("Saturation of the samples", ["", ""], rows)
+    if dark := rest.pop("subtracted_dark_e_s", 0.0):
+        rest["dark signal subtracted by the camera (e⁻/s)"] = dark
     rows = [[key, _plain(value)] for key, value in _flat(rest) if value is not None]
     if rows:
         yield Table("Other numbers of the reduction", ["quantity", "value"], rows)
@@ -250,7 +252,7 @@ def _frames(arrays: Mapping[str, Mapping[str, Any]]) -> Table:
             "first frame (UTC)": date_of_mjd(min(_known(a, "mjd"))) if _known(a, "mjd") else "–",
             "duration": duration(max(times) - min(times)) if times and source != "number" else "–",
             "exposures (s)": listed or "–",
-            "°C": _span(_known(a, "temperature_c")),
+            "temperature (°C)": _span(_known(a, "temperature_c")),
             "times from": {"number": "frame numbers"}.get(source, source),
         }
         rows.append(row)
