@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from scipy.special import logit, logsumexp
+from scipy.special import logit, logsumexp, softmax
 
 from pixcal.estimators.detector.telegraph import moments, population
 from pixcal.estimators.detector.telegraph.classes import Stays
@@ -231,21 +231,19 @@ def find_upper(lit: Sequence[LitSeries], noise: float) -> float:
 def own_levels(series: Sequence[LitSeries], noise: float) -> OwnLevels:
     """Levels of the pixels that have two, from all frames, lit or not.
 
-    The share of time may differ from series to series; that of the longest is given. ``noise``: of
-    frames without light, e-.
+    The share of time is the mean of its posterior: where no series shows it, one half. ``noise``:
+    of frames without light, e-.
     """
     pixels = np.unique(np.concatenate([s.pixel for s in series]))
     likely = np.zeros((len(OWN_AMPLITUDES), len(pixels)))
     of_share = np.zeros((len(OWN_SHARES), *likely.shape))
-    longest = max(len(s.frame) for s in series)
     for one in series:
         at = np.searchsorted(pixels, one.pixel)
         charge, weight = one.charge.astype(np.float32), one.weight.astype(np.float32)
         each = _two_levels(charge, weight, OWN_SHARES, noise * OWN_AMPLITUDES)
         # Or it stayed in one level all along.
         likely[:, at] += np.logaddexp(logsumexp(each, axis=0), 0) - np.log(len(OWN_SHARES) + 1)
-        if 2 * len(one.frame) > longest:
-            of_share[:, :, at] += each
+        of_share[:, :, at] += np.logaddexp(each, 0)
     best = np.clip(likely.argmax(axis=0), 1, len(OWN_AMPLITUDES) - 2)
     number = np.arange(len(pixels))
     low, middle, high = likely[best[None] + np.array([-1, 0, 1])[:, None], number]
@@ -253,7 +251,7 @@ def own_levels(series: Sequence[LitSeries], noise: float) -> OwnLevels:
     off = (high - low) / np.maximum(2 * (2 * middle - low - high), 1e-9)
     step = OWN_AMPLITUDES[1] / OWN_AMPLITUDES[0]
     amplitude = noise * OWN_AMPLITUDES[best] * step ** np.clip(off, -1, 1)
-    upper = OWN_SHARES[of_share[:, best, number].argmax(axis=0)]
+    upper = OWN_SHARES @ softmax(of_share[:, best, number], axis=0)
     two = likely.max(axis=0) > TWO_LEVELS
     return OwnLevels(pixels[two], amplitude[two], upper[two])
 
