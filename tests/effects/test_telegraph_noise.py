@@ -95,6 +95,20 @@ def test_measured_pixels_have_their_levels_and_others_follow_the_law(
     np.testing.assert_allclose(up.mean(axis=0), own.upper, atol=4 * 0.5 / np.sqrt(len(up)))
 
 
+def test_measured_pixels_are_those_of_the_chip(make_effect_bench: Callable[..., Bench]) -> None:
+    window = {"detector.chip": [150, 300], "detector.origin_px": [60, 100]}
+    bench = make_effect_bench({**LONG, **window, "detector.shape": [47, 53]})
+    own = MeasuredPixels(
+        (50, 90), (80, 140), 0.0, (59, 65, 80), (120, 105, 139), (1.0,) * 3, (0.5,) * 3
+    )
+    effect = TelegraphNoise(0.1, 400.0, 0.0, measured=(own,))
+    jumps = np.ptp(frames_of(bench, bias_of(bench), [effect]).astype(float), axis=0) > 1
+    expected = np.zeros((47, 53), bool)
+    expected[[5, 20], [5, 39]] = True
+    np.testing.assert_array_equal(jumps[:30, :40], expected[:30, :40])
+    np.testing.assert_array_equal(effect.noisy_pixels(bench.detector), expected)
+
+
 def test_it_belongs_to_the_pixels_of_the_chip(make_effect_bench: Callable[..., Bench]) -> None:
     chip = {"detector.chip": [150, 300], "frames.bias": 30}
     effect = TelegraphNoise(0.1, 400.0, 0.0)

@@ -5,6 +5,7 @@ import pytest
 from numpy_detectors import Detector, held_against_nominal
 
 from pixcal.effects.quantisation import Quantisation
+from pixcal.effects.telegraph_noise import MeasuredPixels, TelegraphNoise
 from pixcal.estimators.test_statistics.gap import flagged
 from pixcal.model.errors import InputError
 
@@ -84,3 +85,18 @@ def test_real_numbers_that_whole_ones_cannot_stand_for_are_refused() -> None:
     detector = Detector(gain=6e4, noise=30.0, bias=0.01, real=True)
     with pytest.raises(InputError, match="multiply all frames"):
         held_against_nominal(detector, 6, count=1)
+
+
+def test_noise_that_an_effect_replays_pixel_by_pixel_is_not_added_twice() -> None:
+    rng, extra = np.random.default_rng(4), np.zeros((96, 96))
+    extra[10:12, 10:50] = 30.0
+    detector = Detector(response=lambda e: e + extra * rng.standard_normal(e.shape))
+    found = held_against_nominal(detector, 3, count=2)
+    rows, columns = (tuple(at.tolist()) for at in np.nonzero(extra))
+    ones, half = (1.0,) * len(rows), (0.5,) * len(rows)
+    own = MeasuredPixels((0, 96), (0, 96), 1.0, rows, columns, ones, half)
+    jumps = TelegraphNoise(0.0, 1e-3, measured=(own,))
+    for effects, expected in (((), np.hypot(10, 30)), ((jumps,), 10.0)):
+        frames = found.bench.simulate(found.split.test, effects, 5).arrays["bias"]
+        noise = np.sqrt(frames.var(axis=0, ddof=1)[rows, columns].mean())
+        assert noise * detector.gain == pytest.approx(expected, rel=0.15)

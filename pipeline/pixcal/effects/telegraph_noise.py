@@ -13,7 +13,7 @@ from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import DITHER, Evidence, FringeEvidence, Stack
 from pixcal.kernels.scene import TILE, chip_map
 from pixcal.kernels.synthesis import BLOCK_ROWS
-from pixcal.model.arrays import F32, F64, U8, Indices
+from pixcal.model.arrays import F32, F64, U8, Indices, Mask
 from pixcal.model.bench import SimulatedDetector
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
@@ -44,6 +44,14 @@ class MeasuredPixels:
         doc="difference of its two levels, relative to the mean amplitude"
     )
     upper: tuple[float, ...] = quantity(doc="share of the time in its upper level")
+
+    def within(
+        self, origin: tuple[int, int], shape: tuple[int, ...]
+    ) -> tuple[Indices, Indices, Indices]:
+        """Which of the pixels lie in a part of the chip, and their rows and columns there."""
+        y, x = np.array(self.row, int) - origin[0], np.array(self.column, int) - origin[1]
+        here = np.flatnonzero((y >= 0) & (y < shape[0]) & (x >= 0) & (x < shape[1]))
+        return here, y[here], x[here]
 
     def __hash__(self) -> int:
         """Fast hash without the pixels' values, as it is needed in each frame."""
@@ -96,6 +104,12 @@ class TelegraphNoise(Effect):
     )
     upper: float = quantity(0.5, above=0, below=1, doc="share of the time in the upper level")
     measured: tuple[MeasuredPixels, ...] = quantity((), doc="pixels with levels of their own")
+
+    def noisy_pixels(self, detector: SimulatedDetector) -> Mask:
+        noisy = np.zeros(detector.shape, bool)
+        for some in self.measured:
+            noisy[some.within(detector.origin, detector.shape)[1:]] = True
+        return noisy
 
     def readout(self, adu: F32, shot: Shot) -> F32:
         found = adu.copy()
@@ -197,14 +211,13 @@ def _pixels(
     amplitudes = chip_map(detector, rows, TelegraphNoise.name, draw)
     places = chip_map(detector, rows, f"{TelegraphNoise.name} stays", lambda rng: rng.random(TILE))
     uppers = np.full_like(amplitudes, upper)
+    top, left = rows[0] + detector.origin[0], detector.origin[1]
     for some in measured:
-        inside = slice(*(max(r - rows[0], 0) for r in some.rows)), slice(*some.columns)
-        part = amplitudes[inside]
+        (y0, y1), (x0, x1) = some.rows, some.columns
+        part = amplitudes[max(y0 - top, 0) : max(y1 - top, 0), max(x0 - left, 0) : x1 - left]
         part[part >= some.faintest] = 0
-        at = np.array([some.row, some.column])
-        here = (at[0] >= rows[0]) & (at[0] < rows[1]) & (at[1] < amplitudes.shape[1])
-        y, x = at[0, here] - rows[0], at[1, here]
-        amplitudes[y, x], uppers[y, x] = np.array([some.amplitude, some.upper])[:, here]
+        here, *at = some.within((top, left), amplitudes.shape)
+        amplitudes[*at], uppers[*at] = np.array([some.amplitude, some.upper])[:, here]
     y, x = np.nonzero(amplitudes)
     return y + rows[0], x, amplitudes[y, x], places[y, x], uppers[y, x]
 

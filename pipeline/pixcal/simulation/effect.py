@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.model.arrays import F32, F64
+from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.bench import SimulatedDetector
 from pixcal.model.errors import InputError
 from pixcal.simulation.forward import DOMAINS, ForwardModel, Stage, numbers, with_numbers
@@ -211,6 +211,10 @@ class Effect(ForwardModel):
     def read_variance(self, detector: SimulatedDetector) -> float:
         """Variance (e-²) of samples about the frame's mean that it adds to the read noise."""
         return 0.0
+
+    def noisy_pixels(self, detector: SimulatedDetector) -> Mask:
+        """Pixels whose measured noise, beyond that of usual pixels, it simulates one by one."""
+        return np.zeros(detector.shape, bool)
 
     @classmethod
     def starts(cls, evidence: Evidence) -> Sequence[LightStart]:

@@ -133,8 +133,7 @@ class NominalBench:
         change = photon_transfer_change(
             bench, measured, effects, self.recordings, self.gain.neighbours, measured.maps
         )
-        added = sum(effect.read_variance(self.bench.detector) for effect in effects)
-        measured = self._electronics(measured, (seed, own_seed), change, added)
+        measured = self._electronics(measured, (seed, own_seed), change, effects)
         arrays = {
             name: np.empty((len(frames), *bench.detector.shape), self.frames.dtypes[name])
             for name, frames in half.items()
@@ -203,18 +202,22 @@ class NominalBench:
         return replace(measured, sets=tuple(sets))
 
     def _electronics(
-        self, measured: Measured, seeds: tuple[int, int], change: float, added: float
+        self, measured: Measured, seeds: tuple[int, int], change: float, effects: Sequence[Effect]
     ) -> Measured:
         """With gain and read noise drawn within their errors; samples keep their level."""
-        # ``added``: variance (e-²) of the measured read noise that effects add.
         seed, own_seed = seeds
         gain = self.gain.drawn(np.random.default_rng([seed, _GAIN]), change)
         m = measured.maps
         m = replace(m, bias=m.bias + np.float32(self.pedestal))
         noise = m.read_noise
         if self.noise is not None:
-            noise = noise * self.noise.drawn(np.random.default_rng([own_seed, _NOISE]))
+            own = self.noise.drawn(np.random.default_rng([own_seed, _NOISE]))
+            for effect in effects:
+                own[effect.noisy_pixels(self.bench.detector)] = 1
+            noise = noise * own
         square = noise**2
+        # Part of the measured variance that effects add.
+        added = sum(effect.read_variance(self.bench.detector) for effect in effects)
         noise = np.sqrt(np.maximum(square - np.float32(added), _WHITE * square)) * gain
         maps = replace(
             m,
