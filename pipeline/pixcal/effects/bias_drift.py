@@ -27,7 +27,7 @@ from pixcal.estimators.frame_series.variance_components import (
     log_chance_of_any,
     sigmas,
 )
-from pixcal.kernels.processes import brownian
+from pixcal.kernels.processes import HOUR_S, brownian
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.kernels.synthesis import walk_normals
 from pixcal.model.arrays import F32, F64
@@ -37,7 +37,6 @@ from pixcal.simulation.recording import KINDS, Recording
 from pixcal.simulation.shot import Shot
 from pixcal.simulation.track import Track, at
 
-HOUR_S = 3600.0
 STEADY = 3.0  # least significance of a ramp over a walk, standard deviations
 SETTLINGS = 8  # number of trial time constants, from three frames to the length of the run
 # largest error of the mean offset of used fringes, over a sample's read noise

@@ -6,6 +6,7 @@ from typing import Self
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.kernels.processes import HOUR_S
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
@@ -13,7 +14,6 @@ from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.track import Track, moved, vector_tracks
 
-HOUR_S = 3600.0
 TRACKS = ("along_x", "along_y")
 
 

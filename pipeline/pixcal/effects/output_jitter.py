@@ -9,7 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.offset import unlit_stacks
 from pixcal.estimators.frame_series.variance_components import walk_modes
-from pixcal.kernels.processes import brownian
+from pixcal.kernels.processes import HOUR_S, brownian
 from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.scene import Rows
 from pixcal.kernels.significance import SIGNIFICANT, root_with_error, sigmas_of_best, sigmas_of_chi2
@@ -20,7 +20,6 @@ from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
-HOUR_S = 3600.0
 _WALK = 1000  # first key of the walk's random numbers
 MIN_FRAMES = 8
 MAX_EDGES = 15  # along each axis

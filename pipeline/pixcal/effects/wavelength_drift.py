@@ -10,6 +10,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.fringe_motion import Hop, Motion, colour_of, motion_of
 from pixcal.estimators.frame_series.hopping import Hopping, find_hopping, scatter_of
 from pixcal.kernels import optics
+from pixcal.kernels.processes import HOUR_S
 from pixcal.kernels.scene import FrameStates, geometry
 from pixcal.kernels.significance import SIGNIFICANT, root_with_error
 from pixcal.model.arrays import F64
@@ -18,7 +19,6 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.frame_fit import fit_frames
 from pixcal.simulation.recording import Recording
 
-HOUR_S = 3600.0
 SETS_DIFFER = "fringe sets disagree: a wavelength changes all fringe vectors by the same share"
 # largest scatter about two levels, over that from frame to frame, for which two levels suffice
 LEVEL = 1.5

@@ -7,6 +7,7 @@ import numpy as np
 from pixcal.kernels import kernel
 from pixcal.model.arrays import F64
 
+HOUR_S = 3600.0
 SPAN = 4  # longest period of flicker noise, over the length of the line
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, cached_on_evidence
+from pixcal.estimators.fringe_fit.combine import SAME_AXIS
 from pixcal.estimators.maps.map_fit import (
     MapFit,
     MapPart,
@@ -32,7 +33,6 @@ from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import set_recordings
 
 CLIP = 8.0  # clip of differences of neighbouring pixels, over their median
-SAME = 0.98  # cosine of the angle below which two sets measure along one axis
 KINDS = ("the mean light", "the visibility", "the phase")
 PHASE = KINDS.index("the phase")
 MIN_PIXELS, MIN_SIDE = 200, 9
@@ -210,7 +210,7 @@ def _stitched(lit: Sequence[_Lit], vectors: Sequence[tuple[float, float]]) -> In
     axes: dict[tuple[float, ...], list[tuple[float, _Lit]]] = {}
     for one, vector in zip(lit, np.array(vectors), strict=True):
         unit = vector / np.linalg.norm(vector)
-        own = next((a for a in axes if abs(float(unit @ a)) > SAME), tuple(unit))
+        own = next((a for a in axes if abs(float(unit @ a)) > SAME_AXIS), tuple(unit))
         axes.setdefault(own, []).append((float(vector @ own), one))
     maps, gauges = [], []
     for sets in axes.values():

@@ -13,9 +13,10 @@ from pixcal.model.arrays import F64, Indices
 from pixcal.model.errors import InputError
 from pixcal.stages.fit.sweep import read_frames
 from pixcal.stages.reduce.black_cut_off import Black
-from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.reduce.ingested import Ingested, begin_mjd, starts_of
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.cube import ArrayReader
+from pixcal.storage.header_values import DAY_S
 from pixcal.storage.manifest import read_json
 from pixcal.storage.place import Local
 from pixcal.storage.stage import read_acquisition, require
@@ -25,7 +26,6 @@ Part = tuple[tuple[int, int], tuple[int, int]]
 # first row and column in, and shape of, a window
 Window = tuple[tuple[int, int], tuple[int, int]]
 
-DAY_S = 86400.0
 MAX_SAMPLES = 1 << 26  # samples of a set that are taken into memory (some ten bytes each)
 
 
@@ -152,7 +152,7 @@ def _fringes(
         good=good,
         read_variance=read,
         shot_factor=shot,
-        start_s=_start(ingested, f"fringes/{name}"),
+        start_s=starts_of(ingested.tables)[f"fringes/{name}"],
     )
     vars(made)["halves"] = tuple(halves)  # as the property would keep them
     return made
@@ -182,7 +182,7 @@ def _stacks(ingested: Ingested, part: Part) -> tuple[Stack, ...]:
         frames = ingested.arrays[kind].read((0, len(exposures)), *part)
         times = np.asarray(table["time_s"], float)
         for own in groups(table):
-            adu, start = frames[own].astype(np.float32), _start(ingested, kind)
+            adu, start = frames[own].astype(np.float32), starts_of(ingested.tables)[kind]
             step = int(table["step"][own[0]]) if table.get("step") else 0
             exposure, numbers = float(exposures[own[0]]), frame_numbers(table)[own]
             last = int(table["last"][own[0]]) if table.get("last") else -1
@@ -203,20 +203,6 @@ def frame_numbers(table: Mapping[str, list[Any]]) -> Indices:
     return np.array(table["frame"] if "frame" in table else range(len(table["time_s"])), int)
 
 
-def _start(ingested: Ingested, name: str) -> float:
-    """Time of an array's frame 0 after the first frame of all, s; nan when unknown."""
-    begin = {key: begin_mjd(table) for key, table in ingested.tables.items()}
-    return float(begin[name] - np.min(list(begin.values()))) * DAY_S
-
-
 def frame_days(table: Mapping[str, list[Any]]) -> F64:
     """Time (t,) of the frames of an array, days; a cube may have the stamp of its first plane."""
     return np.asarray(begin_mjd(table) + np.array(table["time_s"], float) / DAY_S)
-
-
-def begin_mjd(table: Mapping[str, list[Any]]) -> float:
-    """Time stamp of an array's frame 0, days; nan when unknown."""
-    stamps = np.array(table["mjd"], float) - np.array(table["time_s"], float) / DAY_S
-    # Later planes of a cube without exposure time have none.
-    known = stamps[np.isfinite(stamps)]
-    return float(known[0]) if len(known) else np.nan

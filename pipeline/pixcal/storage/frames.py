@@ -9,6 +9,7 @@ from typing import Any, Literal
 from pixcal.model.errors import InputError
 from pixcal.storage import fits_in
 from pixcal.storage.frame_file import FrameFile
+from pixcal.storage.header_values import DAY_S
 from pixcal.storage.sources import HEADERS, SourceFile
 from pixcal.storage.tiff_png import inspect_picture, is_picture
 
@@ -30,8 +31,6 @@ def inspect(source: SourceFile) -> FrameFile:
 
 
 TimeSource = Literal["header", "frame_period_s", "exptime_s", "number"]
-
-_SECONDS_A_DAY = 86400.0
 
 
 @dataclass(frozen=True)
@@ -160,8 +159,8 @@ def _stamped_frames(
         start = file.mjd or 0.0
         source: TimeSource = "frame_period_s" if step == frame_period_s else "exptime_s"
         for plane in range(file.shape[0]):
-            mjd = start + plane * step / _SECONDS_A_DAY
-            time_s = (start - first) * _SECONDS_A_DAY + plane * step
+            mjd = start + plane * step / DAY_S
+            time_s = (start - first) * DAY_S + plane * step
             frames.append(Frame(file, plane, mjd, time_s, source if plane else "header"))
     return frames
 

@@ -14,7 +14,7 @@ from astropy.io import fits
 
 FIRST_MJD, LAST_MJD = -678_575, 2_973_482  # days of the years 1 to 9999
 _MJD_EPOCH = datetime(1858, 11, 17, tzinfo=UTC)
-_SECONDS_A_DAY = 86400.0
+DAY_S = 86400.0
 
 
 _CARD = 80  # characters
@@ -124,7 +124,7 @@ def time_stamp_mjd(headers: tuple[Header, ...]) -> float | None:
                 continue
             if moment.tzinfo is None:
                 moment = moment.replace(tzinfo=UTC)
-            return (moment - _MJD_EPOCH).total_seconds() / _SECONDS_A_DAY
+            return (moment - _MJD_EPOCH).total_seconds() / DAY_S
     return None
 
 

@@ -6,6 +6,8 @@ import numpy as np
 
 from pixcal.model.arrays import F64
 
+SAME_AXIS = 0.98  # cosine of the angle below which two sets measure along one axis
+
 
 def axes_span_plane(axes: Sequence[tuple[float, float]]) -> bool:
     """Whether unit vectors (x, y) differ enough (10 degrees) to give both components."""

@@ -6,6 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
+from pixcal.estimators.fringe_fit.combine import SAME_AXIS
 from pixcal.estimators.maps.stitching import FieldFit
 from pixcal.estimators.maps.structure import (
     PERIODS,
@@ -22,8 +23,6 @@ from pixcal.model.arrays import F64, Mask
 
 of_space = partial(statistic, "space")
 of_space_power = partial(statistic, "space", power=True)
-
-SAME = 0.98  # cosine of the angle below which two sets measure along the same axis
 
 
 @of_space(
@@ -56,7 +55,7 @@ def apart(sets: Sequence[FringeSetData]) -> Curve:
     for one, other in combinations(sets, 2):
         a, b = np.array(one.fringes.k), np.array(other.fringes.k)
         cosine = float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
-        if abs(cosine) > SAME:
+        if abs(cosine) > SAME_AXIS:
             other_map = np.sign(cosine) * other.maps["offset"]
             values.append(float(np.nanmean(flattened(one.maps["offset"] - other_map) ** 2)))
     return Curve.numbered(values)

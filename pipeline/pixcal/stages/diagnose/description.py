@@ -17,7 +17,8 @@ from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import plain_bench
 from pixcal.stages.diagnose.nominal import SetTruth
 from pixcal.stages.diagnose.parts import FrameSubset, Table
-from pixcal.stages.evidence import DAY_S, frame_days, groups
+from pixcal.stages.evidence import frame_days, groups
+from pixcal.storage.header_values import DAY_S
 
 _LATE = 0.05  # fraction of a period above which a frame counts as late
 _LIFTED = 8.0  # level without light after the pedestal, in units of the read noise

@@ -14,11 +14,13 @@ import numpy as np
 
 from pixcal.effects import effects
 from pixcal.estimators.diagnosis.evidence import SOON_S
+from pixcal.estimators.fringe_fit.combine import SAME_AXIS
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F64, Indices
 from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.parts import FrameSubset, Table
-from pixcal.stages.evidence import DAY_S, frame_days, groups
+from pixcal.stages.evidence import frame_days, groups
+from pixcal.storage.header_values import DAY_S
 
 # samples of a fringe set to analyse, in each half of the frames and each window
 SAMPLES = 6_000_000
@@ -32,7 +34,6 @@ BLOCKS = ((16, 384), (8, 192), (4, 32), (2, FEWEST))
 TURN = (False, True, True, False)  # which blocks are held out: a steady drift is alike in both
 # first frame, last frame and count, by array
 Frames = dict[str, tuple[int, int, int]]
-SAME_AXIS = 0.98  # cosine of the angle below which two sets measure along one axis
 LADDER = 3  # exposure times of flats for a linearity curve
 # with equal phase steps, light of neighbouring frames cannot be detected
 RANDOM = "fringes with random phases"

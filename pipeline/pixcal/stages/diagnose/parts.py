@@ -25,9 +25,10 @@ from pixcal.stages.fit.fringe_set import fit_sets
 from pixcal.stages.fit.maps import write_offsets
 from pixcal.stages.fit.sweep import sweep_sets
 from pixcal.stages.reduce.black_cut_off import Black
-from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.reduce.ingested import Ingested, begin_mjd
 from pixcal.stages.reduce.stage import reduce_frames
 from pixcal.storage.cube import CHUNK
+from pixcal.storage.header_values import DAY_S
 from pixcal.storage.manifest import write_json
 from pixcal.storage.memory import MemoryArray, MemoryBuild, MemoryPath
 
@@ -91,7 +92,7 @@ def select(tables: Mapping[str, Table], half: FrameSubset) -> dict[str, Table]:
         own = {key: [column[n] for n in frames] for key, column in tables[name].items()}
         # In a cube, only the first plane may have a time stamp.
         if len(frames) and all(mjd is None for mjd in own["mjd"]):
-            begin = evidence.begin_mjd(tables[name]) + own["time_s"][0] / evidence.DAY_S
+            begin = begin_mjd(tables[name]) + own["time_s"][0] / DAY_S
             own["mjd"][0] = float(begin) if np.isfinite(begin) else None
         found[name] = own | {"frame": frames.tolist()}
     return found

@@ -15,10 +15,9 @@ from pixcal.model.arrays import F64, Mask
 from pixcal.report.text import number
 from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.halves import Window, frames_of
-from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.reduce.ingested import Ingested, starts_of
 from pixcal.storage.cube import CHUNK
 
-_DAY_S = 86400.0
 _GONE = 5  # decays after which hardly any charge is left
 _ROUNDS = 5  # of levels of frames and pixels in turn
 _NO_SAMPLES = np.zeros((0, 0, 0), np.float32)
@@ -135,7 +134,7 @@ def late_rate(
     unlit = levels.means[levels.times == levels.times.min()].mean()
     series = []
     for group, own in zip(levels.groups, levels.levels, strict=True):
-        frames, start = np.array(group.frames), _starts(source)[group.array]
+        frames, start = np.array(group.frames), starts_of(source.tables)[group.array]
         time = np.array(source.tables[group.array]["time_s"], float)[frames]
         stack = Stack(group.array, group.exptime, frames, time, _NO_SAMPLES, start)
         series.append((stack, gain * (own - unlit)))
@@ -154,20 +153,9 @@ def late_rate(
     return LateRate(of_late[0], error, lag, told_from_drift(series, late, least))
 
 
-def _starts(source: Ingested) -> dict[str, float]:
-    """Time of the first frame of each array after the first of all, s; NaN where unknown."""
-    days = {}
-    for name, table in source.tables.items():
-        stamps = np.array(table["mjd"], float) - np.array(table["time_s"], float) / _DAY_S
-        # Later planes of a cube may have none.
-        days[name] = float(next((day for day in stamps if np.isfinite(day)), np.nan))
-    first = min(days.values())
-    return {name: (day - first) * _DAY_S for name, day in days.items()}
-
-
 def _follows_light(source: Ingested) -> bool:
     """Whether darks follow flats, which are all the light there is."""
-    starts = _starts(source)
+    starts = starts_of(source.tables)
     if not {"dark", "flat"} <= set(starts) or source.exposures.fringes:
         return False
     last = starts["dark"] + float(np.max(np.array(source.tables["dark"]["time_s"], float)))

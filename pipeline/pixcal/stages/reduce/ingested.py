@@ -19,6 +19,7 @@ from pixcal.storage.cube import ArrayReader
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.frame_reader import ChosenFrames, FrameReader, Reader
 from pixcal.storage.frames import first_few
+from pixcal.storage.header_values import DAY_S
 from pixcal.storage.manifest import read_json, read_manifest
 from pixcal.storage.place import Local, Place
 from pixcal.storage.stage import read_acquisition
@@ -246,3 +247,18 @@ class Ingested:
         if dtype.kind not in "iu":
             return -math.inf, MOST_ADU
         return float(np.iinfo(dtype).min), float(np.iinfo(dtype).max)
+
+
+def starts_of(tables: Mapping[str, Mapping[str, list[Any]]]) -> dict[str, float]:
+    """Time of frame 0 of each array after the first of all, s; nan where one is unknown."""
+    begin = {name: begin_mjd(table) for name, table in tables.items()}
+    first = np.min(list(begin.values()))
+    return {name: float(day - first) * DAY_S for name, day in begin.items()}
+
+
+def begin_mjd(table: Mapping[str, list[Any]]) -> float:
+    """Time stamp of an array's frame 0, days; nan when unknown."""
+    stamps = np.array(table["mjd"], float) - np.array(table["time_s"], float) / DAY_S
+    # Later planes of a cube without exposure time have none.
+    known = stamps[np.isfinite(stamps)]
+    return float(known[0]) if len(known) else np.nan
