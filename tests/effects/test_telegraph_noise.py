@@ -107,6 +107,9 @@ def test_measured_pixels_are_those_of_the_chip(make_effect_bench: Callable[..., 
     expected[[5, 20], [5, 39]] = True
     np.testing.assert_array_equal(jumps[:30, :40], expected[:30, :40])
     np.testing.assert_array_equal(effect.noisy_pixels(bench.detector), expected)
+    elsewhere = MeasuredPixels((50, 90), (20, 80), 0.0, (), (), (), ())
+    law, beside = (_pixels(bench.detector, 0, 0.1, 1.0, 0.5, m) for m in ((), (elsewhere,)))
+    np.testing.assert_array_equal(beside, law)
 
 
 def test_it_belongs_to_the_pixels_of_the_chip(make_effect_bench: Callable[..., Bench]) -> None:

@@ -214,7 +214,8 @@ def _pixels(
     top, left = rows[0] + detector.origin[0], detector.origin[1]
     for some in measured:
         (y0, y1), (x0, x1) = some.rows, some.columns
-        part = amplitudes[max(y0 - top, 0) : max(y1 - top, 0), max(x0 - left, 0) : x1 - left]
+        y0, y1, x0, x1 = np.maximum([y0 - top, y1 - top, x0 - left, x1 - left], 0)
+        part = amplitudes[y0:y1, x0:x1]
         part[part >= some.faintest] = 0
         here, *at = some.within((top, left), amplitudes.shape)
         amplitudes[*at], uppers[*at] = np.array([some.amplitude, some.upper])[:, here]
