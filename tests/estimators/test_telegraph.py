@@ -76,6 +76,16 @@ def test_few_frames_do_not_make_equal_jumps_more_frequent(seed: int) -> None:
     assert abs(found.switching_s - 4 * PERIOD_S) < 4 * found.switching_error < 4 * PERIOD_S
 
 
+def test_the_share_allows_for_pixels_that_jump_in_none_of_few_frames() -> None:
+    off = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        found = find_telegraph(jumping(rng, 0.03, 3.5, 0.9, 1.5, (12,), 13_000, tail=0.4))
+        assert found is not None
+        off.append((found.share - 0.03) / found.share_error)
+    assert np.sqrt(np.mean(np.square(off))) < 1.5
+
+
 @pytest.mark.parametrize("dof", [5, 9, 60, 700])
 def test_a_variance_with_jumps_is_a_noncentral_chi_square(dof: int) -> None:
     variance, added = np.array([0.5, 1.0, 2.0, 5.0, 12.0]), np.array([0.05, 0.5, 3.0, 10.0])

@@ -1,7 +1,7 @@
 """Telegraph noise: its signs, the population of pixels and their dwell time."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -175,8 +175,14 @@ def _likeliest(parts: Sequence[Moments], upper: float) -> _Found:
     if even.stays.mean_s > 0:
         # Unequal dwell times only where frames further apart favour them.
         spread = _of_stays(parts, SPREAD, upper)
-        if even.later**2 - spread.later**2 > DIFFER:
+        favoured = even.later**2 - spread.later**2
+        if favoured > DIFFER:
             return spread
+        if favoured > -DIFFER:
+            # Few frames do not tell, and pixels with long times jump in none of them.
+            own, other = even.population, spread.population
+            share_error = float(np.hypot(own.share_error, other.share - own.share))
+            return replace(even, population=replace(own, share_error=share_error))
     return even
 
 
