@@ -14,6 +14,7 @@ from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
+_FITTED = ("shift_px_per_e", "along_y", "falloff_px")
 _DISAGREE = 4.0
 _LAW_ERROR = 0.1  # of the shift: what one falloff leaves between near noise and far harmonics
 # significance, with a free response, above which it may explain all harmonics
@@ -111,15 +112,19 @@ class BrighterFatter(Effect):
                 significance = float(np.copysign(np.sqrt(max(gain, 0.0)), size))
                 why += ", and a second harmonic of the fringes that depends on their direction"
         errors: dict[str, float] = {"shift_px_per_e": float(np.sqrt(variance))}
-        together: tuple[dict[str, float], ...] = ()
+        together: list[dict[str, float]] = []
         if alone is not None and significance > _HINTED:
             mean = alone.shift * (1 + alone.along_y) / 2
-            if _agree(noise, mean, alone.shift_error**2):
+            if _agree(noise, mean, alone.steps[0, 0] ** 2):
                 size, along_y = alone.shift, alone.along_y
-                errors, together = _errors(alone)
+                sizes = np.linalg.norm(alone.steps, axis=0)
+                errors, *together = (
+                    {n: float(v) for n, v in zip(_FITTED, step, strict=True) if v}
+                    for step in (sizes, *alone.steps)
+                )
                 why += "; no nonlinearity is needed in addition"
         effect = cls(float(np.clip(size, 0, _MAX_SHIFT)), falloff, along_y)
-        return Estimate(effect, errors, significance, why, together)
+        return Estimate(effect, errors, significance, why, tuple(together))
 
 
 def _by_axis(noise: SharedCharge) -> tuple[float, float, float, float]:
@@ -145,15 +150,3 @@ def _agree(noise: SharedCharge, shift: float, variance: float) -> bool:
     """Whether a shift by the harmonics does not contradict the noise of neighbours."""
     variance += noise.variance + (_LAW_ERROR * shift) ** 2
     return (shift - noise.size) ** 2 < _DISAGREE**2 * variance
-
-
-def _errors(found: Boundaries) -> tuple[dict[str, float], tuple[dict[str, float], ...]]:
-    """Errors of all parameters, and their correlated steps."""
-    ratio = {"along_y": found.along_y_error} if found.along_y_error else {}
-    together = [d for d in ({"shift_px_per_e": found.shift_error}, ratio) if d]
-    if np.isfinite(found.falloff_error):
-        steps = {"shift_px_per_e": found.with_falloff, "falloff_px": found.falloff_error}
-        together.append(steps | dict.fromkeys(ratio, found.along_y_with_falloff))
-    names = dict.fromkeys(name for part in together for name in part)
-    errors = {n: float(np.linalg.norm([part.get(n, 0.0) for part in together])) for n in names}
-    return errors, tuple(together)

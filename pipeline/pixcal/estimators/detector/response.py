@@ -120,21 +120,16 @@ def fit_curve(
 class Boundaries:
     """Moving boundaries without a nonlinear response, from the second harmonics of all sets."""
 
-    # falloff_px, falloff_error: the error is infinite where the falloff is not constrained
+    shift: float  # of boundaries between columns, per electron, px
+    along_y: float  # shift of boundaries between rows over that
     falloff_px: float
-    falloff_error: float
-    shift: float  # shift, shift_error: per electron, px, for this falloff
-    shift_error: float
-    with_falloff: float  # change of the shift for one error of the falloff, px
+    # independent joint 1-sigma steps (n, 3) of these; of the first two for this falloff, and, where
+    # the falloff is constrained, of all
+    steps: F64
     # against, shapes: chi-square by which an additional nonlinear response, and boundaries alone
     # with any function of distance, would fit better
     against: float
     shapes: float
-    # shift of boundaries between rows over that between columns, its error (zero for fringes along
-    # one axis), and its change for one error of the falloff
-    along_y: float
-    along_y_error: float
-    along_y_with_falloff: float
 
 
 def boundaries_alone(evidence: Evidence, otherwise_px: float) -> Boundaries:
@@ -223,8 +218,10 @@ def _alone(sums: Sequence[tuple[F64, F64]]) -> F64:
     gain = sizes @ rights
     beside = right @ inverse_normal(joint) @ right - gain
     ratio = sizes[-1] / sizes[0]
-    slope = np.array([-ratio, 1.0]) / sizes[0] if len(sums) > 1 else np.zeros(1)
-    error = np.sqrt(slope @ covariance @ slope)
+    error = _RATIO_ERROR
+    if len(sums) > 1:
+        slope = np.array([-ratio, 1.0]) / sizes[0]
+        error = np.sqrt(slope @ covariance @ slope)
     return np.array([UNIT * sizes[0], UNIT**2 * covariance[0, 0], gain, beside, ratio, error])
 
 
@@ -243,14 +240,13 @@ def _best_falloff(of: Callable[[float], F64], otherwise_px: float, of_any: float
             break
         error, top = 1 / np.sqrt(-curved), middle - slope / (2 * curved)
         best = np.clip(top, tried[0], tried[-1])
-    falloff, falloff_error, rises = otherwise_px, np.inf, np.zeros(len(bends))
+    falloff, with_falloff = otherwise_px, []
     if error < MAX_LOG_ERROR:
         # Limited to the range tried; the distance from the maximum adds to the error.
-        error = float(np.hypot(error, top - best))
+        error = np.hypot(error, top - best)
         falloff = float(np.exp(best))
-        falloff_error = falloff * error
-        rises = error * np.array([np.polyval(np.polyder(b), best - middle) for b in bends])
-    size, variance, gain, against, ratio, own = of(falloff).tolist()
-    shift = size, variance**0.5, float(rises[0])
-    axes = ratio, own, float(rises[4])
-    return Boundaries(falloff, falloff_error, *shift, against, of_any - gain, *axes)
+        rises = [error * np.polyval(np.polyder(bends[n]), best - middle) for n in (0, 4)]
+        with_falloff = [[*rises, falloff * error]]
+    shift, variance, gain, against, ratio, own = of(falloff).tolist()
+    steps = np.array([[np.sqrt(variance), 0, 0], [0, own, 0], *with_falloff])
+    return Boundaries(shift, ratio, falloff, steps, against, of_any - gain)
