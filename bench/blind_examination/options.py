@@ -56,5 +56,5 @@ class ScoreConfig:
     also: tuple[tuple[Path, Path], ...] = quantity(
         (),
         metavar="DIR FILE",
-        doc="Another examination of the same size and its truth, to score together; repeatable.",
+        doc="Score another examination as well: its directory and file of the truth; repeatable.",
     )

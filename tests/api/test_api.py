@@ -266,7 +266,10 @@ CUBE = np.full((4, 5, 6), 100, np.uint16)
         ({"frames": {"vertical": CUBE > 0}}, r"frames\['vertical'\]: bool samples"),
         ({"frames": {"vertical": CUBE + np.int64(1 << 25)}}, "samples from 33554532 to 33554532"),
         ({"frames": {"diagonal": CUBE}}, "baselines_mm: diagonal, vertical: each set"),
-        ({"bias": CUBE[:, :2]}, r"bias: frames of \(2, 6\) pixels, the first set has \(5, 6\)"),
+        (
+            {"bias": CUBE[:, :2]},
+            r"bias: frames of \(2, 6\) pixels \(y, x\), where .* \(5, 6\); all",
+        ),
         ({"flats": {-1.0: CUBE}}, r"flats\[-1.0\]: not an exposure time"),
         ({"darks": {1.0: CUBE}, "exptime_s": None}, "exptime_s: missing"),
         ({"pitch_um": -1}, r"pixcal.calibrate: detector.pitch_um: -1 "),

@@ -144,7 +144,8 @@ def _stacks(
         window = window or array.shape[1:]
         if array.shape[1:] != window:
             raise InputError(
-                f"{name}: frames of {array.shape[1:]} pixels, the first set has {window} (y, x)"
+                f"{name}: frames of {array.shape[1:]} pixels (y, x), where the first array has "
+                f"{window}; all frames have one size"
             )
         found[file] = array, seconds
     return found
@@ -161,7 +162,7 @@ def _checked(name: str, stack: ArrayLike) -> Frames:
         return array
     low, high = int(array.min()), int(array.max())
     if max(-low, high) > EXACT:
-        raise InputError(f"{name}: samples from {low} to {high} are beyond ±{EXACT}")
+        raise InputError(f"{name}: samples from {low} to {high} are beyond ±{EXACT}; divide them")
     return array
 
 

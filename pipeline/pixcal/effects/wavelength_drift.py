@@ -54,7 +54,11 @@ class WavelengthDrift(Effect):
         1.1e-6, low=-0.1, high=0.1, doc="relative difference between the two modes"
     )
     hops_per_h: float = quantity(
-        12.0, unit="1/h", low=0, high=1e6, doc="hops to the other mode or back, at random times"
+        12.0,
+        unit="1/h",
+        low=0,
+        high=1e6,
+        doc="rate of mode hops in either direction, at random times",
     )
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:

@@ -86,7 +86,7 @@ class FringeSet:
         if re.fullmatch("mask|delta_(x|y|fringe)(_sigma)?", self.name):
             raise InputError(f"name: {self.name!r} is reserved for a result; choose another")
         if not self.files:
-            raise InputError("files: the list is empty")
+            raise InputError("files: the list is empty; give globs")
         _check_globs("files", self.files)
 
 

@@ -29,7 +29,7 @@ def read_offsets(run_dir: Path) -> tuple[F32, F32]:
     """
     maps = {name: read_map(path)[:2] for name, path in maps_to_use(run_dir).items()}
     if not maps:
-        raise InputError(f"{run_dir}: the fit left no map of offsets")
+        raise InputError(f"{run_dir}: has no map of offsets; run 'pixcal fit' again")
     if "delta_fringe" in maps:
         facts = read_json(run_dir / "fit" / "fit.json")["sets"]
         axis = np.array(next(iter(facts.values()))["axis"], np.float32)[:, None, None]

@@ -36,7 +36,7 @@ def fitted_shape(
         return Paraxial(phase, facts["kx"], facts["ky"], origin, max(window) / 2)
     if facts["model"] != "hyperbolic":
         raise InputError(
-            f"{run}: fitted with {facts['model']!r} fringes, whose modes are not known"
+            f"{run}: fitted with {facts['model']!r} fringes, unknown here; run 'pixcal fit' again"
         )
     geometry = Geometry(
         acquisition.fibres.wavelength_nm * 1e-6,

@@ -212,6 +212,6 @@ def _source(
     if other != (name, key):
         raise InputError(
             f"{path}: the file is listed twice, by {key} and as {other[0]} by {other[1]}; "
-            "a frame can be used only once"
+            "remove one"
         )
     return SourceFile(path, name, facts.st_size, facts.st_mtime_ns)

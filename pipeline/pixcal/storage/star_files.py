@@ -40,7 +40,9 @@ def column(table: Table, name: str, path: Path, option: str) -> F64:
         values: Any = np.ma.filled(np.ma.asarray(table[name], dtype=float), np.nan)
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{option}: column {name!r} of {path} holds no numbers") from error
+        raise InputError(
+            f"{option}: column {name!r} of {path} holds no numbers; name another"
+        ) from error
 
 
 def write_table(table: Table, path: Path, *, overwrite: bool) -> None:

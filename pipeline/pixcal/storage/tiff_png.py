@@ -77,7 +77,7 @@ def unpack_picture(file: FrameFile, out: BinaryIO) -> None:
             picture.seek(page)
             samples = np.asarray(picture)
             if samples.shape != file.shape[1:]:
-                raise InputError(f"{file.source.path}: changed while it was being read")
+                raise InputError(f"{file.source.path}: changed while it was being read; run again")
             if file.coding.bzero:
                 samples = (samples ^ np.uint16(file.coding.bzero)).view(np.int16)
             out.write(samples.astype(file.coding.stored.newbyteorder(">")).tobytes())

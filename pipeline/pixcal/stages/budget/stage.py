@@ -38,7 +38,7 @@ def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, 
     bench = load_bench(bench_file)
     expected.own_effects(bench, str(bench_file))
     if not bench.frames.fringes:
-        raise InputError(f"{bench_file}: frames.fringes: no fringe sets, nothing to budget")
+        raise InputError(f"{bench_file}: frames.fringes: lists no fringe set; add one")
     with naming(str(bench_file)):
         bound = expected.joined(bench)
     for scan, s in zip(bench.frames.fringes, bound.sets, strict=True):

@@ -87,10 +87,12 @@ class CrestPaths:
 def seed_vector(patch: NDArray[Any], good: Mask, nominal: Vector) -> Vector:
     """Fringe vector (kx, ky), rad/px, of a patch (y, x) of a frame; its sign is the nominal's."""
     if good.sum() < MIN_POINTS**2:
-        raise InputError("no fringes found: too few good samples in the centre of the frame")
+        raise InputError(
+            "no fringes found: too few good samples in the centre of the frame; see its mask"
+        )
     level = float(patch[good].mean())
     if not level > 0:
-        raise InputError("no fringes found: the frame is dark")
+        raise InputError("no fringes found: the frame is dark; check which files the set lists")
     maps = np.where(good, patch, level).astype(np.float64)[None] / level - 1
     k = find_fringe_vector(maps, good, nominal)
     if np.hypot(k[0] - nominal[0], k[1] - nominal[1]) > MAX_AWAY * np.hypot(*nominal):
@@ -98,7 +100,8 @@ def seed_vector(patch: NDArray[Any], good: Mask, nominal: Vector) -> Vector:
         raise InputError(
             f"no fringes found near the nominal ones: the strongest period is {measured:.1f} px, "
             f"at {np.degrees(np.arctan2(k[1], k[0])):.0f} degrees from x, where baseline_mm gives "
-            f"{expected:.1f} px at {np.degrees(np.arctan2(nominal[1], nominal[0])):.0f} degrees"
+            f"{expected:.1f} px at {np.degrees(np.arctan2(nominal[1], nominal[0])):.0f} degrees; "
+            "correct it"
         )
     return k
 
