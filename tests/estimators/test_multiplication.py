@@ -80,3 +80,13 @@ def test_noise_of_rows_is_one_sample_a_row() -> None:
 def test_noise_below_a_step_does_not_tell() -> None:
     frames = np.rint(np.random.default_rng(6).normal(0.25, 0.3, (4, *SHAPE))).astype(np.float32)
     assert skew(frames, 0.0, 0.09, 0.01, np.ones(SHAPE, np.bool_), 1.0) is None
+
+
+def test_pixels_that_blink_leave_the_third_moment_of_single_electrons() -> None:
+    rng = np.random.default_rng(7)
+    frames = rng.poisson(1000.0, (20, *SHAPE))
+    blinking = (rng.random(SHAPE) < 3e-3) & (rng.random(frames.shape) < 0.1)
+    frames[blinking] += 200
+    one = skew(frames.astype(np.float32), 1000.0, READ**2, 1.0, np.ones(SHAPE, np.bool_))
+    assert one is not None
+    assert one.cumulant == pytest.approx(1000, abs=4 * one.error)

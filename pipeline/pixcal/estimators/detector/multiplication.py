@@ -20,7 +20,7 @@ EXCESS, EXCESS_ERROR = 2.0, 0.05  # F² of a large multiplication, and error if 
 _SURE = 5.0  # errors by which the ratio must exceed 1
 _RATIOS = (1.3, 1.7)  # of a register: a multiplication of 1.5 has 1.39
 # samples that count: within so many standard deviations, and signals of single electrons
-_CLIP, _ELECTRONS = 8.0, 15.0
+_CLIP, _ELECTRONS = 5.0, 15.0
 _MIN_PIXELS = 1000
 
 
