@@ -84,7 +84,7 @@ def test_saturation_is_where_the_variance_falls():
     dof = np.full(40, 1e4)
     variance = np.where(level < 3500, level / 2, 10.0)
     points = transfer_points(np.stack([dof, dof * level, dof * variance], axis=1))
-    assert saturation(points) == pytest.approx((3400.0, 50.0))
+    assert saturation(points) == pytest.approx((3450.0, 50.0))
     assert full_level(points) == pytest.approx(3500.0)
     rising = transfer_points(np.stack([dof, dof * level, dof * level / 2], axis=1))
     assert saturation(rising) is None

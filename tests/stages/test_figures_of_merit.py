@@ -93,9 +93,7 @@ def test_a_ladder_that_saturates_gives_the_full_well(tmp_path: Path) -> None:
     assert reduced.reduction["linearity"]["max_deviation_percent"] < 0.5
     found = reduced.reduction["figures_of_merit"]["saturation"]
     assert found["note"] == ""
-    # The variance is largest at the last level whose brightest samples alone are cut.
-    assert found["value"] == pytest.approx(8600 / GAIN, rel=0.02)
-    assert abs(found["value"] - FULL / GAIN) < 3 * found["error"] < 0.15 * FULL / GAIN
+    assert abs(found["value"] - FULL / GAIN) < 1.1 * found["error"] < 0.05 * FULL / GAIN
 
 
 def test_wells_that_differ_are_known_to_half_a_step_of_the_ladder(tmp_path: Path) -> None:
@@ -103,8 +101,7 @@ def test_wells_that_differ_are_known_to_half_a_step_of_the_ladder(tmp_path: Path
     acquisition = write_camera(tmp_path / "acq", (500, 2500, 5000, 8000, 11000), full=wells)
     reduced = pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run"))
     found = reduced.reduction["figures_of_merit"]["saturation"]
-    assert abs(found["value"] - wells.mean() / GAIN) < 3 * found["error"]
-    assert 2 * found["error"] == pytest.approx(wells.mean() / GAIN - found["value"], rel=0.15)
+    assert abs(found["value"] - wells.mean() / GAIN) < 2 * found["error"]
 
 
 def test_noise_of_half_a_code_comes_from_pairs_of_many_darks(tmp_path: Path) -> None:

@@ -139,10 +139,11 @@ def transfer_points(sums: F64, most: int = 60) -> F64:
 
 
 def saturation(points: F64) -> Measure | None:
-    """Level (ADU) of the photon-transfer curve's maximum, if the variance falls beyond it.
+    """Level (ADU) at which pixels become full, if the variance falls.
 
-    ``points``: (point, 3) of `transfer_points`. The error is half the distance to the level where
-    the variance has fallen. None where the curve rises to its end: saturation was not reached.
+    Halfway from the photon-transfer curve's maximum to the level where the variance has fallen, and
+    half their distance. ``points``: (point, 3) of `transfer_points`. None where the curve rises to
+    its end: saturation was not reached.
     """
     if len(points) < 2:
         return None
@@ -151,8 +152,8 @@ def saturation(points: F64) -> Measure | None:
     fallen = _fallen(points, peak, _FALL)
     if not len(fallen):
         return None
-    level = float(points[peak, 0])
-    return level, float(fallen[0] - level) / 2
+    ends = float(points[peak, 0]), float(fallen[0])
+    return sum(ends) / 2, (ends[1] - ends[0]) / 2
 
 
 def full_level(points: F64) -> float:

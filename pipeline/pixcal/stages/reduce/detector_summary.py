@@ -113,8 +113,12 @@ def summarise(job: Measuring, folder: Place, source: Ingested) -> Summary:
     rate = read_noise.dark_rate(folder, job)
     times = np.array([group.exptime for group in job.flat])
     charged = levels + rate * times if job.flats_timed and job.flat else levels
-    full = usable & (nearly | (charged > sum(well))) if well else np.zeros_like(usable)
+    full = usable & (nearly | (charged > well[0])) if well else np.zeros_like(usable)
     usable &= ~full
+    if well is not None and (beyond := full & (levels > sum(well))).any():
+        # Wells differ: some pixels may be full far below the next level of the flats.
+        half = (float(levels[beyond].min()) - well[0] + well[1]) / 2
+        well = well[0] - well[1] + half, half
     light = _light(tables, levels, usable, job)
     medians = usual(job, folder, light)
     if job.flat and not medians.response > _LIT * medians.response_error:
@@ -127,7 +131,7 @@ def summarise(job: Measuring, folder: Place, source: Ingested) -> Summary:
             f"frames.flat: the flats hold no light ({levels.max():.2g} ADU above the bias); take "
             "them again, or list none"
         )
-    ends = full_level(points), math.inf if well is None else well[0]
+    ends = full_level(points), math.inf if well is None else well[0] - well[1]
     top = float(np.fmin(job.saturation - medians.bias, ends[0] if ends[0] < math.inf else ends[1]))
     charge = 0.0 if job.read_series is None else rate * job.read_series.exptime
     gain, wander, lost = None, read_noise.bias_wander(job), read_noise.lost_in_blocks(job)

@@ -138,15 +138,12 @@ def _line_noise(
 def _top(summary: Summary, job: Measuring, clipped: bool) -> tuple[Measure | None, bool]:
     """Saturation above bias (ADU, error) and True, or else the highest level and False."""
     # ``clipped``: whether the converter limits samples, not the wells.
-    peak, end = summary.well, job.saturation - summary.usual.bias
-    if peak is not None and (not clipped or peak[0] + 2 * peak[1] < _WELL * end):
-        # Wells differ: some pixels may be full far below the next level of the flats.
-        beyond = summary.levels[summary.full & (summary.levels > sum(peak))]
-        half = (float(beyond.min()) - peak[0]) / 2 if len(beyond) else 0.0
-        return (peak[0], max(peak[1], half)), True
+    well, end = summary.well, job.saturation - summary.usual.bias
+    if well is not None and (not clipped or sum(well) < _WELL * end):
+        return well, True
     if not len(summary.levels) or not summary.usable.any():
         return None, False
-    if clipped and (peak is not None or not summary.usable.all()):
+    if clipped and (well is not None or not summary.usable.all()):
         return (end, job.quantum / 2), True
     return (float(summary.levels[summary.usable].max()), 0.0), False
 
