@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pixcal.stages.reduce.black_cut_off import CutOff
+from pixcal.stages.reduce.black_cut_off import CutOff, cut_offs
 from pixcal.stages.reduce.flat_survey import FlatSurvey
 
 SHAPE = (8, 61, 409)
@@ -50,6 +50,16 @@ def test_lowest_code_and_noise_are_found(
 @pytest.mark.parametrize("level", [1000.0, 1000.3, 1000.5])
 def test_noise_above_the_lowest_code_is_whole(noise: float, level: float) -> None:
     assert CutOff.of(Frames(frames(noise, level, 0)), 1.0) is None
+
+
+def test_dark_signal_that_differs_upwards_has_no_cut_off_where_bias_frames_go_below() -> None:
+    rng = np.random.default_rng(8)
+    dark = 8.1 + 2.5 * rng.gamma(4, 1 / 4, SHAPE[1:]) + 0.4 * rng.standard_normal(SHAPE)
+    arrays = {"dark": Frames(np.rint(dark).astype(np.uint16))}
+    assert cut_offs(arrays, 1.0)  # the darks alone cannot tell
+    assert not cut_offs({**arrays, "bias": Frames(frames(0.4, 8.1, 0))}, 1.0)
+    ended = {"bias": Frames(frames(0.9, 8.5, 8)), "dark": Frames(frames(0.9, 9.0, 8))}
+    assert [one.code for one in cut_offs(ended, 1.0).values()] == [8, 8]
 
 
 @pytest.mark.parametrize("lowest", [1, 4, 64])
