@@ -143,6 +143,14 @@ def test_colour_is_refused(tmp_path: Path) -> None:
     assert "greyscale" in refused(tmp_path)
 
 
+def test_three_frames_written_as_planes_of_colours_are_refused_with_a_remedy(
+    tmp_path: Path,
+) -> None:
+    frames = np.zeros((1, 5, 6, 3), np.uint8)
+    write_tiff(tmp_path / "acq" / "b.tif", frames, tiffinfo={284: 2})
+    assert "photometric='minisblack'" in refused(tmp_path)
+
+
 def test_pages_of_two_sizes_are_refused(tmp_path: Path) -> None:
     first, second = (Image.fromarray(np.zeros((5, n), np.uint16)) for n in (6, 7))
     (tmp_path / "acq").mkdir()

@@ -28,6 +28,8 @@ _CODINGS = {
     "F": SampleFormat(-32),
 }
 
+_PLANAR, _SEPARATE = 284, 2  # TIFF tag PlanarConfiguration, and its value for separate planes
+
 
 def is_picture(start: bytes) -> bool:
     """Whether a file with this beginning is TIFF or PNG."""
@@ -50,9 +52,15 @@ def inspect_picture(source: SourceFile) -> FrameFile:
             )
         (((nx, ny), mode),) = kinds
         if mode not in _CODINGS:
+            remedy = "record raw frames, without colour or palette"
+            if getattr(picture, "tag_v2", {}).get(_PLANAR) == _SEPARATE:
+                remedy = (
+                    "tifffile writes a stack of 3 or 4 frames as planes of colours; write it again "
+                    "with photometric='minisblack'"
+                )
             raise InputError(
                 f"{source.path}: samples of Pillow's mode {mode}; frames are greyscale of 8, 16 or "
-                "32 bits: record raw frames, without colour or palette"
+                f"32 bits: {remedy}"
             )
         header = Header((key, found, "") for key, found in source.header)
         exif = _exposure_s(picture)
