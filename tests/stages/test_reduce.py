@@ -797,3 +797,11 @@ def test_the_numbers_of_the_real_camera_are_those_of_its_own_package() -> None:
     noises = msfc_ccd.noise.readout(taps("dark"), "time").outputs.ndarray.value
     np.testing.assert_allclose(gains.ravel(), ESIS_GAINS, atol=1e-3)
     np.testing.assert_allclose(noises.ravel(), ESIS_NOISES, atol=1e-3)
+
+
+def test_darks_of_one_exposure_time_alone_give_no_read_noise_by_itself(tmp_path: Path) -> None:
+    camera = Camera(16, SMALL)
+    found = small(tmp_path, {"dark": (camera.take(9, 10), [10.0] * 9)})
+    noise = np.hypot(READ, np.sqrt(10 * camera.dark.mean()))
+    assert found["read_noise_e"]["measured"] == pytest.approx(noise, rel=0.05)
+    assert any("read noise contains the noise of the dark signal" in w for w in found["warnings"])

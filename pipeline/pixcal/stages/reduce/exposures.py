@@ -104,7 +104,8 @@ def _group_darks(found: Exposures, times: Mapping[str, list[float | None]]) -> N
     elif not bias and not found.has_rate:
         found.warnings.append(
             "no bias frames, and darks of one exposure time only: their mean is subtracted as "
-            "bias and dark signal, which is valid only for frames of the same exposure time"
+            "bias and dark signal, which is valid only for frames of the same exposure time, and "
+            "the read noise contains the noise of the dark signal"
         )
     elif not found.has_rate and dark:
         found.warnings.append(
