@@ -105,20 +105,11 @@ def summarise(job: Measuring, folder: Place, source: Ingested) -> Summary:
     sums = pair_sums(folder, job)
     # Full pixels saturate the flats even if the converter does not saturate.
     points = transfer_points(add_neighbours(sums[1], sums[0])[0])
-    well, below = saturation(points), usable & ~nearly
-    if well is None and below.any() and (usable & nearly).any():
-        # Photon transfer leaves out levels that the converter's end may clip.
-        ends = levels[below].max(), levels[usable & nearly].max()
-        well = float(sum(ends)) / 2, float(ends[1] - ends[0]) / 2
     rate = read_noise.dark_rate(folder, job)
     times = np.array([group.exptime for group in job.flat])
     charged = levels + rate * times if job.flats_timed and job.flat else levels
-    full = usable & (nearly | (charged > well[0])) if well else np.zeros_like(usable)
+    well, full = _wells(saturation(points), levels, charged, usable, nearly)
     usable &= ~full
-    if well is not None and (beyond := full & (levels > sum(well))).any():
-        # Wells differ: some pixels may be full far below the next level of the flats.
-        half = (float(levels[beyond].min()) - well[0] + well[1]) / 2
-        well = well[0] - well[1] + half, half
     light = _light(tables, levels, usable, job)
     medians = usual(job, folder, light)
     if job.flat and not medians.response > _LIT * medians.response_error:
@@ -247,6 +238,27 @@ def _exposure_steps(tables: F64, job: Measuring) -> tuple[F64, Mask, Mask]:
     seen = weight.sum(axis=0)
     ended = nearly.sum(axis=0) > _SATURATED_STEP * pixels.sum(axis=0)
     return np.divide(total, seen, out=np.zeros_like(total), where=seen > 0), usable, ended
+
+
+def _wells(
+    well: Measure | None, levels: F64, charged: F64, usable: Mask, nearly: Mask
+) -> tuple[Measure | None, Mask]:
+    """Saturation of the wells (ADU), if it was reached, and the steps with full pixels."""
+    # ``charged``: levels with their dark signal, ADU.
+    below, ended = usable & ~nearly, usable & nearly
+    if well is None and below.any() and ended.any():
+        # Photon transfer leaves out levels that the converter's end may clip.
+        ends = float(levels[below].max()), float(levels[ended].max())
+        well = sum(ends) / 2, (ends[1] - ends[0]) / 2
+    if well is None:
+        return None, np.zeros_like(usable)
+    full = usable & (nearly | (charged > well[0]))
+    beyond = full & (levels > sum(well))
+    if beyond.any():
+        # Wells differ: some pixels may be full far below the next level of the flats.
+        half = (float(levels[beyond].min()) - well[0] + well[1]) / 2
+        well = well[0] - well[1] + half, half
+    return well, full
 
 
 def _light(tables: F64, levels: F64, usable: Mask, job: Measuring) -> F64:
