@@ -103,6 +103,16 @@ def test_crosstalk_is_no_charge_transfer() -> None:
         assert found.effect.is_null
 
 
+def test_signals_that_two_outputs_in_the_middle_drag_along_are_no_charge_transfer() -> None:
+    signal = hot_pixels()
+    read, half = signal.copy(), SHAPE[1] // 2
+    read[:, : half - 1] += 0.015 * (signal[:, 1:half] - 20)
+    read[:, half + 1 :] += 0.015 * (signal[:, half:-1] - 20)
+    found = ChargeTransfer.estimate(evidence_of(read))
+    assert found is not None
+    assert found.effect.is_null
+
+
 @pytest.mark.parametrize("output", [0, 99])
 def test_charge_is_kept_and_trails_grow(
     make_effect_bench: Callable[..., Bench], output: int

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels, hot_pixels
 from pixcal.estimators.crosstalk.links import REACH
 from pixcal.estimators.diagnosis.evidence import Evidence, cached_on_evidence
-from pixcal.kernels.significance import sigmas_of_best
+from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best
 from pixcal.model.arrays import F64, Indices
 
 LEAST = 10  # hot pixels that tell
@@ -97,6 +97,11 @@ def _along(found: HotPixels, size: int, start: int, axis: int) -> Trail | None:
     error = float(np.sqrt(rest @ rest)) / total
     losses = max(loss, 0.0) / whole_trail, error / whole_trail
     sigmas = float(np.arctanh(np.clip(rise, -_ALIKE, _ALIKE))) * np.sqrt(len(at) - 3)
+    first = at < np.median(at)
+    signs = [np.sign(apart[half]).sum() / np.sqrt(half.sum()) for half in (first, ~first)]
+    if signs[0] * signs[1] < 0 and min(np.abs(signs)) > SIGNIFICANT:
+        # Charge trails away from the output, not both ways, as signals of two outputs do.
+        sigmas = 0.0
     return Trail(sigmas, losses, power, level, ratio, output)
 
 
