@@ -30,7 +30,7 @@ out_option = click.option(
     )
 )
 def blind() -> None:
-    """Test the diagnosis on simulated benches whose effects are withheld."""
+    """Test the diagnosis on benches whose effects are withheld."""
 
 
 @command(

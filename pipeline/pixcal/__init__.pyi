@@ -58,7 +58,7 @@ def allan(
     regions: collections.abc.Sequence[tuple[int, int, int, int]] = (),
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> pixcal.api.opened.Run:
-    """Measure how the error falls with the number of frames (Allan deviation).
+    """Measure the Allan deviation: error against number of frames.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def budget(
     frames: int | None = None,
     out: str | os.PathLike[str] | None = None,
 ) -> dict[str, typing.Any]:
-    """Plan an exposure: frames and hours needed for a given precision.
+    """Plan the frames and hours needed for a given precision.
 
     BENCH.yaml describes a bench as for `pixcal simulate`. The numbers are the Cramér-Rao bound: no
     unbiased estimate needs fewer frames. The fit comes within a few percent of it.
@@ -219,7 +219,7 @@ def crests(
     segment: int | None = None,
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> dict[str, typing.Any]:
-    """Locate the fibres from the paths of crests and valleys, to check the fit.
+    """Check the fit: locate the fibres from crests and valleys.
 
     Parameters
     ----------
@@ -254,7 +254,7 @@ def diagnose(
     nominal: str | os.PathLike[str] | None = None,
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> dict[str, typing.Any]:
-    """Find where data and simulation differ, which effect causes it, and the residual gap.
+    """Find which effects make the frames differ from a simulation.
 
     Parameters
     ----------
@@ -414,7 +414,7 @@ def run(
     diagnosed: bool = True,
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> pixcal.api.opened.Run:
-    """Run all steps, from an acquisition to corrected maps and the report.
+    """Run all steps: from frames to corrected maps and a report.
 
     Parameters
     ----------

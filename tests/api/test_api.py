@@ -274,6 +274,7 @@ CUBE = np.full((4, 5, 6), 100, np.uint16)
         ({"darks": {1.0: CUBE}, "exptime_s": None}, "exptime_s: missing"),
         ({"pitch_um": -1}, r"pixcal.calibrate: detector.pitch_um: -1 "),
         ({"baselines_mm": {"vertical": (0, 0)}}, "both components are zero"),
+        ({"baselines_mm": {"vertical": 6.0}}, r"such as \[a, b\], in mm, found 6.0"),
         ({"frames": {"../x": CUBE}, "baselines_mm": {"../x": (6, 0)}}, "is not made of letters"),
     ],
 )

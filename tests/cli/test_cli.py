@@ -136,6 +136,11 @@ def loaded_with(module: str) -> set[str]:
     return set(out.stdout.split())
 
 
+def test_the_list_of_commands_cuts_no_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    assert invoke(["--help"]) == 0
+    assert "..." not in capsys.readouterr().out.split("Commands:")[1]
+
+
 def test_help_loads_no_heavy_library() -> None:
     loaded = loaded_with("pixcal_cli.main")
     assert "pixcal_cli.main" in loaded

@@ -185,7 +185,7 @@ def _describe(
         if any(file.startswith(f"{kind}/") for file in stacks)
     }
     fringes = [
-        {"name": name, "files": [f"fringes/{name}.fits"], "baseline_mm": list(baselines_mm[name])}
+        {"name": name, "files": [f"fringes/{name}.fits"], "baseline_mm": baselines_mm[name]}
         for name in names
     ]
     plain = {

@@ -160,7 +160,7 @@ class Fit(Sweep):
 
 @dataclass(frozen=True)
 class Allan:
-    """Measure how the error falls with the number of frames (Allan deviation)."""
+    """Measure the Allan deviation: error against number of frames."""
 
     region: Region | None = python_only_option(
         None, unit="px", low=0, doc="Limits (y0, y1, x0, x1) of the main curve, ends excluded."
@@ -177,7 +177,7 @@ class Allan:
 
 @dataclass(frozen=True)
 class Crests:
-    """Locate the fibres from the paths of crests and valleys, to check the fit."""
+    """Check the fit: locate the fibres from crests and valleys."""
 
     frames: int = quantity(
         8, low=1, metavar="N", doc="Number of frames to use, spread over the run."
@@ -196,7 +196,7 @@ class Crests:
 
 @dataclass(frozen=True)
 class Diagnose:
-    """Find where data and simulation differ, which effect causes it, and the residual gap."""
+    """Find which effects make the frames differ from a simulation."""
 
     only: tuple[str, ...] = python_only_option((), doc="The only candidates.")
     without: tuple[str, ...] = python_only_option((), doc="Effects to leave out.")
@@ -338,7 +338,7 @@ class Compare:
 
 @dataclass(frozen=True)
 class Budget:
-    """Plan an exposure: frames and hours needed for a given precision.
+    """Plan the frames and hours needed for a given precision.
 
     BENCH.yaml describes a bench as for `pixcal simulate`. The numbers are the Cramér-Rao bound: no
     unbiased estimate needs fewer frames. The fit comes within a few percent of it.
@@ -376,7 +376,7 @@ class Simulate:
 
 @dataclass(frozen=True)
 class Run:
-    """Run all steps, from an acquisition to corrected maps and the report."""
+    """Run all steps: from frames to corrected maps and a report."""
 
     overwrite: bool = as_in(Ingest, "overwrite")
     copy: bool = as_in(Ingest, "copy")
