@@ -135,7 +135,7 @@ def test_what_is_left_out_and_what_is_wrong(tmp_path: Path) -> None:
 
 
 def test_mistakes_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"bench.yaml: frames.fringes: no fringe sets"):
+    with pytest.raises(InputError, match=r"bench.yaml: frames.fringes: lists no fringe set; add"):
         budget.run(changed(tmp_path, frames__fringes=[]), Config())
     ramp = {"phase_law": "ramp", "phase_step_rad": float(np.pi)}
     places = {f"frames__fringes__1__{key}": value for key, value in ramp.items()}
