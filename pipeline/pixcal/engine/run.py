@@ -118,7 +118,8 @@ def run_tasks(
     results: dict[int, R] = {}
     times = (TimeElapsedColumn(), "left", TimeRemainingColumn())
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), *times)
-    progress = Progress(*columns, console=Console(file=sys.stderr), disable=runtime.quiet)
+    hidden = runtime.quiet or not items
+    progress = Progress(*columns, console=Console(file=sys.stderr), disable=hidden)
     shown = progress.add_task(label, total=len(items))
     with progress, one_blas_thread():
 

@@ -42,7 +42,9 @@ class Running:
         metavar="threads|processes|sync|tcp://…",
         doc="Run tasks here, or on the Dask cluster at this address.",
     )
-    workers: int = quantity(0, low=0, high=4096, shown="all cores", doc="Number of parallel tasks.")
+    workers: int = quantity(
+        0, low=0, high=4096, shown="all cores", doc="Parallel tasks; 0 is one per core."
+    )
     memory: int = quantity(
         2 << 30,
         unit="bytes",

@@ -296,15 +296,15 @@ def scout_set(
     # Kept chunks; codes of the first look, copies of a tile's share, and its Gram matrix; for each
     # task the sums of a tile, or chunks that are not kept.
     kept = len(places) * tile_bytes if keep else 0
-    what = f"the scout of {name}"
+    what = f"the frame phases of {name}"
     per_task = (4 if keep else max(4, len(places))) * chunk_bytes
     here = within_memory(what, per_task, 3 * PRIME_BYTES + kept, here)
-    each = partial(run_tasks, runtime=here, label=f"first look at {name}")
+    each = partial(run_tasks, runtime=here, label=f"phases {name}")
     scout = Scout(tiles, source.coding, nominal, ((ny - 1) / 2, (nx - 1) / 2), each)
     codes = partial(_codes, source, places, keep)
 
     first = _first_look(source, PRIME_BYTES // (len(places) * chunk_bytes))
-    looks = run_tasks(partial(_look, codes), first, here, label=f"first look at {name}")
+    looks = run_tasks(partial(_look, codes), first, here, label=f"phases {name}")
     with one_blas_thread():
         parts = [scout.prime([np.concatenate(tile) for tile in zip(*looks, strict=True)])]
     del looks
@@ -313,7 +313,7 @@ def scout_set(
         # A chunk of each place and the memory of its solution.
         runtime = within_memory(what, 3 * len(places) * chunk_bytes, kept, runtime)
         task = partial(_solve_block, codes, scout)
-        parts = run_tasks(task, range(source.n_blocks), runtime, label=f"scout {name}")
+        parts = run_tasks(task, range(source.n_blocks), runtime, label=f"phases {name}")
     arrays = {name: np.concatenate([getattr(p, name) for p in parts]) for name in ("g", "dk")}
     for array, data in (arrays | {"time": source.time_s()}).items():
         cube.write_array(folder / array, data, dims=("time", "component")[: data.ndim])

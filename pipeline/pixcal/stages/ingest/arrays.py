@@ -184,7 +184,7 @@ def take_over(made: Build, kept: Sequence[Kept], runtime: Runtime) -> dict[str, 
         for k in kept
     ]
     tasks = list(zip(kept, writers, strict=True))
-    found = run_tasks(_take_over, tasks, runtime, label="unchanged")
+    found = run_tasks(_take_over, tasks, runtime, label="reused frames")
     return {k.array: facts for k, facts in zip(kept, found, strict=True) if facts is not None}
 
 
