@@ -188,7 +188,7 @@ def test_what_cannot_be_done_is_said(
     acquisition = read_json(run / "ingest" / "acquisition.json")
     acquisition["frames"] = {"bias": ["x"]}
     write_json(run / "ingest" / "acquisition.json", acquisition)
-    with pytest.raises(InputError, match="lists no fringes"):
+    with pytest.raises(InputError, match=r"lists no frames.fringes, which crests needs"):
         crests.run(run, Config(), SYNC)
 
 
