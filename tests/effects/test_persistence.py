@@ -113,6 +113,18 @@ def test_traps_are_found_again_by_frames_or_by_time(
     assert unit == ("s" if in_seconds else "frames")
 
 
+def test_bias_frames_without_time_stamps_hide_no_charge_of_traps() -> None:
+    """Light may have come at any time of flats without them; bias frames are placed first."""
+    whole = recorded(0.01, lambda t: float(np.exp(-t / 50)))
+    found = []
+    for kind in ("bias", "flat"):
+        stacks = [replace(s, start_s=np.nan) if s.kind == kind else s for s in whole.stacks]
+        found.append(persistence(replace(whole, stacks=tuple(stacks))))
+    assert found[0] is not None
+    assert abs(found[0].share - 0.01) < 4 * found[0].share_error < 1e-3
+    assert found[1] is None
+
+
 def test_flats_of_the_first_level_may_be_repeated_at_the_end() -> None:
     found = persistence(recorded(0.01, lambda t: float(np.exp(-t / 50)), repeats=4))
     assert found is not None

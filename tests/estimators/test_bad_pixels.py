@@ -7,6 +7,7 @@ from scipy.special import polygamma
 from scipy.stats import chi2
 
 from pixcal.estimators.detector.bad_pixels import (
+    certainly_noisy,
     dead,
     hot,
     noisy,
@@ -14,7 +15,7 @@ from pixcal.estimators.detector.bad_pixels import (
     nonlinear,
     variance_nearby,
 )
-from pixcal.estimators.detector.calibration import ExposureLevel, step_levels
+from pixcal.estimators.detector.calibration import ExposureLevel, step_levels, usual_variance
 
 F64 = NDArray[np.float64]
 CLEAN = (1200, 1000)
@@ -192,6 +193,21 @@ def test_a_population_of_pixels_that_differ_is_not_noisy(spread: float, dof: int
     by_chance = 0.5 * polygamma(1, dof / 2) ** 0.5
     reach = np.exp(4 * np.hypot(spread, by_chance))
     assert factor == pytest.approx(max(1.5, reach), rel=0.05)
+
+
+@pytest.mark.parametrize("dof", [2, 4, 7])
+@pytest.mark.parametrize("spread", [0.0, 0.3])
+def test_few_frames_take_no_population_for_noisy_pixels(spread: float, dof: int) -> None:
+    rng = np.random.default_rng(7)
+    noise = 3 * rng.lognormal(0, spread, (200, 300))
+    variance = noise**2 * rng.chisquare(dof, noise.shape) / dof
+    same = np.ones_like(variance)
+    factor = noisy_factor(1.5, variance, dof, 1.0)
+    if not spread:  # as if no factor was asked for
+        assert factor == pytest.approx(float(certainly_noisy(dof)) ** 0.5, rel=0.05)
+    expected = usual_variance(variance, dof) * same
+    found = noisy(variance, dof * same, expected, np.nan * same, 0 * same, factor)
+    assert found.mean() < 1e-3
 
 
 @pytest.mark.parametrize("dof", [20, 60, 500])

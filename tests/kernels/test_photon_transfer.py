@@ -395,7 +395,7 @@ def test_partial_blocks_are_blocks_if_they_are_large_enough() -> None:
 
 
 @pytest.mark.quick(1)
-@pytest.mark.parametrize("above", [3e3, 1e4])
+@pytest.mark.parametrize("above", [700.0, 3e3, 1e4])
 @pytest.mark.parametrize("levels", [11, 16])
 def test_a_second_amplifier_for_bright_pixels_leaves_the_gain(above: float, levels: int) -> None:
     rng, pixels = np.random.default_rng(levels), 2e5

@@ -226,6 +226,23 @@ def test_levels_that_some_pixels_fill_are_left_out(tmp_path: Path) -> None:
     assert report["saturation_adu"]["full_frames"] == list(range(4 * 10, 4 * 12))
 
 
+@pytest.mark.parametrize("above", [1500, 3000])
+def test_flats_that_another_amplifier_reads_are_not_compared(tmp_path: Path, above: float) -> None:
+    """Bright pixels of a dual-gain camera have more read noise; the gain is that of dim ones."""
+    rng = np.random.default_rng(3)
+    camera = Detector(
+        **CAMERA,
+        flats=ladder([(t, 1) for t in LEVELS], 4),
+        response=lambda e: e + (e > above) * rng.normal(0, 60, e.shape),
+    )
+    _, report = reduced(camera, 6, tmp_path)
+    assert report["gain_e_per_adu"]["measured"] == pytest.approx(2.3, rel=0.02)
+    below = sum(8000 * t < above for t in LEVELS)
+    found = set(report["saturation_adu"]["frames_above_step"])
+    assert set(range(4 * below, 4 * len(LEVELS))) <= found
+    assert not found & set(range(4))
+
+
 def test_dim_levels_are_not_full_where_the_wells_are(tmp_path: Path) -> None:
     """At the dimmest level the read noise is as large as the signal, and outweighs the photons'."""
     well, lamps = 10_000.0, np.linspace(0.01, 1.08, 23)
@@ -371,3 +388,17 @@ def test_row_noise_with_a_repeat_shows_at_its_distance(tmp_path: Path) -> None:
         correlation = np.concatenate([after[name, DETECTOR].value for name in names])
         for step in ((2, 0), (0, 1)):
             assert abs(correlation[STEPS.index(step)]) < 0.01
+
+
+@pytest.mark.parametrize("stated", [10.0, 0.0004])
+def test_a_flat_whose_light_contradicts_its_exposure_time_is_left_out(stated: float) -> None:
+    times = np.repeat([0.004, 0.02, 0.1, 0.3, 0.5, 0.7, 1.3], 2)
+    levels = np.minimum(4000 * times, 3800)  # the last are full
+    right = times.copy()
+    assert not FlatSurvey(levels, None).mistimed([*right]).any()
+    times[0] = stated
+    np.testing.assert_array_equal(np.flatnonzero(FlatSurvey(levels, None).mistimed([*times])), [0])
+    # A lamp that is set anew for each exposure time contradicts none, nor do unknown times.
+    set_anew = levels * np.repeat([1, 3, 0.5, 1, 2, 0.2, 1], 2)
+    assert not FlatSurvey(set_anew, None).mistimed([*right]).any()
+    assert not FlatSurvey(levels, None).mistimed([None] * len(levels)).any()

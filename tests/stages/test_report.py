@@ -15,6 +15,7 @@ from PIL import Image
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.report import page as page_module
+from pixcal.report.summary import detector_headline
 from pixcal.stages import report
 from pixcal.storage.artefact import build
 from pixcal.storage.cube import create_group, write_array
@@ -469,6 +470,14 @@ def test_without_a_fit_the_detector_is_shown(tmp_path: Path, sets: tuple[str, ..
     assert "<img" in section(page, "detector")
     for name in of_fringes[:4] if sets else ():
         assert "there is no fit; run 'pixcal fit RUN'" in words(section(page, name))
+
+
+def test_a_gain_far_off_the_declared_one_is_told_at_once() -> None:
+    gain = {"declared": 3.64, "measured": 2.592, "error": 0.015, "used": 3.64}
+    told = "The detector: gain 2.592 ± 0.015 e⁻/ADU instead of the declared 3.640."
+    assert detector_headline({"gain_e_per_adu": gain}) == told
+    for near in ({"declared": 2.6}, {"error": 0.4}):
+        assert "declared" not in detector_headline({"gain_e_per_adu": gain | near})
 
 
 @pytest.mark.usefixtures("without_figures")

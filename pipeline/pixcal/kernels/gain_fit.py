@@ -37,6 +37,7 @@ _CURVED = 0.05  # probability of a straight line below which the curve is curved
 _SPARE, _RANGE = 3, 3.0
 _ITERATIONS = 5
 _OFF_CURVE = 1e-6  # chance of a misfit beyond which a curve may have a step
+_FEWEST = 2  # points below a step: with the noise without light, they check each other
 _SHORTER = 1.5  # factor between the ranges that are tried then
 
 
@@ -111,16 +112,15 @@ def fit_gain(
         return found and replace(found, error=math.hypot(found.error, common * found.gain))
 
     whole = up_to(highest)
-    if whole is None or straight or whole.chance > _OFF_CURVE:
+    if straight or (whole is not None and whole.chance > _OFF_CURVE):
         return whole
-
-    def points(top: float) -> int:
-        return int(np.count_nonzero((sums[:, 1] > 0) & (sums[:, 1] <= top * sums[:, 0])))
-
-    best, top = whole, whole.levels[1] / _SHORTER
-    while points(top) >= _SPARE:
+    level = np.divide(sums[:, 1], sums[:, 0], where=sums[:, 0] > 0, out=np.zeros(len(sums)))
+    level = level[(level > 0) & (level <= highest)]
+    best, top = whole, float(level.max(initial=0.0)) / _SHORTER
+    while np.count_nonzero(level <= top) >= _FEWEST:
         found = up_to(top)
-        if found is not None and found.chance > _OFF_CURVE and found.error < best.error:
+        better = found is not None and (best is None or found.error < best.error)
+        if found is not None and better and found.chance > _OFF_CURVE:
             best = replace(found, step=True)
         top /= _SHORTER
     return best

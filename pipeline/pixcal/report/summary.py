@@ -14,6 +14,8 @@ TARGET_PX = 5e-5  # target precision of a calibration (paper, section 4.2)
 # offset of the fibres that a laboratory would notice: twice its 2 cm (paper, section 5.2)
 FAR_MM = 40.0
 
+_OFF = 0.05  # relative difference of a measured value from the declared one that is told at once
+
 GOOD, CHECK, BAD = SEVERITY = ("good", "check", "bad")
 
 
@@ -70,6 +72,11 @@ def detector_headline(facts: dict[str, Any]) -> str:
             parts.append(f"{name} {with_error(known['measured'], known.get('error'))} {of}")
         elif known.get("used") is not None:
             parts.append(f"{name} {number(known['used'], 4)} {of} (declared)")
+        declared, measured = known.get("declared"), known.get("measured")
+        if declared and measured is not None:
+            error = 3 * (known.get("error") or 0.0)
+            if abs(measured - declared) > max(error, _OFF * declared):
+                parts[-1] += f" instead of the declared {number(declared, 4)}"
     return f"The detector: {', '.join(parts)}." if parts else "The detector was not measured."
 
 

@@ -183,17 +183,17 @@ def _period(time_s: F64) -> float:
 
 
 def _starts(evidence: Evidence, sets: Sequence[FringeEvidence]) -> dict[str | int, float]:
-    """Start of each recording after that of the acquisition, s; in order if unknown."""
-    known = [*(s.start_s for s in evidence.stacks), *(s.start_s for s in sets)]
-    in_order = not np.isfinite(known).all()
-    found: dict[str | int, float] = {}
-    clock = 0.0
-    for n, stack in enumerate(evidence.stacks):
-        found[n] = clock if in_order else stack.start_s + float(stack.time_s[0])
-        clock += len(stack.adu) * _period(stack.time_s)
-    for s in sets:
-        found[s.name] = clock if in_order else s.start_s
-        clock += float(s.time_s[-1]) + _period(s.time_s)
+    """Start of each recording after that of the acquisition, s; unknown ones come first."""
+    spans: dict[str | int, tuple[float, float]] = {
+        n: (s.start_s + float(s.time_s[0]), len(s.adu) * _period(s.time_s))
+        for n, s in enumerate(evidence.stacks)
+    }
+    spans |= {s.name: (s.start_s, float(s.time_s[-1]) + _period(s.time_s)) for s in sets}
+    before = sum(span for start, span in spans.values() if not np.isfinite(start))
+    found, clock = {}, 0.0
+    for name, (start, span) in spans.items():
+        found[name] = start + before if np.isfinite(start) else clock
+        clock += span * (not np.isfinite(start))
     return found
 
 

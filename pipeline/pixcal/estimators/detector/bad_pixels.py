@@ -7,7 +7,7 @@ can cause: on a perfect detector fewer than one pixel in 10⁵ is flagged.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtri, polygamma
 
 from pixcal.estimators.detector.calibration import MIN_STEPS, ExposureLevel
 from pixcal.kernels.robust import lit, median_and_sigma
@@ -164,10 +164,15 @@ def noisy_factor(least: float, variance: F64, dof: int, quantum: float) -> float
     (ADU²), with ``dof``. ``quantum``: step of the samples (ADU).
     """
     known = variance[variance > 0]
-    if dof < _SPREAD_DOF or not known.size or np.median(known) < quantum**2:
+    if dof < 1 or not known.size or np.median(known) < quantum**2:
         return least
     # Includes the sampling scatter of the variances, which moves pixels as far.
-    return max(least, float(np.exp(_POPULATION * median_and_sigma(np.log(known))[1] / 2)))
+    spread = median_and_sigma(np.log(known))[1]
+    reach = _POPULATION * spread
+    if dof < _SPREAD_DOF:  # that scatter dominates, and is far from log-normal
+        own = max(spread**2 - float(polygamma(1, dof / 2)), 0.0) ** 0.5
+        reach = float(np.hypot(_POPULATION * own, np.log(certainly_noisy(dof))))
+    return max(least, float(np.exp(reach / 2)))
 
 
 def nonlinear(steps: Sequence[ExposureLevel], levels: F64, limit: float) -> Mask:

@@ -98,7 +98,7 @@ def released_late(levels: Levels, least: float) -> tuple[Persistence, list[F64]]
     The flats decide whether the release follows time or the number of frames. Also the mean charge
     released in the frames of each series, e-. ``least``: smallest variance of a frame's mean, e-².
     """
-    sequence = _sequence(levels)
+    sequence = _sequence([one for one in levels if _placed(one[0])])
     if sequence is None:
         return None
     light = np.concatenate(
@@ -124,7 +124,13 @@ def released_late(levels: Levels, least: float) -> tuple[Persistence, list[F64]]
     if best.share <= _SURE * best.share_error:
         return None
     late = sequence.of_light(best).late(best)
-    return best, [late[at] for _, at, _ in sequence.places]
+    placed = iter(late[at] for _, at, _ in sequence.places)
+    return best, [next(placed) if _placed(s) else np.zeros(len(means)) for s, means in levels]
+
+
+def _placed(stack: Stack) -> bool:
+    """Whether a series must have, or has, a place in time: light may have come at any other."""
+    return stack.kind == "flat" or bool(np.isfinite(stack.start_s))
 
 
 def told_from_drift(levels: Levels, late: Sequence[F64], least: float) -> bool:
@@ -134,12 +140,12 @@ def told_from_drift(levels: Levels, late: Sequence[F64], least: float) -> bool:
     of the session on; and the steps from frame to frame after light must follow it, which those of
     a random walk do not. ``late``, ``least``: as `released_late` gives and takes them.
     """
-    start = min(float(s.start_s + s.time_s[0]) for s, _ in levels)
+    start = min(float(s.start_s + s.time_s[0]) for s, _ in levels if _placed(s))
     light = min(float(s.start_s + s.time_s[0]) for s, _ in levels if s.kind == "flat")
     unlit = [
         (s.start_s + s.time_s - start, means, own)
         for (s, means), own in zip(levels, late, strict=True)
-        if s.kind != "flat"
+        if s.kind != "flat" and _placed(s)
     ]
     rest = np.concatenate([_about_mean(means - own) for _, means, own in unlit])
     freedom = len(rest) - len(unlit) - _PARAMETERS

@@ -74,7 +74,10 @@ def prepare_input(
     tables, fringes = frames.tables, bool(frames.acquisition.frames.fringes)
     first, parts = chosen_windows(shape, 0 if fringes else frames_of_half(tables))
     pixels = (first[0][1] - first[0][0]) * (first[1][1] - first[1][0])
-    own = split(tables, pixels, reduced["saturation_adu"].get("full_frames", ()))
+    # The nominal bench has one gain, and pixels that are not full.
+    ends = reduced["saturation_adu"]
+    other = (n for key in ("full_frames", "frames_above_step") for n in ends.get(key, ()))
+    own = split(tables, pixels, sorted(other))
     _enough(own.test)
     runtime, few, room = _memory(own.test, pixels, runtime)
     windows: list[Window] = []

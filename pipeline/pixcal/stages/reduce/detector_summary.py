@@ -59,6 +59,12 @@ class Summary:
     well: Measure | None  # level of its maximum (ADU above bias), if the flats go beyond
     linearity: Straightness | None  # of the usable steps
 
+    @property
+    def above_step(self) -> Mask:
+        """Steps of the flats that are read at another gain, as in a dual-gain camera."""
+        top = self.gain.levels[1] if self.gain and self.gain.step else np.inf
+        return np.asarray(self.levels > top)
+
     def gain_to_use(self, choice: str) -> float:
         """Gain (e-/ADU), ``declared`` or ``measured``; InputError if there is no measured one."""
         declared = self.declared.gain_e_per_adu

@@ -88,7 +88,8 @@ def _gain_warnings(fit: GainFit, summary: Summary, used: float, filtered: bool) 
         warnings.append(
             f"the photon-transfer curve is not smooth above {fit.levels[1]:.0f} ADU, as in a "
             "camera that reads bright pixels at another gain (dual gain, HDR): the reported gain "
-            "applies below this level; gain and noise of brighter pixels are not measured"
+            "applies below this level; gain and noise of brighter pixels are not measured, and the "
+            "diagnosis leaves brighter flats out"
         )
     if fit.without_dark:
         warnings.append(

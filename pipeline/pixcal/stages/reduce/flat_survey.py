@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from pixcal.estimators.detector.calibration import MIN_STEPS
 from pixcal.model.arrays import F64, I64, Mask
 from pixcal.model.errors import InputError
 from pixcal.storage.frame_reader import Reader
@@ -36,6 +37,7 @@ JUMP, NOTABLE = 20.0, 0.1
 OUTLIER = 9.0  # median deviations above which a difference of two frames is not noise
 PILED = 4  # least ratio of samples at a pile to those at any of these codes
 WIDE = 4.0  # codes between one sigma below and above in flats that are not full, to know full ones
+_STEADY_LAMP = 0.25  # largest relative difference of the light per second of a steady lamp
 _ONE_SIGMA = tuple(ndtr([-1.0, 1.0]))
 
 
@@ -65,6 +67,18 @@ class FlatSurvey:
         frame = int(self.levels.argmax())
         least = share * float(self.levels[frame])
         return (frame, least) if self.noise and least > _CLEAR * self.noise else None
+
+    def mistimed(self, exposures: Sequence[float | None]) -> Mask:
+        """Flats (t,) of a steady lamp, few of many, whose light contradicts their exposure time."""
+        times = np.array([t if t else np.nan for t in exposures], float)
+        rates = self.levels / times
+        # Full pixels gather less light than their time would give.
+        faint = self.levels < self.levels.max() / 2
+        usual = float(np.median(rates[known])) if (known := faint & (rates > 0)).any() else np.nan
+        off = (rates > 2 * usual) | (faint & (rates < usual / 2))
+        rest = np.abs(rates[known & ~off] / usual - 1)
+        many = len(np.unique(times[known & ~off])) >= MIN_STEPS and 10 * off.sum() <= len(off)
+        return off if many and rest.max() < _STEADY_LAMP else np.zeros(len(off), np.bool_)
 
     def of_frames(self, numbers: Sequence[int]) -> "FlatSurvey":
         """The survey of some of the flats."""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pixcal.model.acquisition import Detector
+from pixcal.model.arrays import Mask
 from pixcal.model.errors import InputError
 from pixcal.stages.reduce import flat_survey
 from pixcal.stages.reduce.black_cut_off import Black, CutOff, cut_offs
@@ -24,6 +25,12 @@ from pixcal.storage.manifest import read_json, read_manifest
 from pixcal.storage.place import Local, Place
 from pixcal.storage.stage import read_acquisition
 
+# reasons to leave flats out, and what to do
+_UNLIT = "without light", "list them under frames.dark or frames.bias if they are to be used"
+_MISTIMED = (
+    "whose light contradicts their EXPTIME, while that of all others follows it,",
+    "correct their EXPTIME (for TIFF and PNG in headers.csv) if they are to be used",
+)
 MOST_ADU = 2.0**32  # above any converter's range: larger real numbers are not samples
 
 
@@ -76,13 +83,24 @@ class Ingested:
         return found
 
     @cached_property
-    def _used(self) -> dict[str, list[int]]:
-        """Numbers of the frames that are used: no flats without light."""
+    def _left_out(self) -> dict[tuple[str, str], Mask]:
+        """Which flats are not used, by the reason."""
         # Parts of a run, and simulations, keep the flats of the whole.
         if self._all_flats is None or self.black is not None:
+            return {}
+        times = self._catalogue["flat"]["exptime_s"]
+        return {
+            _UNLIT: ~self._all_flats.lit,
+            _MISTIMED: self._all_flats.mistimed([times[n] for n in self._whole["flat"]]),
+        }
+
+    @cached_property
+    def _used(self) -> dict[str, list[int]]:
+        """Numbers of the frames that are used."""
+        if not self._left_out:
             return self._whole
-        numbers = zip(self._whole["flat"], self._all_flats.lit, strict=True)
-        return self._whole | {"flat": [n for n, lit in numbers if lit]}
+        numbers = np.array(self._whole["flat"])
+        return self._whole | {"flat": numbers[~np.any([*self._left_out.values()], axis=0)].tolist()}
 
     @cached_property
     def _listed(self) -> dict[str, dict[str, list[Any]]]:
@@ -118,9 +136,10 @@ class Ingested:
     def survey(self) -> FlatSurvey | None:
         """Survey of the flats; None without flats."""
         every = self._all_flats
-        if every is None or self.black is not None:
+        if every is None or not self._left_out:
             return every
-        return every.of_frames(np.flatnonzero(every.lit).tolist())
+        used = ~np.any([*self._left_out.values()], axis=0)
+        return every.of_frames(np.flatnonzero(used).tolist())
 
     @cached_property
     def exposures(self) -> Exposures:
@@ -131,21 +150,18 @@ class Ingested:
                 "dark frames have no EXPTIME and are of several levels: not used; write exposure "
                 "times into the headers (for TIFF and PNG into headers.csv)"
             )
-        found.warnings += self._unlit_warning()
+        found.warnings += [
+            f"flat frames {reason[0]} are left out ({mask.sum()} of {len(mask)}): "
+            f"{first_few(self._names_of_flats(mask))}; {reason[1]}"
+            for reason, mask in self._left_out.items()
+            if mask.any()
+        ]
         return found
 
-    def _unlit_warning(self) -> list[str]:
-        """Warning on flats that are left out as they hold no light."""
-        unlit = sorted(set(self._whole.get("flat", ())) - set(self._used.get("flat", ())))
-        if not unlit:
-            return []
+    def _names_of_flats(self, mask: Mask) -> list[str]:
         table = self._catalogue["flat"]
-        cubes = any(table["plane"])
-        names = [table["file"][n] + f" [{table['plane'][n]}]" * cubes for n in unlit]
-        return [
-            f"flat frames without light are left out ({len(unlit)} of {len(self._whole['flat'])}): "
-            f"{first_few(names)}; list them under frames.dark or frames.bias if they are to be used"
-        ]
+        numbers = np.array(self._whole["flat"])[mask]
+        return [table["file"][n] + f" [{table['plane'][n]}]" * any(table["plane"]) for n in numbers]
 
     @cached_property
     def arrays(self) -> Mapping[str, Reader]:
@@ -250,9 +266,9 @@ class Ingested:
 
 
 def starts_of(tables: Mapping[str, Mapping[str, list[Any]]]) -> dict[str, float]:
-    """Time of frame 0 of each array after the first of all, s; nan where one is unknown."""
+    """Time of frame 0 of each array after the first known one, s; nan where it is unknown."""
     begin = {name: begin_mjd(table) for name, table in tables.items()}
-    first = np.min(list(begin.values()))
+    first = min((day for day in begin.values() if np.isfinite(day)), default=np.nan)
     return {name: float(day - first) * DAY_S for name, day in begin.items()}
 
 

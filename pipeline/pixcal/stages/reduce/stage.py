@@ -15,6 +15,7 @@ import numpy as np
 
 from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
+from pixcal.model.arrays import Mask
 from pixcal.model.config import result_options
 from pixcal.model.errors import InputError
 from pixcal.model.flags import PixelFlag
@@ -261,12 +262,8 @@ def _report(
             "found": source.saturation_found,
             "used": job.saturation if math.isfinite(job.saturation) else None,
             "levels_left_out": int((~summary.usable).sum()),
-            "full_frames": sorted(
-                frame
-                for group, full in zip(source.exposures.flat, summary.full, strict=True)
-                for frame in group.frames
-                if full
-            ),
+            "full_frames": _flats(source, summary.full),
+            "frames_above_step": _flats(source, summary.above_step),
         },
         "flags": _count_flags(made.folder / "calibration.zarr" / "mask", source.shape),
         "quantisation": {name: facts.pop("quantisation") for name, facts in sets.items()},
@@ -276,6 +273,12 @@ def _report(
     report["figures_of_merit"] = characterise(made, source, job, summary, nearby, report, runtime)
     write_json(made.folder / "reduce.json", report)
     made.summary.update({key: report[key] for key in ("gain_e_per_adu", "flags", "warnings")})
+
+
+def _flats(source: Ingested, levels: Mask) -> list[int]:
+    """Numbers of the flats of some levels (step,)."""
+    chosen = zip(source.exposures.flat, levels, strict=True)
+    return sorted(frame for group, own in chosen if own for frame in group.frames)
 
 
 def _dark_lines(mask: ArrayReader, shape: tuple[int, int]) -> list[str]:
