@@ -243,6 +243,22 @@ def test_flats_that_another_amplifier_reads_are_not_compared(tmp_path: Path, abo
     assert not found & set(range(4))
 
 
+@pytest.mark.parametrize("fraction", [0.0, 0.5])
+@pytest.mark.parametrize("noise", [0.28, 0.4])
+def test_rounding_leaves_the_spread_of_the_bias(
+    tmp_path: Path, noise: float, fraction: float
+) -> None:
+    """The mean of samples rounded to steps of twice the noise follows the level in a staircase."""
+    offset = {"noise": 2.3 * noise, "scatter": 0.15, "bias": 200 + fraction, "dark": 0.0}
+    camera = Detector(**CAMERA | offset, flats=ladder([(t, 1) for t in LEVELS]))
+    _, report = reduced(camera, 3, tmp_path)
+    found = report["figures_of_merit"]
+    assert ("read_noise" in found) == (noise > 0.35)
+    value, error = (found["dsnu"][key] for key in ("value", "error"))
+    assert abs(value - 2.3 * 0.15) < 3 * error
+    assert error < (0.02 if noise > 0.35 else 0.6) * value
+
+
 def test_dim_levels_are_not_full_where_the_wells_are(tmp_path: Path) -> None:
     """At the dimmest level the read noise is as large as the signal, and outweighs the photons'."""
     well, lamps = 10_000.0, np.linspace(0.01, 1.08, 23)

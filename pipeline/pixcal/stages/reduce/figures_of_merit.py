@@ -13,6 +13,7 @@ from pixcal.engine.run import Runtime
 from pixcal.estimators.detector import emva
 from pixcal.estimators.detector.emva import Measure, Nonuniformity
 from pixcal.estimators.detector.pair_noise import shared_by_lines
+from pixcal.kernels.rounding import level_before_rounding
 from pixcal.model.arrays import F64, Mask
 from pixcal.report.text import with_error
 from pixcal.stages.reduce.dark_current import dark_current
@@ -70,8 +71,19 @@ def characterise(
     of_noise = {"gain": gain[0] / excess, "read_variance": (noise or (0.0,))[0] ** 2}
     curves["photon_transfer"] |= of_noise
     if halves.dark is not None:
-        electrons = halves.dark * gain[0]
-        facts["warnings"] += _spread(found, curves, "dsnu", "e-", electrons, halves.good)
+        step = source.quantum or 1e-9
+        sigma = summary.noise_before_rounding_e(gain[0]) / gain[0] / step
+        own = step * level_before_rounding(halves.dark / step, sigma)
+        both = [gain[0] * levels for levels in (halves.dark, own)]
+        known = summary.before_rounding is not None
+        facts["warnings"] += _spread(found, curves, "dsnu", "e-", both[known], halves.good)
+        if not known:
+            # How far the mean of rounded samples follows the level is not known.
+            other: Json = {}
+            _spread(other, {}, "dsnu", "e-", both[1], halves.good)
+            for name, figure in other.items():
+                left = figure["value"] - found[name]["value"]
+                found[name]["error"] = math.hypot(found[name]["error"], left)
         if source.exposures.read_series and source.exposures.read_series.array in source.cut_off:
             said = found["dsnu"]["note"], "lower limit: dark pixels are cut off at the lowest code"
             found["dsnu"]["note"] = "; ".join(filter(None, said))
