@@ -19,7 +19,7 @@ from pixcal.report.text import with_error
 from pixcal.stages.reduce.dark_current import dark_current
 from pixcal.stages.reduce.detector_summary import Summary, pair_sums
 from pixcal.stages.reduce.frame_statistics import Measuring
-from pixcal.stages.reduce.halves import middle_of, read_halves
+from pixcal.stages.reduce.halves import Halves, middle_of, read_halves
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduce.outputs import outputs_of, report_outputs
 from pixcal.stages.reduce.read_noise import Nearby
@@ -71,19 +71,7 @@ def characterise(
     of_noise = {"gain": gain[0] / excess, "read_variance": (noise or (0.0,))[0] ** 2}
     curves["photon_transfer"] |= of_noise
     if halves.dark is not None:
-        step = source.quantum or 1e-9
-        sigma = summary.noise_before_rounding_e(gain[0]) / gain[0] / step
-        own = step * level_before_rounding(halves.dark / step, sigma)
-        both = [gain[0] * levels for levels in (halves.dark, own)]
-        known = summary.before_rounding is not None
-        facts["warnings"] += _spread(found, curves, "dsnu", "e-", both[known], halves.good)
-        if not known:
-            # How far the mean of rounded samples follows the level is not known.
-            other: Json = {}
-            _spread(other, {}, "dsnu", "e-", both[1], halves.good)
-            for name, figure in other.items():
-                left = figure["value"] - found[name]["value"]
-                found[name]["error"] = math.hypot(found[name]["error"], left)
+        facts["warnings"] += _dsnu(found, curves, halves, summary, gain[0], source.quantum)
         if source.exposures.read_series and source.exposures.read_series.array in source.cut_off:
             said = found["dsnu"]["note"], "lower limit: dark pixels are cut off at the lowest code"
             found["dsnu"]["note"] = "; ".join(filter(None, said))
@@ -193,6 +181,25 @@ def _full_well(
 _TITLES = {"dsnu": "DSNU", "prnu": "PRNU"}
 _ALTERNATES = 6.0  # least difference of even and odd lines to report, in its errors
 _ALTERNATING_SHARE = 0.04  # least share of its square in the variance of the map
+
+
+def _dsnu(
+    found: Json, curves: Json, halves: Halves, summary: Summary, gain: float, quantum: float
+) -> list[str]:
+    """Add DSNU before rounding, or with an error of how far rounded means follow the level."""
+    assert halves.dark is not None
+    step = quantum or 1e-9
+    sigma = summary.noise_before_rounding_e(gain) / gain / step
+    own = gain * step * level_before_rounding(halves.dark / step, sigma)
+    if summary.before_rounding is not None:
+        return _spread(found, curves, "dsnu", "e-", own, halves.good)
+    other: Json = {}
+    _spread(other, {}, "dsnu", "e-", own, halves.good)
+    warnings = _spread(found, curves, "dsnu", "e-", gain * halves.dark, halves.good)
+    for name, figure in other.items():
+        left = figure["value"] - found[name]["value"]
+        found[name]["error"] = math.hypot(found[name]["error"], left)
+    return warnings
 
 
 def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: Mask) -> list[str]:
