@@ -9,7 +9,7 @@ from all_frames import frames_of
 
 from pixcal.effects.gain_error import GainError
 from pixcal.estimators.detector.flat_noise import shot_share_of_flats
-from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.model.bench import Bench
 from pixcal.simulation.recording import recordings
 
@@ -115,10 +115,24 @@ def test_levels_of_a_lamp_that_was_changed_do_not_bend_the_gain(
         # A lamp brighter by a quarter at the top, and set anew for each level.
         time = 0.01 * n * (1 - 0.25 * n / 9 + 0.01 * off)
         adu = (electrons / whole.gain + whole.bias).astype(np.float32)
-        flats.append(replace(one, adu=adu, exptime_s=time, time_s=one.time_s[:2]))
+        two = replace(one, frame=one.frame[:2], time_s=one.time_s[:2])
+        flats.append(replace(two, adu=adu, exptime_s=time))
     stacks = (*(s for s in whole.stacks if s.kind != "flat"), *flats)
     share, error = shot_share_of_flats(replace(whole, stacks=stacks)) or (0.0, 0.0)
     assert abs(share - 1) < 4 * error < 0.2
+
+
+def test_a_lamp_whose_pattern_drifts_adds_no_noise(acquired: Callable[..., Evidence]) -> None:
+    whole = replace(acquired(), fringes={})
+
+    def drifting(stack: Stack) -> Stack:
+        wave = np.cos(2 * np.pi * np.arange(stack.adu.shape[2]) / 30)
+        course = 0.02 * np.linspace(-1, 1, len(stack.adu))
+        return replace(stack, adu=stack.adu * (1 + course[:, None, None] * wave).astype(np.float32))
+
+    stacks = tuple(drifting(s) if s.kind == "flat" else s for s in whole.stacks)
+    share, error = shot_share_of_flats(replace(whole, stacks=stacks)) or (0.0, 0.0)
+    assert abs(share - 1) < 3 * error < 0.05
 
 
 @pytest.mark.parametrize("factor", [1.0, 20.0, 200.0])

@@ -1,8 +1,9 @@
 """Order of frames in a recording by their numbers: consecutive frames, and gaps."""
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 
-from pixcal.model.arrays import Indices, Mask
+from pixcal.model.arrays import F32, Indices, Mask
 
 
 def runs(numbers: Indices) -> list[tuple[int, int]]:
@@ -31,3 +32,10 @@ def since_gap(numbers: Indices, steps: int) -> Mask:
     begins = np.flatnonzero(~follows(numbers))
     place = np.arange(len(numbers))
     return np.asarray(place - begins[np.searchsorted(begins, place, "right") - 1] < steps)
+
+
+def slow_courses(frame: Indices) -> F32:
+    """Orthonormal courses (t, k) of light that drifts slowly, a constant first, by frame number."""
+    past = (frame - frame[0]) / max(int(frame[-1] - frame[0]), 1)
+    courses = legvander(2 * past - 1, min(3, (len(frame) - 1) // 8))
+    return np.linalg.qr(courses)[0].astype(np.float32)

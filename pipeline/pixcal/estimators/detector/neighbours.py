@@ -15,6 +15,7 @@ import numpy as np
 from pixcal.estimators.diagnosis.distortions import Freedom, TwoWay
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, cached_on_evidence
 from pixcal.kernels.boundaries import REACH, boundary_pushes, shared_noise
+from pixcal.kernels.frame_order import slow_courses
 from pixcal.kernels.line_means import without_line_means
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F32, F64
@@ -154,8 +155,8 @@ def _of_flats(stack: Stack, evidence: Evidence) -> Iterator[NoiseBlock]:
     # Copies, not views: for views the kernels would be compiled a second time.
     variance = np.repeat((charge + np.float32(evidence.read_noise**2))[None], len(frames), 0)
     weight = np.where(good, 1 / variance, np.float32(0)).reshape(len(frames), -1)
-    level = np.ones((1, len(frames)), np.float32)
-    freedom = TwoWay(weight, level, light.reshape(1, -1).astype(np.float32))
+    courses = np.ascontiguousarray(slow_courses(stack.frame).T)
+    freedom = TwoWay(weight, courses, light.reshape(1, -1).astype(np.float32))
     noise = without_line_means(frames - charge, good)
     residual = freedom.left_over(noise.reshape(weight.shape))
     residual[np.abs(residual) * np.sqrt(weight) > _CLIP] = 0
@@ -163,7 +164,7 @@ def _of_flats(stack: Stack, evidence: Evidence) -> Iterator[NoiseBlock]:
     yield NoiseBlock(
         residual.reshape(frames.shape), variance.astype(np.float32),
         np.repeat(charge[None], len(frames), 0), freedom.frame_covariance.astype(np.float32),
-        freedom.of_place.reshape(1, *good.shape), 1 - 1 / len(frames),
+        freedom.of_place.reshape(1, *good.shape), 1 - len(courses) / len(frames),
     )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack, cached_on_evidence
+from pixcal.kernels.frame_order import slow_courses
 from pixcal.kernels.line_means import without_line_means
 from pixcal.kernels.residual_sums import residual_sums
 from pixcal.kernels.robust import robust_sigma
@@ -181,14 +182,19 @@ def _of_stack(evidence: Evidence, stack: Stack) -> F64 | None:
     ones = np.ones(level.shape)
     # Noise that every second row shares does not average out over few frames.
     residual = without_line_means(frames - brighter, good)
+    # A lamp that drifts, with its shape, is no noise either.
+    slow = slow_courses(stack.frame)
+    residual -= np.tensordot(slow, np.tensordot(slow, residual, (0, 0)), 1)
+    residual /= np.sqrt(1 - (slow**2).sum(axis=1))[:, None, None]
+    nothing = np.zeros((len(frames), 1))
     sums = residual_sums(
         residual,
         usual + brighter,
         scale * ones,
         evidence.read_noise**2 * ones,
         good,
-        np.ones((len(frames), 1)),
-        (noise / len(frames))[None],
+        nothing,
+        nothing[:1, :, None] * noise,
         np.full(len(STEPS), 1 / pixels),
         STEPS,
         CLIP,
