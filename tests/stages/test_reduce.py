@@ -672,12 +672,15 @@ def test_a_range_that_needs_coarse_steps_is_measured_then_said(tmp_path: Path) -
     assert found["sets"]["b"]["lost_samples"] == 0
 
 
-def test_a_converter_that_ends_early_is_noticed(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("declared", "noticed"), [(None, True), (4095, False), (65535, True)])
+def test_a_converter_that_ends_early_is_noticed(
+    tmp_path: Path, declared: int | None, noticed: bool
+) -> None:
     camera = Camera(11, SMALL)
     fringes = np.minimum(camera.fringes(4), 4095)
     kinds = {"bias": (camera.take(3, 0), [0.0] * 3), "fringes/a": (fringes, [FRINGE_S] * 4)}
-    found = small(tmp_path, kinds, saturation_adu=None)
-    assert any("declare detector.saturation_adu" in w for w in found["warnings"])
+    found = small(tmp_path, kinds, saturation_adu=declared)
+    assert any("declare detector.saturation_adu" in w for w in found["warnings"]) == noticed
 
 
 def test_saturated_flats_are_left_out(tmp_path: Path) -> None:

@@ -139,10 +139,12 @@ def share_at_mean(found: dict[str, Any], bounds: Bounds) -> float | None:
     return float(found["quantisation"]["step_e"] ** 2 / 12 / variance)
 
 
-def set_warnings(name: str, found: dict[str, Any], declared: bool, share: float) -> list[str]:
+def set_warnings(
+    name: str, found: dict[str, Any], declared: float | None, share: float
+) -> list[str]:
     """Warnings on a fringe set, given the result of `write_set`.
 
-    ``declared``: whether the saturation level is declared; ``share``: as in `write_set`.
+    ``declared``: saturation level, ADU; ``share``: as in `write_set`.
     """
     warnings = []
     cost = found["quantisation"]["share_of_variance_dark"]
@@ -152,10 +154,11 @@ def set_warnings(name: str, found: dict[str, Any], declared: bool, share: float)
             f"signal needs, add {100 * cost:.2g} % to the variance of a sample without light"
         )
     largest = found["largest_adu"]
-    if not declared and any(largest == 2**bits - 1 for bits in _CONVERTERS):
+    level = math.inf if declared is None else declared
+    if largest < level and any(largest == 2**bits - 1 for bits in _CONVERTERS):
         warnings.append(
             f"{name}: the largest sample is {largest}, the largest code of a converter; if it "
-            "saturates there, declare detector.saturation_adu"
+            f"saturates there, declare detector.saturation_adu: {largest}"
         )
     if found["mean_e"] is None:
         warnings.append(f"{name}: no usable samples: all are saturated or missing")

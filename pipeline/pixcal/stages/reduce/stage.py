@@ -246,11 +246,10 @@ def _report(
     if source.survey is not None and source.exposures.known:
         light = source.survey.levels
         warnings += lamp_warnings([(g.exptime, light[list(g.frames)]) for g in job.flat])
-    declared = source.detector.saturation_adu is not None
     warnings += trail_warnings(made.folder / "calibration.zarr", source, found.gain)
     warnings += _dark_lines(ArrayReader(made.folder / "calibration.zarr" / "mask"), source.shape)
     for name, facts in sets.items():
-        warnings += set_warnings(name, facts, declared, config.rounding_share)
+        warnings += set_warnings(name, facts, source.detector.saturation_adu, config.rounding_share)
         facts["quantisation"]["share_at_mean"] = share_at_mean(facts, found.bounds)
         facts["flags"] = _count_flags(made.cubes / "reduced.zarr" / name / "mask", source.shape)
     report = {
