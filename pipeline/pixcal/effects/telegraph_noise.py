@@ -5,10 +5,10 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from pixcal.estimators.detector.telegraph.classes import Stays
-from pixcal.estimators.detector.telegraph.dwell import LitSeries
+from pixcal.estimators.detector.telegraph.dwell import PixelSeries
 from pixcal.estimators.detector.telegraph.find import Telegraph, find_telegraph, significance
 from pixcal.estimators.detector.telegraph.moments import Series
+from pixcal.estimators.detector.telegraph.population import Stays
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import DITHER, Evidence, FringeEvidence, Stack
 from pixcal.kernels.scene import TILE, chip_map
@@ -156,10 +156,10 @@ def _estimate(cls: type[TelegraphNoise], found: Telegraph, evidence: Evidence) -
     by_law = cls(
         found.share,
         found.amplitude,
-        found.switching_s,
+        found.stays.mean_s,
         found.shape,
-        found.switching_decades,
-        found.upper,
+        found.stays.decades,
+        found.stays.upper,
     )
     effect, own = by_law, found.own
     if own is not None and len(own.pixel):
@@ -278,36 +278,34 @@ def _of_stack(stack: Stack, evidence: Evidence) -> Series | None:
     )
 
 
-def _lit(evidence: Evidence, pixels: Indices) -> list[LitSeries]:
+def _lit(evidence: Evidence, pixels: Indices) -> list[PixelSeries]:
     """Residual charge of given pixels in every fringe set."""
+    chosen = np.zeros(evidence.good.size, bool)
+    chosen[pixels] = True
     found = []
     for fringes in evidence.fringes.values():
-        own = np.zeros(fringes.good.size, bool)
-        own[pixels] = True
-        own &= np.isfinite(fringes.theta).all(axis=0).ravel()
-        chosen = replace(fringes, good=own.reshape(fringes.good.shape))
-        freedom = Freedom(chosen, LIT_HARMONICS)
-        left = freedom.left_over(freedom.of_good(chosen.residual))
-        charge = np.where(freedom.weight > 0, left, 0.0).astype(float)
+        freedom, left = _left_over(fringes, chosen.reshape(evidence.good.shape), LIT_HARMONICS)
         period = _period(fringes.time_s) if len(fringes.time_s) > 1 else 0.0
+        own, fitted = np.flatnonzero(freedom.good), freedom.of_time.T.astype(float)
         weight = freedom.weight.astype(float)
-        fitted = freedom.of_time.T.astype(float)
-        found.append(LitSeries(charge, weight, fringes.frame, period, np.flatnonzero(own), fitted))
+        found.append(PixelSeries(np.nan_to_num(left), weight, fringes.frame, period, own, fitted))
     return found
 
 
 def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Series:
     # Include pixels that the fit excluded for their noise, as these may be telegraph noise.
-    every = evidence.good & np.isfinite(fringes.theta).all(axis=0)
-    fringes = replace(fringes, good=every)
-    freedom = Freedom(fringes, HARMONICS)
-    left = freedom.left_over(freedom.of_good(fringes.residual))
-    root = np.sqrt(freedom.weight)
-    noise = np.where(root > 0, left * root, np.nan).astype(float)
+    freedom, left = _left_over(fringes, evidence.good, HARMONICS)
     sigma = float(freedom.weight[freedom.weight > 0].mean() ** -0.5)
-    return Series(
-        noise, fringes.frame, np.flatnonzero(freedom.good), sigma, _period(fringes.time_s)
-    )
+    own, noise = np.flatnonzero(freedom.good), left * np.sqrt(freedom.weight)
+    return Series(noise, fringes.frame, own, sigma, _period(fringes.time_s))
+
+
+def _left_over(fringes: FringeEvidence, pixels: Mask, harmonics: int) -> tuple[Freedom, F64]:
+    """Residual charge (t, n) of pixels that have maps, e-; NaN where there is none."""
+    good = pixels & np.isfinite(fringes.theta).all(axis=0)
+    freedom = Freedom(replace(fringes, good=good), harmonics)
+    left = freedom.left_over(freedom.of_good(fringes.residual))
+    return freedom, np.where(freedom.weight > 0, left, np.nan).astype(float)
 
 
 def _period(time_s: F64) -> float:

@@ -17,7 +17,6 @@ from pixcal.kernels.significance import sigmas_of_best
 from pixcal.model.arrays import F64, Indices, Mask
 
 NOISY = 3.0  # excess of the variance, in its own sigmas, from which a pixel is noisy
-LAGS = 1, 4  # frames apart whose products give the dwell time, and its range
 QUIET = 1 << 14  # most pixels of usual noise that are kept
 _OUTLIER = 5.0  # standard deviations
 # relative excess of the distance between quartiles of n variances over that of identical pixels,
@@ -47,8 +46,7 @@ class Moments:
     above: F64  # above, below: samples that are outliers upwards and downwards
     below: F64
     kurtosis: F64  # excess, unbiased
-    # (lag, n) mean product of frames `LAGS` apart; NaN where there are none
-    products: F64
+    product: F64  # mean product of neighbouring frames; NaN where there are none
     pairs: float  # neighbouring frames, over all but one
     samples_dof: float  # of the variance
     spread: float  # variance over pixels of the logarithm of their true variance
@@ -92,12 +90,11 @@ def moments_of(series: Series, *, hits: bool = False) -> Moments | None:
     variance = square / (n - 1)
     kurtosis = n * ((x * x) ** 2).sum(axis=0) / square**2 - 3
     kurtosis = (n - 1) / ((n - 2) * (n - 3)) * ((n + 1) * kurtosis + 6)
-    products, pairs = np.full((len(LAGS), x.shape[1]), np.nan), []
-    for own, lag in zip(products, LAGS, strict=True):
-        paired = np.flatnonzero(follows(series.frame, lag))
-        pairs.append(len(paired) / (len(x) - 1))
-        if len(paired):
-            own[:] = (x[paired] * x[paired - lag]).sum(axis=0) / (n - 1) / pairs[-1]
+    paired = np.flatnonzero(follows(series.frame))
+    pairs = len(paired) / (len(x) - 1)
+    product = np.full(x.shape[1], np.nan)
+    if len(paired):
+        product = (x[paired] * x[paired - 1]).sum(axis=0) / (n - 1) / pairs
     dof = float(np.median(n)) - 1
     centre = np.median(variance) * dof / chdtri(dof, 0.5)
     # Half the pixels lie between the quartiles, whatever the noisy ones do.
@@ -111,8 +108,8 @@ def moments_of(series: Series, *, hits: bool = False) -> Moments | None:
         above[used].astype(float),
         below[used].astype(float),
         kurtosis,
-        products / centre,
-        pairs[0],
+        product / centre,
+        pairs,
         dof,
         (wide**2 - 1) * 2 / dof if differ else 0.0,
         series.sigma * float(np.sqrt(centre)),
@@ -120,6 +117,11 @@ def moments_of(series: Series, *, hits: bool = False) -> Moments | None:
         int(np.median(n)),
         np.ones(np.count_nonzero(used)),
     )
+
+
+def all_moments(series: Sequence[Series], *, hits: bool = False) -> list[Moments]:
+    """Moments of the series that have any."""
+    return [m for s in series if (m := moments_of(s, hits=hits)) is not None]
 
 
 def _particles(noise: F64) -> Mask:
@@ -171,7 +173,7 @@ def signs(parts: Sequence[Moments]) -> Signs:
         flat -= float(part**2 @ m.kurtosis)
         flat_variance += float(part**4 @ of_kurtosis)
         # Mean and variance for white noise, exact (Moran 1948, Biometrika 35, 255).
-        stay += float(part @ (m.products[0] / m.variance + 1 / n))
+        stay += float(part @ (m.product / m.variance + 1 / n))
         stay_variance += float(part**2 @ ((n - 2) ** 2 / (n**2 * (n - 1)))) / m.pairs
         for sign, counts in ((1, m.above), (-1, m.below)):
             again, by_chance = _recur(counts)

@@ -1,33 +1,30 @@
-"""How many pixels jump, how far, and how long they stay.
+"""How many pixels jump, and how far, from the distribution of their variances.
 
-The distribution of the pixels' variances gives the share of such pixels and their mean amplitude,
-by maximum likelihood: most pixels have the common noise, a share has more, with amplitudes from a
-gamma distribution (exponential unless the data require another). Neighbouring frames give the dwell
-time.
+A pixel that jumps by A between two equally likely levels has A²/4 more variance, or less where it
+stays long or one level is rare. Maximum likelihood: most pixels have the common noise, a share has
+more, with amplitudes from a gamma distribution (exponential unless the data require another).
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import brentq, minimize
-from scipy.special import expit, gammaln, xlogy
+from scipy.optimize import minimize
+from scipy.special import expit, gammaln, logsumexp, xlogy
 
-from pixcal.estimators.detector.telegraph.classes import (
-    AMPLITUDES,
-    AmplitudeClasses,
-    Mixture,
-    Stays,
-    joined,
-    of_own_noise,
-    own_noises,
-)
 from pixcal.estimators.detector.telegraph.moments import Moments
-from pixcal.model.arrays import F64, Indices
+from pixcal.model.arrays import F32, F64
 
+AMPLITUDES = np.geomspace(0.1, 300, 90)  # grid of amplitudes over the common noise
+PLACES = (np.arange(5) + 0.5) / 5  # of pixels in the range of dwell times
+_DRAWN, _FEWEST_DRAWN = 30_000, 600  # states that are simulated, and pixels at least
+_UNDERFLOW = 1e-300
+# Pixels' own noise is log-normal. Nodes: reach (its standard deviations), least number, and spacing
+# (standard deviations of a sample variance)
+_REACH, _FEWEST, _STEP = 3.0, 7, 2.0
 # logarithm of the shape: prior 1-sigma, and largest value
 _USUAL, _MAX_LOG_SHAPE = 1.5, 4.0
-_MOVE = 1e-4  # step of parameters for derivatives of the classes' shares
 # of the logits of shares, of logarithms of amplitudes over the noise, and of shapes
 _RANGES = (
     (-16.0, 16.0),
@@ -35,27 +32,53 @@ _RANGES = (
     (-_MAX_LOG_SHAPE, _MAX_LOG_SHAPE),
 )
 _CLEAR = 8.0  # log-likelihood by which a shape other than exponential must be better
-# probability of telegraph noise from which a pixel is used for the dwell time,
-LIKELY = 0.1
-_MOST = 0.95  # and quantile of their variances above which a pixel's weight is reduced
+
+
+@dataclass(frozen=True)
+class Stays:
+    """Dwell times of pixels in a level."""
+
+    mean_s: float  # geometric mean over the pixels; 0: no longer than a frame
+    decades: float = 0.0  # range of the pixels' times, uniform in the logarithm
+    upper: float = 0.5  # share of the time in the upper level
+
+    def kept(self, period_s: float, places: F32 | F64) -> F64:
+        """Correlation from frame to frame of pixels at places in the range, 0 to 1."""
+        if not self.mean_s > 0:
+            return np.zeros(places.shape)
+        times = self.mean_s * 10 ** (self.decades * (places.astype(float) - 0.5))
+        return np.asarray(np.exp(-2 * period_s / times))
+
+    def states(self, period_s: float, count: int) -> F64:
+        """States (frame, pixel), -1 or 1, less their mean, of pixels at `PLACES` in turn."""
+        return _states(tuple(self.kept(period_s, PLACES).tolist()), count, self.upper)
+
+
+@lru_cache(maxsize=64)
+def _states(keeps: tuple[float, ...], count: int, upper: float) -> F64:
+    rng = np.random.default_rng(0)
+    shape = count, max(_DRAWN // count, _FEWEST_DRAWN)
+    keep = np.resize(keeps, shape[1])
+    anew, up = rng.random(shape) >= keep, rng.random(shape) < upper
+    anew[0] = True
+    # Each frame has the state that was last drawn anew.
+    drawn = np.maximum.accumulate(np.where(anew, np.arange(count)[:, None], 0), axis=0)
+    found = np.where(np.take_along_axis(up, drawn, 0), 1.0, -1.0)
+    return np.asarray(found - found.mean(axis=0))
 
 
 @dataclass(frozen=True)
 class Population:
     """Pixels with telegraph noise."""
 
-    # share, amplitude, shape, share_error, amplitude_error, shape_error: of the pixels; mean,
-    # e-; of the amplitudes' gamma distribution
+    # share, amplitude, shape, and their errors: of the pixels; mean, e-; of the amplitudes' gamma
+    # distribution
     share: float
     amplitude: float
     shape: float
     share_error: float
     amplitude_error: float
     shape_error: float
-    unit: float  # noise that is the unit of `AMPLITUDES`, e-
-    weight: F64  # (class,) share of the pixels in each class of amplitudes
-    pixels: Indices  # (n,) all pixels
-    chance: F64  # (n,) probability that each has telegraph noise
 
 
 def find_population(parts: Sequence[Moments], stays: Stays) -> Population:
@@ -65,49 +88,37 @@ def find_population(parts: Sequence[Moments], stays: Stays) -> Population:
     stands_for = np.ones(len(pixels))
     for m in parts:
         stands_for[np.searchsorted(pixels, m.pixel)] = m.stands_for
-    mixture = Mixture.of(joined(pixels, parts, unit, stays))
-
-    def weights(p: F64) -> F64:
-        """Share of the pixels in each class of amplitudes."""
-        share, mean, shape = expit(p[0]), np.exp(p[1]), _shape(p)
-        x = AMPLITUDES * shape / mean
-        density = np.exp(xlogy(shape - 1, x) - x - gammaln(shape)) * shape / mean
-        return np.asarray(share * density * np.gradient(AMPLITUDES))
+    ratio = _joined(parts, unit, stays)
+    largest = ratio.max(axis=1)
+    ratio = np.exp(ratio - largest[:, None])
 
     def cost(p: F64) -> float:
+        share, mean, shape = expit(p[0]), np.exp(p[1]), np.exp(p[2]) if len(p) > 2 else 1.0
+        x = AMPLITUDES * shape / mean
+        density = np.exp(xlogy(shape - 1, x) - x - gammaln(shape)) * shape / mean
+        weights = share * density * np.gradient(AMPLITUDES)
+        # Amplitudes below the grid count as quiet.
+        quiet = np.log(max(1 - weights.sum(), 1e-12))
+        jumps = largest + np.log(np.maximum(ratio @ weights, _UNDERFLOW))
         far = float(np.sum(p[2:] ** 2)) / (2 * _USUAL**2)
-        return far - float(stands_for @ mixture.log_likelihood(weights(p)))
-
-    def slope(p: F64) -> F64:
-        moves = _MOVE * np.eye(len(p))
-        by = np.array([(weights(p + m) - weights(p - m)) / (2 * _MOVE) for m in moves])
-        of_weight = mixture.slope(weights(p), stands_for)
-        return np.concatenate([np.zeros(2), p[2:] / _USUAL**2]) - by @ of_weight
+        return far - float(stands_for @ np.logaddexp(quiet, jumps))
 
     def lowest(start: F64) -> F64:
-        return np.asarray(
-            minimize(cost, start, jac=slope, method="L-BFGS-B", bounds=_RANGES[: len(start)]).x
-        )
+        return np.asarray(minimize(cost, start, method="L-BFGS-B", bounds=_RANGES[: len(start)]).x)
 
     best = lowest(np.array([-4.0, 1.0]))
     other = lowest(np.append(best, 0.5))
     if cost(other) < cost(best) - _CLEAR:
         best = other
-    share, mean, shape = float(expit(best[0])), float(np.exp(best[1])), _shape(best)
-    of_all = unit, weights(best), pixels, mixture.chance(weights(best))
+    share, amplitude = float(expit(best[0])), unit * float(np.exp(best[1]))
+    shape = float(np.exp(best[2])) if len(best) > 2 else 1.0
     covariance = _curvature(cost, best)
     if covariance is None:
-        return Population(share, unit * mean, shape, 1.0, unit * mean, 0.0, *of_all)
-    errors = np.sqrt(np.diag(covariance))
-    share_error = float(min(errors[0] * share * (1 - share) + 1e-9, 1.0))
-    amplitude_error = float(unit * mean * errors[1])
-    shape_error = float(shape * errors[2]) if len(best) > 2 else 0.0
-    return Population(share, unit * mean, shape, share_error, amplitude_error, shape_error, *of_all)
-
-
-def _shape(p: F64) -> float:
-    """Shape of the gamma distribution: exponential if it is no parameter."""
-    return float(np.exp(np.clip(p[2], -_MAX_LOG_SHAPE, _MAX_LOG_SHAPE))) if len(p) > 2 else 1.0
+        return Population(share, amplitude, shape, 1.0, amplitude, 0.0)
+    errors = np.sqrt(np.diag(covariance)).tolist()
+    share_error = min(errors[0] * share * (1 - share) + 1e-9, 1.0)
+    shape_error = shape * errors[2] if len(best) > 2 else 0.0
+    return Population(share, amplitude, shape, share_error, amplitude * errors[1], shape_error)
 
 
 def _curvature(cost: Callable[[F64], float], at: F64, step: float = 0.05) -> F64 | None:
@@ -123,94 +134,67 @@ def _curvature(cost: Callable[[F64], float], at: F64, step: float = 0.05) -> F64
     return np.asarray(np.linalg.inv(second))
 
 
-def find_switching(
-    parts: Sequence[Moments], population: Population, decades: float, upper: float
-) -> tuple[float, float]:
-    """Mean dwell time and its error, s, from neighbouring frames."""
-    period = min(m.period_s for m in parts)
-    # Other pixels do not constrain it.
-    few = population.pixels[population.chance > LIKELY]
-    if not len(few):
-        return 0.0, period
-
-    def rest(log_time: float, most: float) -> tuple[float, float]:
-        return _rest(parts, population, Stays(float(np.exp(log_time)), decades, upper), 0, most)
-
-    # The frames do not constrain longer dwell times.
-    longest = max(m.period_s * m.frames for m in parts)
-    low, high = np.log(0.1 * period), np.log(max(longest, period))
-
-    def solved(more: float) -> float:
-        """Logarithm of the time whose expected products exceed those measured by ``more``."""
-        if rest(high, most)[0] + more >= 0:
-            return float(high)
-        return float(brentq(lambda v: rest(v, most)[0] + more, low, high, xtol=3e-3))
-
-    # Then all pixels count equally, as a few may hide the signal of the others.
-    for most in (_MOST, 0.0):
-        none, error = rest(low, most)
-        if none > 3 * error:
-            break
-    else:
-        at_most = float(np.exp(solved(error))) if none + error > 0 else 0.0
-        return 0.0, max(at_most, period)
-    found = solved(0.0)
-    slope = abs(rest(found + 0.05, most)[0] - rest(found - 0.05, most)[0]) / 0.1
-    return float(np.exp(found)), float(np.exp(found) * rest(found, most)[1] / max(slope, 1e-12))
-
-
-def off_later(parts: Sequence[Moments], population: Population, stays: Stays) -> float:
-    """Products of frames further apart in excess of those for given stays, in errors."""
-    total, error = _rest(parts, population, stays, 1, _MOST)
-    return total / error if error > 0 else 0.0
-
-
-def _rest(
-    parts: Sequence[Moments], population: Population, stays: Stays, lag: int, most: float
-) -> tuple[float, float]:
-    """Products of frames at one lag in excess of those for given stays, and their error."""
-    few = population.pixels[population.chance > LIKELY]
-    if not len(few):
-        return 0.0, 0.0
-    own = [m.of(few) for m in parts]
-    logarithms, expected = _expected(few, own, population.unit, stays, lag)
-    mixture = Mixture.of(logarithms)
-    chance = mixture.chance(population.weight)
-    of_class = mixture.shares(population.weight)
-    total = square = 0.0
-    for m, products in zip(own, expected, strict=True):
-        if not len(m.pixel) or np.isnan(m.products[lag]).any():
-            continue
-        at = np.searchsorted(few, m.pixel)
-        of_pixel = np.einsum("nk,nk->n", of_class[at], products)
-        left = chance[at] * (m.products[lag] + 1 / m.count - chance[at] * of_pixel)
-        # The products of a few pixels that jump far would outweigh those of all others.
-        left *= m.stands_for * np.minimum(np.quantile(m.variance, most) / m.variance, 1)
-        total += float(left.sum())
-        square += float(left @ left)
-    return total, square**0.5
-
-
-def _expected(
-    pixels: Indices, parts: Sequence[Moments], unit: float, stays: Stays, lag: int
-) -> tuple[F64, list[F64]]:
-    """Result of `joined`, and the expected products of frames (n, class) of each series."""
-    totals = [np.zeros((len(m.pixel), len(AMPLITUDES))) for m in parts]
-    weight, largest = np.zeros((2, len(pixels), len(AMPLITUDES)))
-    largest -= np.inf
-    every = np.full(len(pixels), -np.inf)
+def _joined(parts: Sequence[Moments], unit: float, stays: Stays) -> F64:
+    """Logarithms (pixel, class) of the likelihoods of all series over that of a quiet pixel."""
+    pixels = np.unique(np.concatenate([m.pixel for m in parts]))
+    total, every = np.full((len(pixels), len(AMPLITUDES)), -np.inf), np.full(len(pixels), -np.inf)
+    moves = [_moves(tuple(stays.kept(m.period_s, PLACES)), m.frames, stays.upper) for m in parts]
     for noise, share in own_noises(parts):
-        classes = [AmplitudeClasses.of(m, unit, stays, noise) for m in parts]
-        ratio, quiet = of_own_noise(pixels, parts, classes)
-        ratio += quiet[:, None] + share
-        np.logaddexp(every, quiet + share, out=every)
-        before, largest = largest, np.maximum(largest, ratio)
-        kept, now = np.exp(before - largest), np.exp(ratio - largest)
-        weight = weight * kept + now
-        for m, one, total in zip(parts, classes, totals, strict=True):
-            at = np.searchsorted(pixels, m.pixel)
-            total *= kept[at]
-            total += now[at] * one.expected(lag)
-    ats = (np.searchsorted(pixels, m.pixel) for m in parts)
-    expected = [total / weight[at] for total, at in zip(totals, ats, strict=True)]
-    return largest + np.log(weight) - every[:, None], expected
+        # One at a time, as each is large.
+        ratio, quiet = np.zeros(total.shape), np.full(len(pixels), share)
+        for m, chances in zip(parts, moves, strict=True):
+            at = np.searchsorted(pixels, m.pixel)  # no pixel is in a series twice
+            added = (AMPLITUDES * unit / m.sigma / 2) ** 2 / noise
+            levels = log_ratio_of_jumps(m.variance / noise, added, m.samples_dof)
+            largest = levels.max(axis=1, keepdims=True)
+            mixed = np.exp(levels - largest) @ chances
+            ratio[at] += largest + np.log(np.maximum(mixed, _UNDERFLOW))
+            quiet[at] -= (m.variance / noise + np.log(noise)) * m.samples_dof / 2
+        ratio += quiet[:, None]
+        np.logaddexp(total, ratio, out=total)
+        np.logaddexp(every, quiet, out=every)
+    return np.asarray(total - every[:, None])
+
+
+def log_ratio_of_jumps(variance: F64, added: F64, dof: float) -> F64:
+    """Logarithms (n, class) of the likelihoods of variances (n,) with jumps, over those without.
+
+    ``added``: (class,) variance of the jumps over that of the noise. For given states, a sample
+    variance has a noncentral chi-square distribution; its Bessel function is taken for large
+    orders (DLMF 10.41.3), with an error of half of 1 / ``dof`` at most.
+    """
+    order = max(dof / 2 - 1, 0.5)
+    s = np.sqrt(1 + variance[:, None] * (added * (dof / order) ** 2))
+    found = s - 1 - np.log((1 + s) / 2)
+    found *= order
+    found -= np.log(s) / 2
+    found -= dof / 2 * added
+    return np.asarray(found)
+
+
+@lru_cache(maxsize=16)
+def _moves(keeps: tuple[float, ...], count: int, upper: float) -> F64:
+    """Chances (level, class) that a class of amplitudes shows the variance of another.
+
+    A pixel that stays long may show its levels unequally, or one only.
+    """
+    seen = (_states(keeps, count, upper) ** 2).sum(axis=0) / (count - 1)
+    step = np.log(AMPLITUDES[1] / AMPLITUDES[0])
+    moves = np.rint(np.log(np.maximum(seen, 1e-12)) / 2 / step).astype(int)
+    classes = np.arange(len(AMPLITUDES))
+    chances = np.zeros((len(classes), len(classes)))
+    for move, often in zip(*np.unique(moves, return_counts=True), strict=True):
+        np.add.at(chances, (np.clip(classes + move, 0, classes[-1]), classes), often / len(moves))
+    return chances
+
+
+def own_noises(parts: Sequence[Moments]) -> list[tuple[float, float]]:
+    """Variances over the common one that quiet pixels may have, and logarithms of their shares."""
+    dof = np.array([m.samples_dof for m in parts])
+    deviation = float(np.sqrt(np.average([m.spread for m in parts], weights=dof**2)))
+    step = _STEP * np.sqrt(2 / dof.sum())
+    if not deviation:
+        return [(1.0, 0.0)]
+    at = np.linspace(-_REACH, _REACH, max(int(2 * _REACH * deviation / step) + 2, _FEWEST))
+    shares = -(at**2) / 2
+    return list(zip(np.exp(deviation * at), shares - logsumexp(shares), strict=True))
