@@ -1,11 +1,14 @@
 """Samples that pile up at the lowest and the highest code, told from noise that ends there."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pixcal.model.errors import InputError
+from pixcal.stages.diagnose.description import _top
 from pixcal.stages.reduce.black_cut_off import CutOff, cut_offs
 from pixcal.stages.reduce.flat_survey import FlatSurvey
 
@@ -186,3 +189,18 @@ def test_codes_of_unequal_width_are_no_cut_off(noise: float, level: float, count
     rng = np.random.default_rng([int(10 * noise), count])
     mean = sum(np.rint(rng.normal(level, noise, SHAPE)) for _ in range(count)) / count
     assert CutOff.of(Frames(np.rint(mean).astype(np.uint16)), 1.0) is None
+
+
+@pytest.mark.parametrize("declared", [None, 65535.0])
+def test_crests_beyond_the_end_of_16_bits_are_cut_off_in_simulations_too(
+    declared: float | None,
+) -> None:
+    flat = np.ones((5, 7), np.float32)
+    bright: Any = [SimpleNamespace(light=33_000 * flat, contrast=0.97 * flat)]
+    evidence: Any = SimpleNamespace(gain=1.0, bias=1000 * flat)
+    acquisition: Any = SimpleNamespace(detector=SimpleNamespace(saturation_adu=declared))
+    top = _top(acquisition, evidence, bright, {"a": np.dtype(np.uint16)})
+    assert top == 65535
+    if declared is None:
+        with pytest.raises(InputError, match="16-bit converter"):
+            _top(acquisition, evidence, bright, {"a": np.dtype(np.float32)})

@@ -14,7 +14,7 @@ from pixcal.model.arrays import F64, Indices
 from pixcal.model.bench import Bench, SimulatedDetector
 from pixcal.model.errors import InputError
 from pixcal.simulation.recording import Recording
-from pixcal.simulation.replica import plain_bench
+from pixcal.simulation.replica import TOP_ADU, plain_bench
 from pixcal.stages.diagnose.nominal import SetTruth
 from pixcal.stages.diagnose.parts import FrameSubset, Table
 from pixcal.stages.evidence import frame_days, groups
@@ -198,13 +198,13 @@ def _top(
     dtypes: Mapping[str, np.dtype[Any]],
 ) -> float:
     """Highest sample, ADU."""
-    ends = [np.iinfo(dtype).max for dtype in dtypes.values() if dtype.kind in "iu"]
-    top = float(min([65535, *ends]))
+    ends = [np.iinfo(d).max if d.kind in "iu" else np.inf for d in dtypes.values()]
+    end = min(acquisition.detector.saturation_adu or np.inf, *ends)
     for truth in sets:
         peak = float(np.median(truth.light * (1 + truth.contrast))) / evidence.gain
-        if peak + float(np.median(evidence.bias)) > 65535:
+        if end > TOP_ADU < peak + float(np.median(evidence.bias)):
             raise InputError(
                 f"fringes reach {peak:.0f} ADU above the bias: samples above 65535 ADU cannot be "
                 "simulated; give frames of a 16-bit converter"
             )
-    return min(top, acquisition.detector.saturation_adu or top)
+    return float(min(end, TOP_ADU))
