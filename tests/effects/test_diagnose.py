@@ -28,6 +28,7 @@ from pixcal.stages import correct, diagnose, fit, ingest, reduce, simulate
 from pixcal.stages.diagnose import frames, search_run, stage, trial, windows
 from pixcal.stages.diagnose.diagnosis_input import prepare_input
 from pixcal.stages.diagnose.frames import frames_of_half, split
+from pixcal.stages.diagnose.parts import evidence_of
 from pixcal.stages.diagnose.windows import chosen_windows, whole_of
 from pixcal_cli.main import invoke
 
@@ -100,6 +101,19 @@ def test_an_effect_is_found_and_closes_the_gap(with_lag: Path) -> None:
     fit.run(with_lag, fit.Config(), SYNC)
     assert diagnosed(with_lag, only=FEW) == found
     assert (with_lag / "diagnose" / "manifest.json").stat().st_mtime_ns == made
+
+
+def test_frames_less_an_effect_show_it_no_more(reduced: Callable[..., Path]) -> None:
+    """Only its change without noise is subtracted: their noise stays as it is."""
+    inputs = prepare_input(reduced({"nonlinearity": {}}), SYNC)
+    window, raw = inputs.first, inputs.learn()
+    freed = window.bench.without(raw, window.learn, [Nonlinearity()])
+    before, after = (evidence_of(one, window.part, window.whole) for one in (raw, freed))
+    assert (Nonlinearity.detect(before) or 0) > 50
+    assert abs(Nonlinearity.detect(after) or 0) < 3
+    for name, fringes in after.fringes.items():
+        assert np.nanstd(fringes.residual) < np.nanstd(before.fringes[name].residual)
+        assert fringes.adu.dtype == before.fringes[name].adu.dtype
 
 
 @pytest.mark.long

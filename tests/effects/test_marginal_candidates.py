@@ -35,11 +35,15 @@ def test_a_slow_estimate_is_a_statistic_only_if_the_strongest(
     assert set(marginal_candidates(found, KINDS, fringes=False)) == in_the_dark
 
 
-@pytest.mark.parametrize(("strongest", "tested"), [(90.0, True), (130.0, False)])
-def test_a_score_test_is_no_statistic_beside_a_far_stronger_effect(
-    strongest: float, tested: bool
+@pytest.mark.parametrize(
+    ("strongest", "simulates", "tested"),
+    [(90.0, True, True), (130.0, True, False), (1000.0, False, True)],
+)
+def test_a_slow_score_test_is_no_statistic_beside_a_far_stronger_effect(
+    strongest: float, simulates: bool, tested: bool
 ) -> None:
-    again = Again(RowNoise(), lambda _: 5.0)
+    """One that fits the maps alone is quick: a strong ghost hides no hyperbolic fringes."""
+    again = Again(RowNoise(), lambda _: 5.0, simulates)
     found = {
         "ipc": Candidate("ipc", Estimate(Ipc(), {}, strongest, "")),
         "row_noise": Candidate("row_noise", Estimate(RowNoise(), {}, 5.0, "", again=again)),

@@ -11,7 +11,7 @@ from pixcal.estimators.test_statistics.expectation import Reference, signature_k
 from pixcal.estimators.test_statistics.gap import compare, flagged
 from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
-from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.effect import DOMAINS, Effect, Estimate, Stage
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
 from pixcal.stages.diagnose.comparison import Comparison, differing, gap_interval, shrinkage
 from pixcal.stages.diagnose.rejection import doubtful, unhelpful
@@ -43,7 +43,7 @@ class Toy(Effect):
     name = "toy"
     title = "a toy"
     acts_at = Stage.LIGHT
-    domains = ("noise",)
+    domains = DOMAINS
     strengths = ("size",)
     sources = ("the test",)
 
@@ -58,6 +58,7 @@ PATTERNS: Mapping[str, Mapping[int, float]] = {
     "unknown": {2: 1.0, 3: 1.0, 4: 1.0, 5: 1.0, 1: 1.0},
     "little": {5: 1.0},
     "more": {4: 1.0, 5: 1.0},
+    "weak": {5: 1.0},
     "left, measured": {0: 1.0, 1: 0.5, 5: 10.0},
     "curve": {0: 1.0, 1: 0.5, 2: 1 / 3, 3: -1 / 6, 4: 0.5},
     **{f"single {row}": {row: 1.0} for row in range(len(KEYS))},
@@ -207,6 +208,27 @@ def test_a_curve_stays_where_no_two_others_leave_less() -> None:
         {"left": 0.03, "right": 0.01}, [candidate(label, size) for label, size in sizes.items()]
     )
     assert found.accepted == ("curve",)
+
+
+@pytest.mark.parametrize("truth", [{"left": 0.03, "right": 0.01}, {"curve": 0.03}])
+def test_a_curve_is_measured_again_without_what_it_takes_up(truth: Mapping[str, float]) -> None:
+    """It adds nothing to what it took up: each is measured on frames without the other."""
+    alone = {name: truth.get(name, 0.0) for name in ("left", "right")}
+
+    def measure(name: str, without: Sequence[Effect]) -> Estimate | None:
+        assert [e.name for e in without] == ["right" if name == "curve" else "curve"]
+        label = "left" if name == "curve" else name
+        effect = Toy(label, alone[label])
+        object.__setattr__(effect, "name", name)
+        return Estimate(effect, {"size": 1e-4}, 50.0, "told")
+
+    data = REFERENCE.on_scale(curves((), 500, truth))
+    named = {c.name: c for c in (candidate("curve", 0.03), candidate("right", 0.012))}
+    found = Search(REFERENCE, data, simulate, lambda *_: {}, measure=measure).run(named)
+    assert found.accepted == (("curve", "right") if len(truth) > 1 else ("curve",))
+    assert found.candidates["curve"].reason == ""
+    where = differing(found.nominal, found.final, data)
+    assert shrinkage(data, found.nominal, found.final, where).gap.total < 0.05
 
 
 def test_of_two_that_are_alike_the_one_that_opens_no_gap_is_taken() -> None:
@@ -364,6 +386,56 @@ def test_no_cause_is_claimed_where_what_differs_most_stays(unknown: float, claim
     found, _ = search({"left": 0.03, "single 5": unknown}, [candidate("left", 0.03)])
     assert found.accepted == (("left",) if claimed else ())
     assert claimed or "the largest difference remains" in found.candidates["left"].reason
+
+
+@dataclass(frozen=True)
+class ToyOfTime(Toy):
+    """Shows in the series of frames alone."""
+
+    domains = ("time",)
+
+
+@dataclass(frozen=True)
+class ToyOfTimeAndNoise(Toy):
+    """Shows in the noise of samples too."""
+
+    domains = ("time", "noise")
+
+
+@pytest.mark.parametrize(
+    ("elsewhere", "beside", "kind", "replayed", "claimed"),
+    [
+        ("single 5", 0.0, ToyOfTime, False, True),
+        ("single 5", 0.02, ToyOfTime, False, True),
+        ("single 5", 0.02, ToyOfTimeAndNoise, False, False),
+        ("single 5", 0.0, ToyOfTime, True, False),
+        ("single 0", 0.0, ToyOfMaps, False, False),
+    ],
+    ids=["another domain", "two others", "one of its own too", "frame by frame", "static maps"],
+)
+def test_what_stays_in_another_domain_makes_no_cause_doubtful(
+    elsewhere: str, beside: float, kind: type[Toy], replayed: bool, claimed: bool
+) -> None:
+    """It has another cause, if the first explains its own domain in frames that could refute it."""
+    own = "single 5" if kind is ToyOfMaps else "single 2"
+    effect = kind(own, 0.02)
+    object.__setattr__(effect, "name", own)
+    one = Candidate(own, Estimate(effect, {"size": 2e-4}, 50.0, "told"))
+    one.replay = effect if replayed else None
+    truth = {own: 0.02, elsewhere: 0.2, "single 1": beside}
+    found, left = search(truth, [one])
+    assert found.accepted == ((own,) if claimed else ())
+    assert left > 0.5
+
+
+@pytest.mark.parametrize(("made", "accepted"), [(2.0, ("left", "weak")), (20.0, ("left",))])
+def test_chance_in_the_simulation_of_a_cause_takes_nothing_from_a_second(
+    made: float, accepted: tuple[str, ...]
+) -> None:
+    """5 sigma, less 2 by chance, had not been enough."""
+    truth, own = {"left": 0.03, "weak": 0.003}, [candidate("left", 0.03)]
+    found, _ = search(truth, [*own, candidate("weak", 0.003, sigmas=5.0)], {"weak": made})
+    assert found.accepted == accepted
 
 
 def test_a_small_remainder_of_what_another_cause_brings_about_is_not_claimed() -> None:

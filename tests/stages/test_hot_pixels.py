@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pixcal.stages.diagnose.nominal import uncoupled
+from pixcal.stages.diagnose.hot_pixels import uncoupled
 
 
 def test_pixels_beside_hot_ones_are_as_any_others() -> None:

@@ -199,7 +199,7 @@ class Effect(ForwardModel):
         if found is None:
             return None
         ask = partial(score_again, found.model, found.response, template=found.template)
-        again = Again(found.model, ask)
+        again = Again(found.model, ask, simulates=True)
         return Estimate(found.model, found.errors, found.significance, found.why, again=again)
 
     @classmethod
@@ -294,6 +294,7 @@ class Again:
     effect: Effect
     # its significance in evidence; None if undetermined
     detect: Callable[[Evidence], float | None] = field(repr=False, compare=False)
+    simulates: bool = False  # whether it simulates frames, which takes a fifth of a simulation
 
     @property
     def name(self) -> str:

@@ -18,8 +18,8 @@ from pixcal.stages.diagnose.trial import Effects, Signature, each_of, estimate
 NEARLY_ALL = 0.9  # share of its significance above which a candidate is not scaled down
 # significance of a slow estimate up to which it is a test statistic, and without fringes from which
 MAX_SLOW_SIGNIFICANCE, MIN_DARK_SIGNIFICANCE = 20.0, 10.0
-# significance over that of the strongest candidate below which a score test, which takes a fifth of
-# a simulation, is none: the strongest effect is likely to produce it
+# significance over that of the strongest candidate below which a score test on simulated frames is
+# none: the strongest effect is likely to produce it
 MIN_RELATIVE_SIGNIFICANCE = 0.05
 
 
@@ -48,10 +48,15 @@ class Candidate:
         return self.estimate is not None and not self.estimate.refused and self.significance > 0
 
     @property
+    def domains(self) -> tuple[str, ...]:
+        """Where its effect shows; empty without an estimate."""
+        return () if self.estimate is None else self.estimate.effect.domains
+
+    @property
     def in_maps_alone(self) -> bool:
         """Whether it changes only static maps, which are common to all frames."""
         # The chance pattern of the offsets is then the same in the held-out frames.
-        return self.estimate is not None and self.estimate.effect.domains == ("space",)
+        return self.domains == ("space",)
 
     @property
     def law(self) -> Effect | None:
@@ -162,7 +167,11 @@ def marginal_candidates(
         one.again or kinds[name]
         for name, one in sorted(seen.items())
         if one.significance >= SIGNIFICANT
-        and (one.again is None or one.significance >= MIN_RELATIVE_SIGNIFICANCE * most)
+        and (
+            one.again is None
+            or not one.again.simulates
+            or one.significance >= MIN_RELATIVE_SIGNIFICANCE * most
+        )
         and (kinds[name].quick or (strongest and one.significance == most))
     )
 

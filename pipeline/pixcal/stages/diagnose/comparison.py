@@ -1,6 +1,6 @@
 """Compare simulated benches with the held-out frames; how much of the gap effects close."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from pixcal.estimators.test_statistics.expectation import (
     Reference,
     expect_nominal,
     expect_with,
+    statistic_named,
 )
 from pixcal.estimators.test_statistics.gap import (
     FALSE_ALARM_RATE,
@@ -26,7 +27,7 @@ from pixcal.estimators.test_statistics.gap import (
     remaining,
 )
 from pixcal.model.arrays import F64
-from pixcal.stages.diagnose.thresholds import LAW_ERROR, MIN_LOGLIK_GAIN, STAYS
+from pixcal.stages.diagnose.thresholds import LAW_ERROR, MAX_RESIDUAL_GAP, MIN_LOGLIK_GAIN, STAYS
 from pixcal.stages.diagnose.trial import Curves, Effects
 
 DRAWS = 200
@@ -172,6 +173,19 @@ class Comparison:
             return False
         left = abs(float(after[top].sigmas[before[top].worst]))
         return left > STAYS * sizes[top]
+
+    def settles(self, domains: Container[str], fewer: Trial, trial: Trial) -> bool:
+        """Whether a cause, added to ``fewer``, leaves almost nothing open in its own domains."""
+        before, after = (
+            {
+                key: one
+                for key, one in compare(self.data, bench.expected).items()
+                if statistic_named(key[0]).domain in domains
+            }
+            for bench in (fewer, trial)
+        )
+        where = flagged(before)
+        return bool(where) and remaining(before, after, where).total <= MAX_RESIDUAL_GAP
 
     def replay_fits_better(self, replay: Trial, law: Trial) -> bool:
         """Whether a replay is likelier than the law, or leaves a smaller residual gap."""

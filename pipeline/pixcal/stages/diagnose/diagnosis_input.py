@@ -1,8 +1,8 @@
 """Input of a diagnosis: windows of a reduced run, their nominal bench, their statistics."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,7 @@ class DiagnosisInput:
     # whether memory suffices to run estimates in this process in parallel with simulations
     room: bool
     effects: Considered
+    learn: Callable[[], RawFrames]  # reads the frames to which effects are fitted again
 
     @cached_property
     def measured(self) -> Curves:
@@ -109,7 +110,10 @@ def prepare_input(
     tried = tuple(w for w in windows if w.part in parts)
     facts = _frames_used(frames, own, windows[0], tried, left_out)
     effects.note_missing(facts)
-    return DiagnosisInput(windows[0], tried, tuple(measured), facts, runtime, few, room, effects)
+    learn = partial(take, ingested, frames, own.learn, first)
+    return DiagnosisInput(
+        windows[0], tried, tuple(measured), facts, runtime, few, room, effects, learn
+    )
 
 
 def _run_frames(run_dir: Path, ingested: Ingested, reduced: Mapping[str, Any]) -> RunFrames:

@@ -22,7 +22,8 @@ from pixcal.simulation.effect import FittedFrames
 from pixcal.stages.diagnose.description import bench_of, pedestal_of, recordings_of
 from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.flats import FlatLight, MeasuredGain
-from pixcal.stages.diagnose.nominal import Measured, NominalBench, SetTruth, uncoupled
+from pixcal.stages.diagnose.hot_pixels import uncoupled
+from pixcal.stages.diagnose.nominal import Measured, NominalBench, SetTruth
 from pixcal.stages.diagnose.parts import FrameSubset, RunFrames
 from pixcal.stages.reduce.calibration import FLAT_FLOOR
 

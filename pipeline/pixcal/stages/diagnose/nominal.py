@@ -7,18 +7,15 @@ errors. Fringes, repeating rows or columns, and curvature are removed from the o
 foundry makes them: only an effect may produce them in a simulation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
 
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.beams import Light
-from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.scene import DetectorMaps, FrameStates, Rows
 from pixcal.model.arrays import F32, F64, Indices
 from pixcal.model.bench import Bench
@@ -29,17 +26,12 @@ from pixcal.simulation.replica import TOP_ADU, OfAcquisition
 from pixcal.simulation.shot import Shot
 from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.flats import FlatLight, MeasuredGain, photon_transfer_change
+from pixcal.stages.diagnose.hot_pixels import uncoupled
 from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, RunFrames
 
 _GAIN, _NOISE, _DARK = 101, 102, 103  # keys of random numbers
 _WHITE = 1e-3  # least share of the variance of the read noise that effects leave
 _ROWS = 8  # in the middle, on which the mean charge left by earlier frames is computed
-HOT = 40.0  # robust standard deviations of the dark current above which a pixel is hot
-# pixels around a hot one that may have received some of its charge: at most a share of `SHARED`
-HOT_REACH = 2
-SHARED = 0.1
-
-Dark = TypeVar("Dark", F32, F64)
 
 
 @dataclass(frozen=True)
@@ -117,6 +109,56 @@ class NominalBench:
         Effects are undone on the measured maps, which contain them, before they act. ``seed``: of
         everything random. ``window``: number of the window, for independent pixel noise.
         """
+        measured, bench, taken = self._prepared(effects, seed, window)
+        camera = Camera(bench, self._rows, [measured, *effects], maps=measured.maps)
+        arrays = {
+            name: np.empty((len(frames), *bench.detector.shape), self.frames.dtypes[name])
+            for name, frames in half.items()
+        }
+        for own, name, wanted, at in self._of_half(half, taken):
+            for (_, samples), place in zip(camera.expose(own, wanted), at, strict=True):
+                arrays[name][place] = self._as_recorded(
+                    samples, own.exptime_s, bench.detector.top_adu, name
+                )
+        return self.frames.raw(arrays, half)
+
+    def without(self, raw: RawFrames, half: FrameSubset, effects: Sequence[Effect]) -> RawFrames:
+        """A half of the frames, less what effects change in them without noise."""
+        measured, bench, taken = self._prepared(effects, 0, 0)
+        with_effects, free = (
+            Camera(bench, self._rows, [measured, *acting], maps=measured.maps, noise=False)
+            for acting in (effects, ())
+        )
+        arrays = {name: samples.copy() for name, samples in raw.arrays.items()}
+        top, step = self.bench.detector.top_adu, self.bench.detector.step_adu
+        for own, name, wanted, at in self._of_half(half, taken):
+            kind = arrays[name].dtype
+            each = with_effects.analogue(own, wanted), free.analogue(own, wanted), at
+            for one, other, place in zip(*each, strict=True):
+                before = arrays[name][place]
+                found = before - (one - other)
+                if kind.kind != "f":
+                    found = np.clip(step * np.rint(found / step), np.iinfo(kind).min, top)
+                arrays[name][place] = np.where(before < top, found, before)
+        return replace(raw, arrays=arrays)
+
+    @property
+    def _rows(self) -> Rows:
+        return 0, self.bench.detector.shape[0]
+
+    def _of_half(
+        self, half: FrameSubset, taken: dict[tuple[int, int], Recording]
+    ) -> Iterator[tuple[Recording, str, list[int], list[int]]]:
+        """Recordings, their arrays, and their frames of a half: in the recording, in the array."""
+        for recording, (name, numbers) in zip(self.recordings, self.places, strict=True):
+            wanted = np.flatnonzero(np.isin(numbers, half[name]))
+            at = np.searchsorted(half[name], numbers[wanted])
+            yield taken[recording.key], name, wanted.tolist(), at.tolist()
+
+    def _prepared(
+        self, effects: Sequence[Effect], seed: int, window: int
+    ) -> tuple[Measured, Bench, dict[tuple[int, int], Recording]]:
+        """Light and pixels before the effects, the bench, and its recordings, by their keys."""
         own_seed = seed + SEEDS_APART * window
         detector = replace(
             self.bench.detector,
@@ -126,7 +168,6 @@ class NominalBench:
         bench = replace(self.bench, seed=seed, detector=detector)
         for effect in effects:
             effect.check(bench)
-        rows = (0, bench.detector.shape[0])
         measured = self._drawn(effects, own_seed)
         if effects:
             measured = self._of_measured_k(measured, bench, effects)
@@ -134,10 +175,6 @@ class NominalBench:
             bench, measured, effects, self.recordings, self.gain.neighbours, measured.maps
         )
         measured = self._electronics(measured, (seed, own_seed), change, effects)
-        arrays = {
-            name: np.empty((len(frames), *bench.detector.shape), self.frames.dtypes[name])
-            for name, frames in half.items()
-        }
         levels = measured.lamp.levels(self.recordings, effects, self.bench.detector)
         own_key = {r.key: r for r in self.recordings}
 
@@ -148,15 +185,7 @@ class NominalBench:
 
         taken = {r.key: with_earlier(r) for r in self.recordings}
         measured = _without_late_charge(measured, effects, bench, list(taken.values()))
-        camera = Camera(bench, rows, [measured, *effects], maps=measured.maps)
-        for recording, (name, numbers) in zip(self.recordings, self.places, strict=True):
-            wanted = np.flatnonzero(np.isin(numbers, half[name]))
-            own = taken[recording.key]
-            top = detector.top_adu
-            for frame, samples in camera.expose(own, wanted.tolist()):
-                at = int(np.searchsorted(half[name], numbers[frame]))
-                arrays[name][at] = self._as_recorded(samples, own.exptime_s, top, name)
-        return self.frames.raw(arrays, half)
+        return measured, bench, taken
 
     def _as_recorded(
         self, samples: NDArray[np.uint16], exptime_s: float, top_adu: float, name: str
@@ -276,16 +305,3 @@ def _without_late_charge(
     electrons = total / float(measured.maps.adu_per_e.mean())
     rate = measured.maps.dark_rate - np.float32(electrons / seconds)
     return replace(measured, maps=replace(measured.maps, dark_rate=np.maximum(rate, 0)))
-
-
-def uncoupled(dark: Dark, rng: np.random.Generator) -> Dark:
-    """Dark current (y, x), with neighbours of hot pixels redrawn from other pixels' values."""
-    rest = dark - np.median(dark)
-    spread = robust_sigma(rest)
-    brightest = maximum_filter(rest, size=2 * HOT_REACH + 1, mode="nearest")
-    beside = (brightest > HOT * spread) & (rest < SHARED * brightest)
-    found = dark.copy()
-    usual = dark[~beside & (rest <= HOT * spread)]
-    if usual.size:
-        found[beside] = rng.choice(usual, np.count_nonzero(beside))
-    return found

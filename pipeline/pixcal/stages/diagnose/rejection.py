@@ -6,11 +6,11 @@ pairs of the strongest other candidates are tried in its place.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 
 from pixcal.kernels.significance import SIGNIFICANT
-from pixcal.simulation.effect import Effect
+from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.candidates import Candidate
 from pixcal.stages.diagnose.comparison import Comparison, Trial
 from pixcal.stages.diagnose.thresholds import (
@@ -124,6 +124,23 @@ def unhelpful(
     return least, "it does not reduce the differences; it may be a proxy for an unknown cause"
 
 
+def _imitated(candidate: Candidate) -> bool:
+    """Whether the causes produce much of its significance, or it has none."""
+    return candidate.share < 1 - LAW_ERROR or candidate.significance < SIGNIFICANT
+
+
+def settled(comparison: Comparison, fewer: Trial, trial: Trial, candidate: Candidate) -> bool:
+    """Whether a candidate explains all of its own domains: what stays elsewhere has other causes.
+
+    ``fewer``, ``trial``: without and with it.
+    """
+    # Held-out frames cannot refute static maps, or what was measured frame by frame on them.
+    fitted_there = candidate.in_maps_alone or candidate.replay in trial.effects
+    return not (fitted_there or _imitated(candidate)) and comparison.settles(
+        candidate.domains, fewer, trial
+    )
+
+
 def doubtful(
     comparison: Comparison,
     current: Trial,
@@ -135,12 +152,12 @@ def doubtful(
     # another law of other causes: these produce much of its significance, or it has none.
     where = comparison.gap_of(current)
     open_still = comparison.residual(current, where)
-    closed = {n: comparison.residual(trial, where) - open_still for n, trial in without.items()}
-    imitated = {
-        name
-        for name in closed
-        if candidates[name].share < 1 - LAW_ERROR or candidates[name].significance < SIGNIFICANT
+    closed = {
+        name: comparison.residual(trial, where) - open_still
+        for name, trial in without.items()
+        if not settled(comparison, trial, current, candidates[name])
     }
+    imitated = {name for name in closed if _imitated(candidates[name])}
     needed = {
         name: max(
             MIN_SHARE_OF_RESIDUAL * open_still,
@@ -184,6 +201,7 @@ class Exchange:
     out: str  # name of the cause
     effects: Mapping[str, Effect]  # all causes with them, by name
     new: tuple[str, str]  # names of the two
+    estimates: Mapping[str, Estimate] = field(default_factory=dict)  # measured anew, by name
 
     @property
     def reason(self) -> str:
@@ -191,24 +209,45 @@ class Exchange:
         return f"{' and '.join(self.new)} together explain the held-out frames better"
 
 
+def _other(causes: Mapping[str, Effect], candidates: Mapping[str, Candidate]) -> list[str]:
+    """Other candidates that are significant, the strongest first."""
+    names = (
+        name
+        for name, one in candidates.items()
+        if name not in causes and one.usable and one.significance >= SIGNIFICANT
+        if one.estimate is not None and not one.estimate.effect.is_null
+    )
+    return sorted(names, key=lambda name: -candidates[name].significance)
+
+
 def exchanges(
     causes: Mapping[str, Effect], candidates: Mapping[str, Candidate]
 ) -> tuple[Exchange, ...]:
     """Replace each cause by every pair of the strongest other candidates, as measured."""
-    sizes = {
-        name: one.significance
-        for name, one in candidates.items()
-        if name not in causes and one.usable and one.significance >= SIGNIFICANT
-        if one.estimate is not None and not one.estimate.effect.is_null
-    }
     found = []
     for out in causes:
         rest = {name: effect for name, effect in causes.items() if name != out}
-        strongest = sorted(sizes, key=lambda name: -sizes[name])[:STRONGEST]
-        for new in combinations(strongest, 2):
+        for new in combinations(_other(causes, candidates)[:STRONGEST], 2):
             effects = rest | {name: _as_measured(candidates[name]) for name in new}
             found.append(Exchange(out, effects, new))
     return tuple(found)
+
+
+def entangled(
+    causes: Mapping[str, Effect], candidates: Mapping[str, Candidate]
+) -> list[tuple[str, str]]:
+    """Each cause with the strongest other candidate of its domains, whose effect it may absorb."""
+
+    def steady(name: str) -> bool:
+        estimate, replay = candidates[name].estimate, candidates[name].replay
+        return estimate is not None and replay == estimate.in_full
+
+    pairs = []
+    for out in filter(steady, causes):
+        own = set(candidates[out].domains)
+        others = (n for n in _other(causes, candidates) if own & set(candidates[n].domains))
+        pairs += [(out, n) for n in others if steady(n)][:1]
+    return pairs
 
 
 def _as_measured(candidate: Candidate) -> Effect:

@@ -14,7 +14,7 @@ from pixcal.estimators.test_statistics import Key
 from pixcal.estimators.test_statistics.expectation import Reference, signature_key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
-from pixcal.simulation.effect import Effect
+from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose import rejection
 from pixcal.stages.diagnose.candidates import (
     Addition,
@@ -40,6 +40,8 @@ PROMISING = 0.25  # share of the best gain above which a candidate is simulated 
 # largest significance credited after one simulation: its scatter is unknown
 MAX_SINGLE_SIMULATION_SIGMA = 3.0
 MAX_CAUSES = 5  # most causes that are accepted
+# significance in one simulation, sigma, up to which chance produces it, not the causes
+BY_CHANCE = 2.5
 TIE_MARGIN = 0.1  # relative difference from the best gain within which candidates are equal
 # most simulations of a search (two causes take about 80); number of samples that limits them if
 # each has many; least number even then. Never the time: results must not depend on the machine.
@@ -53,6 +55,7 @@ def affordable(samples: int) -> int:
 
 Simulate = Callable[[Sequence[Effects], int, str, Sequence[str]], Sequence[list[Curves] | str]]
 Estimates = Callable[[Effects, Sequence[str]], Mapping[str, float]]
+Measure = Callable[[str, Effects], Estimate | None]
 
 
 class Search:
@@ -62,6 +65,7 @@ class Search:
     simulate : benches, seeds, label, candidates for the next `estimates` -> statistics
     estimates : effects, names -> significance of candidates on simulations of the fitted frames
     most : largest number of simulations
+    measure : name, effects -> estimate of a candidate on the fitted frames less these effects
     """
 
     def __init__(
@@ -71,8 +75,10 @@ class Search:
         simulate: Simulate,
         estimates: Estimates,
         most: int = SIMULATIONS,
+        measure: Measure = lambda *_: None,
     ) -> None:
         self._ask, self._estimates, self._most = simulate, estimates, most
+        self._measure = measure
         self._made: dict[frozenset[Effect], int] = {}  # simulations of each bench
         self.comparison = Comparison(reference, data)
         self._current = self.comparison.nominal  # the bench with all causes accepted so far
@@ -146,6 +152,9 @@ class Search:
         alone += [
             (name, one) for name in sorted(once) if (one := self._remaining[name].alone) is not None
         ]
+        start = self.comparison.nominal
+        if any(rejection.settled(self.comparison, start, t, self._candidates[n]) for n, t in alone):
+            return False
         closed = rejection.all_close_little(self.comparison, alone)
         if not closed or self._close_much_together(tuple(one.effect for one in laws.values())):
             return False
@@ -178,7 +187,10 @@ class Search:
         options = rejection.exchanges(self._effects, candidates)
         count = len(self._effects) + 1
         left = self._left - CONFIRM_SIMULATIONS * (1 + count * (count + 1) // 2)
-        if not options or len(options) + 1 > left or not self.comparison.differs(self._current):
+        if not self.comparison.differs(self._current):
+            return False
+        options += self._measured_apart()
+        if not options or len(options) + 1 > left:
             return False
         benches = [tuple(one.effects.values()) for one in options]
         # Choose by one simulation of each, then by a few, before the choice is confirmed.
@@ -201,6 +213,8 @@ class Search:
         self._current, self._effects = trial, dict(best.effects)
         self._alike = {name: self._alike.get(name, ()) for name in self._effects}
         candidates[best.out].reason = best.reason
+        for name, estimate in best.estimates.items():
+            candidates[name].estimate, candidates[name].replay = estimate, estimate.in_full
         for name, one in candidates.items():
             if name in self._effects:
                 one.reason = ""
@@ -210,6 +224,25 @@ class Search:
             remaining.pop(name, None)
         self._leave_explained(" and ".join(best.new))
         return True
+
+    def _measured_apart(self) -> tuple[rejection.Exchange, ...]:
+        """Each cause with a candidate of its domains, both measured on frames without the other."""
+        found = []
+        for out, other in rejection.entangled(self._effects, self._candidates):
+            rest = {name: effect for name, effect in self._effects.items() if name != out}
+            estimates: dict[str, Estimate] = {}
+            beside = self._candidates[other].estimate
+            for name in (out, other):
+                if beside is not None:
+                    beside = self._measure(name, (*rest.values(), beside.effect))
+                if beside is None or beside.effect.is_null or beside.significance < SIGNIFICANT:
+                    break
+                estimates[name] = beside
+            if len(estimates) < 2:
+                continue
+            effects = rest | {name: one.effect for name, one in estimates.items()}
+            found.append(rejection.Exchange(out, effects, (out, other), estimates))
+        return tuple(found)
 
     def _favoured(
         self, laws: Additions, replays: Additions
@@ -389,9 +422,10 @@ class Search:
         """Fraction of each remaining candidate's significance that the causes do not produce."""
         if not self._remaining:
             return {}
-        produced = self._estimates(self._bench, list(self._remaining))
+        made = self._estimates(self._bench, list(self._remaining))
+        produced = {name: size for name, size in made.items() if size > BY_CHANCE}
         return {
-            name: float(np.clip(1 - max(produced.get(name, 0.0), 0.0) / c.significance, 0, 1))
+            name: max(1 - produced.get(name, 0.0) / c.significance, 0.0)
             for name, c in self._remaining.items()
         }
 

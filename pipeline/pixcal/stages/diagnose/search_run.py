@@ -1,7 +1,7 @@
 """Simulate the nominal bench of a diagnosis, and search for causes of the gap."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,10 @@ from pixcal.estimators.test_statistics.gap import Difference, compare, flagged
 from pixcal.model.arrays import F64
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Estimate
 from pixcal.stages.diagnose.candidates import SearchResult
 from pixcal.stages.diagnose.diagnosis_input import DiagnosisInput
+from pixcal.stages.diagnose.parts import evidence_of
 from pixcal.stages.diagnose.result import Description, by_domain
 from pixcal.stages.diagnose.search import (
     CONFIRM_SIMULATIONS,
@@ -22,7 +24,15 @@ from pixcal.stages.diagnose.search import (
     Search,
     affordable,
 )
-from pixcal.stages.diagnose.trial import Curves, Effects, Signature, Trials, detect, each_of
+from pixcal.stages.diagnose.trial import (
+    Curves,
+    Effects,
+    Signature,
+    Trials,
+    detect,
+    each_of,
+    estimate,
+)
 from pixcal.stages.diagnose.windows import whole_of
 
 REFERENCES = 16  # simulations of the nominal bench
@@ -53,7 +63,7 @@ def run_search(inputs: DiagnosisInput, scratch: Path) -> tuple[Description, list
     if needs_slow(effects.signatures, quick, compare(data, expect_nominal(reference))):
         trials, reference, data = simulated(effects.signatures)
     services, most = _SearchServices(inputs, trials), affordable(trials.samples)
-    search = Search(reference, data, services.simulate, services.again, most)
+    search = Search(reference, data, services.simulate, services.again, most, services.measure)
     found = search.run(effects.candidates)
     described = Description(found, data, inputs.measured, reference, inputs.facts)
     return described, _places(inputs, trials, found)
@@ -85,6 +95,18 @@ class _SearchServices:
         """Significance of candidates on simulations of the fitted frames with given effects."""
         answer = self.answers.pop((on, tuple(names)), None)
         return self._estimated(on, names, self.inputs.few) if answer is None else answer
+
+    def measure(self, name: str, without: Effects) -> Estimate | None:
+        """Estimate of an effect on the fitted frames less what other effects change in them."""
+        window, kind = self.inputs.first, self.inputs.effects.kinds[name]
+        try:
+            raw = window.bench.without(self.inputs.learn(), window.learn, without)
+            evidence = replace(evidence_of(raw, window.part, window.whole), full=window.full)
+        except InputError:
+            return None
+        asked = partial(estimate, evidence)
+        found = each_of({name: kind}, asked, self.inputs.few, "estimate again")[name]
+        return found if isinstance(found, Estimate) and not found.refused else None
 
     def _estimated(self, on: Effects, names: Sequence[str], few: Runtime) -> dict[str, float]:
         window, effects = self.inputs.first, self.inputs.effects
