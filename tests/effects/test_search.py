@@ -13,7 +13,7 @@ from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import DOMAINS, Effect, Estimate, Stage
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
-from pixcal.stages.diagnose.comparison import Comparison, differing, gap_interval, shrinkage
+from pixcal.stages.diagnose.comparison import Comparison, Trial, differing, gap_interval, shrinkage
 from pixcal.stages.diagnose.rejection import doubtful, unhelpful
 from pixcal.stages.diagnose.search import (
     CONFIRM_SIMULATIONS,
@@ -426,6 +426,17 @@ def test_what_stays_in_another_domain_makes_no_cause_doubtful(
     found, left = search(truth, [one])
     assert found.accepted == ((own,) if claimed else ())
     assert left > 0.5
+
+
+def test_causes_that_only_compensate_each_other_settle_no_domain() -> None:
+    comparison = Comparison(REFERENCE, REFERENCE.on_scale(curves((), 500, {"single 2": 0.02})))
+
+    def trial(*effects: Effect) -> Trial:
+        return comparison.trial(effects, [curves(effects, seed) for seed in range(8)])
+
+    true, one, other = Toy("single 2", 0.02), Toy("single 2", 0.05), Toy("right", -0.05)
+    assert comparison.settles(("time",), comparison.nominal, trial(true))
+    assert not comparison.settles(("time",), trial(one), trial(one, other))
 
 
 @pytest.mark.parametrize(("made", "accepted"), [(2.0, ("left", "weak")), (20.0, ("left",))])

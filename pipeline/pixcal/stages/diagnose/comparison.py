@@ -176,16 +176,19 @@ class Comparison:
 
     def settles(self, domains: Container[str], fewer: Trial, trial: Trial) -> bool:
         """Whether a cause, added to ``fewer``, leaves almost nothing open in its own domains."""
-        before, after = (
+        # Nor relative to the nominal bench: causes may only compensate each other.
+        nominal, before, after = (
             {
                 key: one
                 for key, one in compare(self.data, bench.expected).items()
                 if statistic_named(key[0]).domain in domains
             }
-            for bench in (fewer, trial)
+            for bench in (self.nominal, fewer, trial)
         )
-        where = flagged(before)
-        return bool(where) and remaining(before, after, where).total <= MAX_RESIDUAL_GAP
+        return all(
+            (where := flagged(start)) and remaining(start, after, where).total <= MAX_RESIDUAL_GAP
+            for start in (nominal, before)
+        )
 
     def replay_fits_better(self, replay: Trial, law: Trial) -> bool:
         """Whether a replay is likelier than the law, or leaves a smaller residual gap."""
