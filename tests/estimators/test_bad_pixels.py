@@ -195,6 +195,18 @@ def test_a_population_of_pixels_that_differ_is_not_noisy(spread: float, dof: int
     assert factor == pytest.approx(max(1.5, reach), rel=0.05)
 
 
+def test_noise_below_a_step_has_a_population_too() -> None:
+    rng = np.random.default_rng(8)
+    noise = 0.66 * rng.lognormal(0, 0.3, (200, 300))
+    frames = np.rint(40.3 + noise * rng.standard_normal((20, *noise.shape)))
+    variance = frames.var(axis=0, ddof=1)
+    same = np.ones_like(variance)
+    factor = noisy_factor(1.5, variance, 19, 1.0)
+    expected = usual_variance(variance, 19) * same
+    found = noisy(variance, 19 * same, expected, np.nan * same, 0 * same, factor)
+    assert found.mean() < 1e-3
+
+
 @pytest.mark.parametrize("dof", [2, 4, 7])
 @pytest.mark.parametrize("spread", [0.0, 0.3])
 def test_few_frames_take_no_population_for_noisy_pixels(spread: float, dof: int) -> None:

@@ -2,6 +2,7 @@
 
 import tracemalloc
 from collections.abc import Callable, Sequence
+from itertools import product
 from types import SimpleNamespace
 from typing import Any
 
@@ -218,6 +219,17 @@ def test_levels_of_one_exposure_time_and_a_drifting_lamp_lie_on_no_line() -> Non
     levels = [
         Level(2.0, mean, True, mean * drifting, np.arange(8.0)) for mean in (1e3, 2e3, 4e3, 8e3)
     ]
+    assert straightness(levels, np.empty((0, 3)), np.nan) is None
+
+
+@pytest.mark.parametrize("gap", [100, 1000, 10_000])
+def test_a_lamp_that_is_set_anew_does_not_drift(gap: float) -> None:
+    """Its drift would change the light by many powers of ten until the next exposure time."""
+    rng, levels = np.random.default_rng(1), []
+    for t, mean in product((0.05, 1.0), (3e3, 2e3, 1e3)):
+        light = mean * (1 + 1e-3 * rng.standard_normal(4))
+        at = gap * (t == 1) + (3e3 - mean) / 50
+        levels.append(Level(t, float(light.mean()), True, light, at + np.arange(4.0)))
     assert straightness(levels, np.empty((0, 3)), np.nan) is None
 
 

@@ -394,6 +394,18 @@ def test_partial_blocks_are_blocks_if_they_are_large_enough() -> None:
     np.testing.assert_array_equal(blocks[:, 0], [255, 255, 47, 0, 0, 0])
 
 
+@pytest.mark.parametrize("spread", [0.1, 0.3])
+def test_pixels_of_unequal_noise_are_no_outliers(spread: float) -> None:
+    """As in scientific CMOS cameras; hits by particles are."""
+    rng = np.random.default_rng(12)
+    noise = 5 * rng.lognormal(0, spread, (640, 640))
+    first, second = (noise * rng.standard_normal(noise.shape) for _ in range(2))
+    first[::40, ::40] += 500
+    blocks = pair_statistics(first, second, gain=1.0, read_noise=5.0, quantum=1.0)
+    variance = np.average(blocks[:, 2], weights=blocks[:, 0])
+    assert variance == pytest.approx(np.mean(noise**2), rel=0.01)
+
+
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("above", [700.0, 3e3, 1e4])
 @pytest.mark.parametrize("levels", [11, 16])

@@ -40,7 +40,7 @@ _EVERYWHERE = 0.5  # least over largest covariance of lags above which noise is 
 _SIZES = 12  # of covariances of neighbours that are tried
 # least share of a block's pixels, along each axis, that have a neighbour at a lag in it
 _PAIRED = 1 - REACH / BLOCK
-_CLIP = 5.0
+_CLIP = 7.0  # pixels of a population of unequal noise are no outliers
 _MIN_PIXELS = 32  # fewest to separate outliers from noise
 
 

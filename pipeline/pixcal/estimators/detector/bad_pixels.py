@@ -34,6 +34,7 @@ _CLIPPINGS = 4
 _CLIP = 4.0
 _POPULATION = 4.0  # standard deviations of log noise up to which pixels are of one population
 _SPREAD_DOF = 8
+_HALF_A_STEP = 1 / 4 + 1 / 12  # variance of noise of half a step, which hardly depends on the level
 _QUARTILE = 0.6745  # of a normal distribution, in standard deviations
 _FEWEST = 64
 _SAMPLE = 4096
@@ -164,7 +165,7 @@ def noisy_factor(least: float, variance: F64, dof: int, quantum: float) -> float
     (ADU²), with ``dof``. ``quantum``: step of the samples (ADU).
     """
     known = variance[variance > 0]
-    if dof < 1 or not known.size or np.median(known) < quantum**2:
+    if dof < 1 or not known.size or np.median(known) < _HALF_A_STEP * quantum**2:
         return least
     # Includes the sampling scatter of the variances, which moves pixels as far.
     spread = median_and_sigma(np.log(known))[1]

@@ -173,10 +173,14 @@ def _drift(levels: Sequence[Level]) -> list[list[F64]] | None:
     if fitted is None:
         return None
     sizes, steps = fitted
-    return [
-        [np.exp(terms[:, : len(own)] @ own) for terms in powers]
+    exponents = [
+        [terms[:, : len(own)] @ own for terms in powers]
         for own in (sizes, *(sizes + step for step in steps))
     ]
+    # A lamp that was set anew for each level does not drift.
+    if np.ptp(np.concatenate(exponents[0])) > np.log(RATES):
+        return None
+    return [[np.exp(one) for one in own] for own in exponents]
 
 
 def _polynomial(design: F64, value: F64, freedom: int) -> tuple[F64, F64] | None:
