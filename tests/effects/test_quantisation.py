@@ -376,7 +376,8 @@ def test_where_a_bit_leaves_several_codes_out_its_weight_is_told(step: float) ->
     off = np.zeros(12)
     off[[7, 10]] = 0.4, step
     widths = widths_of(FITS, tuple(off))
-    bits, covariance = widths.bits(0.0)
+    found = widths.bits(0.0)
+    bits, covariance = found.bits, found.covariance
     # A common factor of all weights does not show; what a bit adds over all lower ones does.
     for bit in (7, 10):
         over = np.where(np.arange(12) == bit, 1.0, np.where(np.arange(12) < bit, -1.0, 0.0))

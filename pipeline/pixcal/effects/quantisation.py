@@ -297,7 +297,8 @@ def _uneven(
         if far and (other := widths.far_bits(found.law)):
             found, start = other, other.bits
             rest = widths.without(found.bits, found.law).scatter()[0]
-        bits, covariance = widths.bits(2 * rest, found.law, start)
+        found = widths.bits(2 * rest, found.law, start)
+        bits, covariance = found.bits, found.covariance
         levelled = np.stack([widths.level(one) for one in np.eye(len(bits))], 1)
     # No bit deviates by more than its own weight, although a fit to few codes may say so.
     if bits is not None and (np.abs(levelled @ bits) <= 2.0 ** np.arange(len(bits))).all():

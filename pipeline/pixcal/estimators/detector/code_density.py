@@ -312,26 +312,17 @@ class CodeWidths:
 
     def wrong_bits(self, scatter: float) -> WrongBits:
         """Errors of the bits' weights (codes) under the better of `FITS` and `NEAREST`."""
-        tried = [self._wrong_bits(scatter, law) for law in (FITS, NEAREST)]
-        return min(tried, key=lambda one: one.misfit)
+        return min((self.bits(scatter, law) for law in (FITS, NEAREST)), key=lambda one: one.misfit)
 
     def far_bits(self, near: Law) -> WrongBits | None:
         """Errors under `NEAREST_OF_ALL`; None unless it fits clearly better than ``near``."""
         start = self._far(NEAREST_OF_ALL)
         scatter = 2 * self.without(start, NEAREST_OF_ALL).scatter()[0]
-        far = self._wrong_bits(scatter, NEAREST_OF_ALL, start)
-        again = self._wrong_bits(scatter, near)
-        return far if far.misfit < again.misfit - _CLEARLY else None
+        far = self.bits(scatter, NEAREST_OF_ALL, start)
+        return far if far.misfit < self.bits(scatter, near).misfit - _CLEARLY else None
 
-    def _wrong_bits(self, scatter: float, law: Law, start: F64 | None = None) -> WrongBits:
-        bits, covariance = self.bits(scatter, law, start)
-        inverse = np.linalg.pinv(covariance, rcond=1e-9, hermitian=True)
-        weight = 1 / (self.variance + max(scatter, 0.0))
-        misfit = float(weight @ self.without(bits, law).width ** 2)
-        return WrongBits(bits, law, covariance, float(bits @ inverse @ bits), misfit)
-
-    def bits(self, scatter: float, law: Law = FITS, start: F64 | None = None) -> tuple[F64, F64]:
-        """Errors of the bits' weights, in codes, lowest bit first, and their covariance.
+    def bits(self, scatter: float, law: Law = FITS, start: F64 | None = None) -> WrongBits:
+        """Errors of the bits' weights, in codes, lowest bit first.
 
         A bit that does not change within the measured codes has zero error. A factor common to all
         weights, a gain, does not change local widths: the smallest errors are given (`level` gives
@@ -370,7 +361,8 @@ class CodeWidths:
             bits, left, misfit = moved, after, misfit - better
             if better < _SETTLED:
                 break
-        return bits, covariance
+        inverse = np.linalg.pinv(covariance, rcond=1e-9, hermitian=True)
+        return WrongBits(bits, law, covariance, float(bits @ inverse @ bits), misfit)
 
     def _far(self, law: Law) -> F64:
         """Errors of bits, highest first, from the step between levels where each bit changes."""
