@@ -173,17 +173,3 @@ def bent(
     normal, right = weighted @ fringes.g, weighted @ changed.reshape(T, -1).T[..., None]
     theta = np.linalg.solve(normal, right)[..., 0].T
     return replace(fringes, electrons=electrons, theta=theta.reshape(3, NY, NX))
-
-
-def test_steps_that_grow_are_not_taken(fringes: FringeEvidence) -> None:
-    """Residuals that no size explains: the change grows faster than its slope at zero."""
-
-    def steep(of: FringeEvidence, signal: F32, sizes: NDArray[np.float64]) -> F32:
-        charge = signal / np.float32(20_000)
-        return np.asarray(sizes[0] * (1 + 30 * abs(sizes[0])) * charge**3, np.float32)
-
-    signal = np.nan_to_num(fringes.electrons)
-    other = replace(fringes, electrons=signal + np.float32(400) * (signal / 20_000) ** 3)
-    sizes, _, _ = fit_distortions([other], steep, 1)
-    assert np.isfinite(sizes).all()
-    assert abs(sizes[0]) < 1000

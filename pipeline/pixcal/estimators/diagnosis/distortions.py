@@ -188,16 +188,11 @@ def fit_distortions(
     sizes = np.zeros(count)
     rights = [fit.right(sizes) for fit in fits]
     agreement = _agreement(fits, rights)
-    last = np.inf
     for _ in range(_ROUNDS):
         right = sum(rights) + information * (known - sizes)
         step = covariance @ right
-        moved = float(right @ step)
-        # Steps that grow lead away from residuals that no size explains.
-        if moved > last:
-            break
-        sizes, last = sizes + step, moved
-        if moved < _STILL**2:
+        sizes = sizes + step
+        if right @ step < _STILL**2:
             break
         rights = [fit.right(sizes) for fit in fits]
     return sizes, covariance, agreement
