@@ -213,6 +213,20 @@ def test_frames_of_fringes_tell_how_much_of_the_time_pixels_are_in_the_upper_lev
     assert own_levels([noise], 1.0).common_upper == 0.5
 
 
+def test_pixels_with_different_shares_of_the_time_have_none_in_common() -> None:
+    """As many are rarely in the upper level as in the lower one."""
+    rng = np.random.default_rng(31)
+    upper = rng.choice([0.06, 0.94], 240)
+    amplitude = np.exp(rng.uniform(0.0, 2.3, 240))
+    series = []
+    for frames, noise in ((40, 1.0), (300, 8.0), (300, 8.0)):
+        up = rng.random((frames, 240)) < upper
+        charge = up * 4 * amplitude + noise * rng.standard_normal(up.shape)
+        series.append(lit_series(charge, noise**-2, np.arange(240)))
+    series[0] = replace(series[0], chosen=True)
+    assert own_levels(series, 1.0).common_upper == 0.5
+
+
 def test_levels_of_single_pixels_are_those_that_they_have() -> None:
     """Weak ones by the dark frames, strong ones by those of fringes, also where one was unseen."""
     rng = np.random.default_rng(3)

@@ -24,9 +24,8 @@ TWO_LEVELS = 8.0
 _OVERFLOW = np.float32(80.0)  # logarithm below which float32 numbers do not overflow
 # log-likelihood by which a common share must be likelier than one half: in all, and per pixel
 CLEAR, CLEAR_A_PIXEL = 10.0, 0.1
-MOST = (
-    0.5  # least difference between shares of pixels that are rarely and mostly in the upper level
-)
+# least excess of pixels that are rarely, or mostly, in the upper level, over all that tell
+MOST = 0.5
 Lit = Callable[[Indices], Sequence[PixelSeries]]
 
 
