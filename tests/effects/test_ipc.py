@@ -297,14 +297,14 @@ def test_a_kernel_is_found_with_its_period_and_nothing_else(acquired: Acquired, 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("longest", [7, 10_000])
+@pytest.mark.parametrize("most", [1, 1 << 30])
 def test_products_of_neighbours_are_the_same_in_pieces_of_any_length(
-    acquired: Acquired, monkeypatch: pytest.MonkeyPatch, longest: int
+    acquired: Acquired, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
     frames = acquired({"frames.fringes.0.count": 150, "frames.fringes.1.count": 150})
     steps = links((frames.good.shape[0], frames.good.shape[1]))[:5]
     usual = covariance.products(frames, steps)
-    monkeypatch.setattr(covariance, "_LONG", longest)
+    monkeypatch.setattr(covariance, "_AT_ONCE", most)
     pieces = covariance.products(frames, steps)
     assert usual is not None
     assert pieces is not None
@@ -313,7 +313,7 @@ def test_products_of_neighbours_are_the_same_in_pieces_of_any_length(
         np.testing.assert_allclose(
             getattr(pieces, name), whole, rtol=1e-5, atol=1e-5 * np.abs(whole).max()
         )
-    assert pieces.shot == pytest.approx(usual.shot, rel=1e-6)
+    assert pieces.shot[0] == pytest.approx(usual.shot[0], rel=1e-6)
 
 
 @pytest.mark.long

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pixcal.estimators.crosstalk import support
-from pixcal.estimators.crosstalk.covariance import NORMAL, NORMALS, TERMS, Products
+from pixcal.estimators.crosstalk.covariance import BOTH, TERMS, Products
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels
-from pixcal.estimators.crosstalk.information import MeasuredLinks
+from pixcal.estimators.crosstalk.kernel import best_period, coupling_of
 from pixcal.estimators.crosstalk.links import PixelClasses, class_sums, links, periods, sums_of
-from pixcal.estimators.crosstalk.pattern import visibility_pattern
-from pixcal.estimators.crosstalk.support import INDEPENDENT, Choice, choose
+from pixcal.estimators.crosstalk.maps import Maps
+from pixcal.estimators.crosstalk.sources import Sources
+from pixcal.estimators.crosstalk.support import INDEPENDENT, sigmas_of, standing_out
 from pixcal.estimators.fringe_fit.modes import solve_modes
 from pixcal.estimators.maps.corrected import (
     corrected_offsets,
@@ -57,19 +57,15 @@ def test_a_partner_has_the_class_that_is_told(step):
     y, x = np.indices((20, 20))
     here, there = classes.of(y, x), classes.of(y + step[0], x + step[1])
     for n in range(classes.count):
-        back = support.coupling_of(classes, n, 1, step)
+        back = coupling_of(classes, n, 1, step)
         assert set(there[here == n]) == {back.row * classes.columns + back.column}
-    coarse = PixelClasses(2, 3, (2, 1))
-    np.testing.assert_array_equal(coarse.groups_of(classes)[here], coarse.of(y, x))
 
 
 def test_significance_is_that_of_the_best_of_many_looks():
     """The largest of N squares of normals; a million draws against the formula's quantiles."""
 
     def of(best, tests):
-        return Choice(
-            (), PixelClasses(1, 1, (0, 0)), (support.FamilyOfTests(best, tests),)
-        ).significance
+        return sigmas_of((best, tests))
 
     rng = np.random.default_rng(2)
     tests, drawn = 1000, []
@@ -86,43 +82,39 @@ def test_significance_is_that_of_the_best_of_many_looks():
 def test_significance_is_that_of_the_better_of_two_groups_of_looks():
     rng = np.random.default_rng(3)
     drawn = [
-        Choice(
-            (),
-            PixelClasses(1, 1, (0, 0)),
-            tuple(
-                support.FamilyOfTests(
-                    float((rng.standard_normal(n) ** 2).max()), round(n / INDEPENDENT)
-                )
+        sigmas_of(
+            *(
+                (float((rng.standard_normal(n) ** 2).max()), round(n / INDEPENDENT))
                 for n in (700, 7)
-            ),
-        ).significance
+            )
+        )
         for _ in range(400)
     ]
     assert np.mean(drawn) == pytest.approx(0, abs=0.2)
     assert np.std(drawn) == pytest.approx(1, abs=0.15)
 
 
-def noise_shared(steps, alike, share=0.01):
+def noise_shared(steps, alike, share=0.01, maps=None):
     """Products of residuals in which pixels some steps apart share noise, by some part of it."""
     shape = (24, 24)
-    normal = np.zeros((len(steps), NORMALS, *shape))
-    normal[:, NORMAL[0, 0]] = normal[:, NORMAL[1, 1]] = 1e4
-    right = np.zeros((len(steps), TERMS, *shape))
+    normal = np.zeros((len(steps), len(BOTH), *shape))
+    normal[:, [0, 4]] = 1e4  # D with D, and D' with D'
+    right = np.zeros((len(steps), len(TERMS), *shape))
     for n, step in enumerate(steps):
         right[n, :2] = 1e4 * share if step in alike else 0.0
-    return MeasuredLinks(
-        Products(right, normal, 1.0, 1e-3, 0.0, 1e-3, 0.02), None, steps, shape, (0, 0)
-    )
+    line = 1e6 * np.column_stack([np.eye(3), [1, 0, 0]])  # as much noise as the charge gives
+    noise = Products(right, normal, line, 0.02)
+    return Sources(noise, None, maps, steps, shape, (0, 0))
 
 
 def test_noise_that_far_pixels_share_is_refused_at_once():
     steps = links((24, 24))
-    near = [s for s in steps if max(map(abs, s)) < 3]
-    found = choose(noise_shared(steps, near), lambda classes: 0.0)
-    assert [steps[n] for n in found.links] == near
-    assert found.classes.count == 1
+    near = tuple(s for s in steps if max(map(abs, s)) < 3)
+    shared = noise_shared(steps, near)
+    assert standing_out(shared)[0] == near
+    assert best_period(shared.of(near)).count == 1
     with pytest.raises(InputError, match=r"^not decided: .* 48 of them beyond 2 pixels"):
-        choose(noise_shared(steps, steps), lambda classes: 0.0)
+        standing_out(noise_shared(steps, steps))
 
 
 def test_less_is_enough_for_adjacent_pixels_that_couple_alike():
@@ -132,7 +124,7 @@ def test_less_is_enough_for_adjacent_pixels_that_couple_alike():
     def taken(alike, chi2):
         # Of the share there and back as one number: 2 × 576 pixels of weight 1e4.
         share = (chi2 / (2 * 576 * 1e4)) ** 0.5
-        return [steps[n] for n in choose(noise_shared(steps, alike, share), lambda c: 0.0).links]
+        return list(standing_out(noise_shared(steps, alike, share))[0])
 
     assert taken([(0, 1)], 15.0) == [(0, 1)]
     assert taken([(0, 2)], 15.0) == []
@@ -140,15 +132,10 @@ def test_less_is_enough_for_adjacent_pixels_that_couple_alike():
     assert taken([(0, 1), (1, 0)], 5.0) == []
 
 
-def test_a_period_that_only_the_visibility_shows_is_taken_once_there_is_crosstalk():
-    steps = links((24, 24))
-
-    def pattern(classes):
-        return 500.0 if classes.rows % 3 == 0 else 0.0
-
-    found = choose(noise_shared(steps, [(1, 0)]), pattern)
-    assert (found.classes.rows, found.classes.columns) == (3, 1)
-    assert choose(noise_shared(steps, []), pattern).classes.count == 1
+def test_a_period_that_only_the_visibility_shows_is_taken():
+    maps = SimpleNamespace(pattern=lambda classes: 500.0 if classes.rows % 3 == 0 else 0.0)
+    found = best_period(noise_shared(((1, 0),), [(1, 0)], maps=maps))
+    assert (found.rows, found.columns) == (3, 1)
 
 
 def striped(rng, period, depth):
@@ -160,7 +147,12 @@ def striped(rng, period, depth):
     theta = np.stack([np.ones(shape), alpha * np.sin(psi), alpha * np.cos(psi)])
     good = np.ones(shape, bool)
     one = SimpleNamespace(
-        good=good, delta=np.zeros(shape), theta=theta, k=(2 * np.pi / 7.3, 0.0), origin=(0, 0)
+        good=good,
+        delta=np.zeros(shape),
+        theta=theta,
+        k=(2 * np.pi / 7.3, 0.0),
+        origin=(0, 0),
+        shot_factor=good,
     )
     return SimpleNamespace(good=good, fringes={"vertical": one})
 
@@ -169,7 +161,7 @@ def test_visibility_of_rows_has_the_chi_square_of_its_period():
     """Noise alone gives one a class; one row in three with 0.2 % less contrast gives more."""
     falls = []
     for depth in (0.0, 2e-3):
-        gain = visibility_pattern(striped(np.random.default_rng(5), period=3, depth=depth))
+        gain = Maps.of(striped(np.random.default_rng(5), period=3, depth=depth)).pattern
         alone = gain(PixelClasses(1, 1, (0, 0)))
         falls.append([gain(PixelClasses(n, 1, (0, 0))) - alone for n in (2, 3, 5)])
     noise, with_pattern = falls
@@ -184,7 +176,7 @@ def test_a_patch_of_low_contrast_is_no_period_of_columns():
     maps = striped(np.random.default_rng(6), period=3, depth=0.0)
     theta = maps.fringes["vertical"].theta
     theta[1:, 20:33, 30:36] *= 0.5
-    gain = visibility_pattern(maps)
+    gain = Maps.of(maps).pattern
     assert max(gain(PixelClasses(1, n, (0, 0))) for n in range(1, 9)) < 25
 
 

@@ -6,83 +6,71 @@ import numpy as np
 import pytest
 
 from pixcal.estimators.crosstalk import covariance
-from pixcal.estimators.crosstalk.covariance import NORMAL
+from pixcal.estimators.crosstalk.covariance import BOTH, TERMS
 from pixcal.estimators.crosstalk.residuals import Residuals
 
+SHAPE = 7, 21
 LINKS = ((0, 1), (1, -2), (2, 0))
 
 
 def some(frames: int, seed: int) -> Residuals:
+    """Frames, and a tenth as many modes; pixels without a fit, and samples without weight."""
     rng = np.random.default_rng(seed)
-    shape = (frames, 7, 21)
-    one = rng.uniform(0.5, 1.5, shape).astype(np.float32)
-    one[rng.random(shape) < 0.1] = 0
-    charge = rng.uniform(0.5, 2, shape).astype(np.float32) * one
-    e, modes = rng.standard_normal((2, *shape)).astype(np.float32)
-    return Residuals(e * one, charge, charge, one, modes[None, ::16] * one[::16])
+    good = rng.random(SHAPE) > 0.1
+    size = frames + frames // 10, int(good.sum())
+    weight = rng.uniform(0.5, 1.5, size).astype(np.float32) * (rng.random(size) > 0.1)
+    charge = rng.uniform(0.5, 2, size).astype(np.float32)
+    e = rng.standard_normal(size).astype(np.float32) * weight
+    return Residuals(e, charge, weight, frames, good, steady=False)
 
 
-def shifted(values: np.ndarray, dy: int, dx: int) -> np.ndarray:
-    """The partner of each pixel; zero beyond the window."""
-    wide = np.pad(values, ((0, 0), (0, 2), (2, 2)))
-    _, ny, nx = values.shape
-    return wide[:, dy : dy + ny, 2 + dx : 2 + dx + nx]
-
-
-def steady(frames: int, seed: int) -> Residuals:
-    """Frames of one charge; samples are clipped in pixels of which no two are partners."""
-    part = some(frames, seed)
-    one = np.broadcast_to(part.one.max(axis=0), part.one.shape).copy()
-    clipped = np.random.default_rng(seed).random(one.shape) < 0.3
-    clipped[:, np.arange(7) % 4 != 0] = clipped[:, :, np.arange(21) % 4 != 0] = False
-    one[clipped] = 0
-    level = np.random.default_rng(seed).uniform(0.5, 2, one.shape[1:]).astype(np.float32)
-    e, charge = part.e * (one > 0), level * one
-    return Residuals(e, charge, charge, one, part.modes * (one[::16] > 0), steady=True)
-
-
-def test_frames_of_one_charge_give_the_sums_of_any_frames() -> None:
-    parts, links = [steady(20, 1), steady(2, 2), steady(35, 3)], np.array(LINKS)
-    usual, quick = ([np.zeros((3, n, 7, 21), np.float32) for n in (5, 14)] for _ in range(2))
-    covariance._add([replace(part, steady=False) for part in parts], links, *usual)
-    covariance._add(parts, links, *quick)
-    for one, other in zip(usual, quick, strict=True):
-        np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-5 * np.abs(one).max())
+def expected(parts: list[tuple[np.ndarray, ...]], step: tuple[int, int]) -> list[np.ndarray]:
+    """Sums of products (y, x) of values times the terms D, D', 1, (D² + D'²) / 2, and of each."""
+    sums = [np.zeros((n, *SHAPE)) for n in (4, 10)]
+    for value, charge, good in parts:
+        whole = np.zeros((2, len(value), SHAPE[0] + 2, SHAPE[1] + 4))
+        whole[:, :, :-2, 2:-2][..., good] = value, charge
+        here = whole[:, :, :-2, 2:-2]
+        dy, dx = step
+        there = whole[:, :, dy : dy + SHAPE[0], 2 + dx : 2 + dx + SHAPE[1]]
+        product, own, other = here[0] * there[0], here[1], there[1]
+        terms = np.stack([own, other, np.ones_like(own), (own**2 + other**2) / 2])
+        sums[0] += (product * terms).sum(axis=1)
+        i, j = np.triu_indices(4)
+        sums[1] += (product * terms[i] * terms[j]).sum(axis=1)
+    return sums
 
 
 @pytest.mark.parametrize("step", range(len(LINKS)))
 def test_the_sums_are_those_of_the_terms(step: int) -> None:
-    parts = [some(20, 1), some(35, 2)]
-    right, normal = np.zeros((3, 5, 7, 21)), np.zeros((3, 14, 7, 21))
-    links = np.array(LINKS)
-    noise = [frames for p in parts for frames in ((p.e, p.charge, p.one), p.taken)]
-    covariance._add_right_sums(*covariance._powers(noise, 2), links, right)
-    terms = [(p.one, p.charge, p.one) for p in parts]
-    covariance._add_normal_sums(*covariance._powers(terms, 4), links, normal)
-
-    def formulae(charge: np.ndarray, one: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Weight of a product, and the terms D, D', 1, D D', D² + D'²."""
-        own = np.divide(charge, one, out=np.zeros_like(charge), where=one > 0)
-        other = shifted(own, *LINKS[step])
-        each = [own, other, np.ones_like(own), own * other, own**2 + other**2]
-        return one * shifted(one, *LINKS[step]), each
-
-    expected = np.zeros((5, 7, 21))
-    for e, charge, one in noise:
-        weight, each = formulae(charge, one)
-        product = e * shifted(e, *LINKS[step]) * weight
-        expected += np.array([(product * term).sum(axis=0) for term in each])
-    np.testing.assert_allclose(right[step], expected, rtol=1e-4, atol=1e-4)
-    for (i, j), place in np.ndenumerate(NORMAL):
-        own_sum = np.zeros((7, 21))
-        for _, charge, one in terms:
-            weight, each = formulae(charge, one)
-            own_sum += (weight**2 * each[i] * each[j]).sum(axis=0)
-        np.testing.assert_allclose(normal[step, place], own_sum, rtol=1e-4, atol=1e-4)
+    parts = [(p.e, p.charge, p.good) for p in (some(20, 1), some(35, 2))]
+    for terms, sums in zip((TERMS, BOTH), expected(parts, LINKS[step]), strict=True):
+        found = np.zeros((len(LINKS), len(terms), *SHAPE), np.float32)
+        covariance._add(parts, terms, LINKS, found)
+        np.testing.assert_allclose(found[step], sums, rtol=1e-4, atol=1e-4)
 
 
-def test_short_sequences_are_gathered_and_long_ones_are_not() -> None:
-    lengths = [50, 12, 300, 40, 60, 70]
-    parts = [some(n, n) for n in lengths]
-    gathered = [[len(p.e) for p in group] for group in covariance._gathered(parts)]
-    assert gathered == [[50, 12], [300], [40, 60], [70]]
+def test_one_frame_stands_for_all_of_one_charge_and_few_for_many() -> None:
+    part = some(200, 3)
+    flat = replace(
+        part,
+        charge=np.tile(part.charge[0], (len(part.charge), 1)),
+        weight=np.ones_like(part.weight),
+        steady=True,
+    )
+    for one, frames, accuracy in ((part, 29, 0.2), (flat, 1, 1e-4)):
+        value, charge, good = covariance._weights(one)
+        assert len(value) == len(charge) == frames
+        few = expected([(value, charge, good)], (0, 1))[1].sum(axis=(1, 2))
+        all_frames = (one.weight[: one.count], one.charge[: one.count], good)
+        every = expected([all_frames], (0, 1))[1].sum(axis=(1, 2))
+        np.testing.assert_allclose(few, every, rtol=accuracy)
+
+
+def test_short_sequences_are_gathered_and_long_ones_are_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    parts = [some(n, 1) for n in (50, 10, 300, 40, 60, 70)]
+    monkeypatch.setattr(covariance, "_AT_ONCE", 100 * int(parts[0].good.sum()))
+    gathered = [[part.count for part in group] for group in covariance._gathered(parts)]
+    assert gathered == [[50, 10, 300], [40, 60], [70]]

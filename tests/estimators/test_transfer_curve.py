@@ -10,8 +10,9 @@ from scipy.special import chdtrc
 
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.effects.quantisation import Quantisation
-from pixcal.estimators.crosstalk.dense import frames_of, within
+from pixcal.estimators.crosstalk.kernel import within
 from pixcal.estimators.crosstalk.links import links
+from pixcal.estimators.crosstalk.sources import sources_of
 from pixcal.estimators.detector.flat_noise import shot_share_of_flats
 from pixcal.estimators.detector.ladder_curve import ladder_curve
 from pixcal.estimators.detector.neighbours import shared_charge
@@ -280,12 +281,12 @@ def test_some_links_are_measured_as_among_all() -> None:
     rate[20::30, 15::30] = 5e3
     given = replace(given, dark_rate=rate)
     every, near = links(SHAPE), within(SHAPE)
-    among, alone = (frames_of([given], lambda _, own=own: own) for own in (every, near))
+    among, alone = (sources_of([given], lambda _, own=own: own) for own in (every, near))
     assert among is not None
     assert alone is not None
-    some, alone_links = among.of_steps(near).links, alone.links
-    assert some.links == alone_links.links
-    for one, other in ((some.products, alone_links.products), (some.hot, alone_links.hot)):
+    some = among.of(near)
+    assert some.links == alone.links
+    for one, other in ((some.noise, alone.noise), (some.hot, alone.hot)):
         assert one is not None
         assert other is not None
         for key, value in vars(other).items():

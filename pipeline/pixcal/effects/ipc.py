@@ -7,8 +7,13 @@ from typing import Self
 
 import numpy as np
 
-from pixcal.estimators.crosstalk.dense import dense_kernel
-from pixcal.estimators.crosstalk.joined import Kernel, measure, significance
+from pixcal.estimators.crosstalk.kernel import (
+    Kernel,
+    dense_kernel,
+    measure,
+    significance,
+    significant,
+)
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import (
     Coupling,
@@ -120,21 +125,25 @@ class Ipc(Effect):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Kernel from hot pixels in darks, the noise of flats and fringes, and the maps, joined."""
-        kernel = measure(evidence)
-        if kernel is None:
+        measured = measure(evidence)
+        if measured is None:
             return None
-        sigma = np.sqrt(np.diag(kernel.covariance))
+        kernel, sigmas = measured
+        if kernel is None:
+            return Estimate(cls(()), {}, sigmas, _NONE)
+        couplings, covariance = significant(kernel)
+        sigma = np.sqrt(np.diag(covariance))
         errors = {f"couplings[{n}].share": float(s) for n, s in enumerate(sigma)}
-        if kernel.per_ke:
-            errors |= {f"couplings[{n}].per_ke": kernel.per_ke_error for n in range(len(sigma))}
+        if kernel.per_ke[0]:
+            errors |= {f"couplings[{n}].per_ke": kernel.per_ke[1] for n in range(len(sigma))}
         return Estimate(
-            cls(kernel.couplings),
+            cls(couplings),
             errors,
-            kernel.significance,
-            _why(kernel),
-            law=f"a kernel of {len(kernel.couplings)} couplings, all significant",
-            size=_size(kernel.couplings, sigma),
-            in_full=cls(_worth_it(kernel.whole)) if kernel.whole else None,
+            sigmas,
+            _why(couplings, kernel),
+            law=f"a kernel of {len(couplings)} couplings, all significant",
+            size=_size(couplings, sigma),
+            in_full=cls(_worth_it(kernel.couplings)) if couplings else None,
         )
 
     @classmethod
@@ -173,10 +182,9 @@ class Ipc(Effect):
         found = dense_kernel(parts, self.couplings)
         if found is None:
             return None
-        sigma = np.sqrt(np.diag(found.covariance))
         return Estimate(
             type(self)(_worth_it(found.couplings)),
-            {f"couplings[{n}].share": float(s) for n, s in enumerate(sigma)},
+            {f"couplings[{n}].share": float(s) for n, s in enumerate(found.errors)},
             float("nan"),
             "every coupling within two pixels, measured on all frames",
             covariance=found.covariance,
@@ -243,13 +251,12 @@ def _on_charge(
     return replace(maps, theta=theta, flat=None if maps.flat is None else after)
 
 
-def _why(kernel: Kernel) -> str:
-    if not kernel.couplings:
-        return (
-            "no significant signal beside hot pixels, and no significant noise common to neighbours"
-        )
-    rows = max(c.every_rows for c in kernel.couplings)
-    columns = max(c.every_columns for c in kernel.couplings)
-    ways = " and ".join(kernel.by)
+_NONE = "no significant signal beside hot pixels, and no significant noise common to neighbours"
+
+
+def _why(couplings: Sequence[Coupling], kernel: Kernel) -> str:
+    if not couplings:
+        return _NONE
+    rows, columns = (max(getattr(c, n) for c in couplings) for n in ("every_rows", "every_columns"))
     repeats = f"repeating every {rows} rows and {columns} columns"
-    return f"{len(kernel.couplings)} couplings, {repeats}, in {ways}"
+    return f"{len(couplings)} couplings, {repeats}, in {' and '.join(kernel.methods)}"

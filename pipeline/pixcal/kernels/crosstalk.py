@@ -173,9 +173,14 @@ def couple_fringes(
     return out
 
 
-def uncouple(signal: F64, couplings: Sequence[Coupling], first: tuple[int, int] = (0, 0)) -> F64:
+def uncouple(
+    signal: NDArray[Any],
+    couplings: Sequence[Coupling],
+    first: tuple[int, int] = (0, 0),
+    steps: int = STEPS,
+) -> NDArray[Any]:
     """Signal collected, from the signal that is read: the inverse of `couple`."""
-    return _inverse(signal, lambda found: couple(found, couplings, first))
+    return _inverse(signal, lambda found: couple(found, couplings, first), steps)
 
 
 def uncouple_fringes(
@@ -185,13 +190,15 @@ def uncouple_fringes(
     return _inverse(theta, lambda found: couple_fringes(found, couplings, first))
 
 
-def _inverse(data: F64, forward: Callable[[F64], F64]) -> F64:
+def _inverse(
+    data: NDArray[Any], forward: Callable[[NDArray[Any]], NDArray[Any]], steps: int = STEPS
+) -> NDArray[Any]:
     """Inverse by fixed-point iteration: the remainder is added back."""
     # Each step shrinks the rest by the shares that leave a pixel: for a tenth, some 15 steps to the
     # last digit.
     found = data.copy()
     size = float(np.max(np.abs(data), initial=0.0))
-    for _ in range(STEPS):
+    for _ in range(steps):
         rest = data - forward(found)
         found += rest
         if float(np.max(np.abs(rest), initial=0.0)) <= CONVERGED * size:

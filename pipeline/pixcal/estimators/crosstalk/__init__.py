@@ -1,7 +1,6 @@
-"""The coupling between pixels, measured three ways and joined.
+"""The coupling between pixels, as a kernel.
 
-`support` detects couplings, and their period, in the noise that neighbours share (`covariance`) and
-around `hot_pixels`. For that period `dense` measures all couplings within two pixels, from these
-and the `pattern` of the maps (visibility and offsets of all sets), each shrunk by its error;
-`joined` selects the significant ones.
+Three `sources` measure shares: the noise that neighbours have in common (`covariance` of
+`residuals`), the surroundings of `hot_pixels`, and the `maps` of a fit. `support` detects the
+significant links; `kernel` chooses the period and measures all couplings within two pixels jointly.
 """

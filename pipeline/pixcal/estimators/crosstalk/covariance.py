@@ -3,243 +3,187 @@
 With D the variance of a pixel's charge and k the share that it gives to a partner (primes: the
 partner's),
 
-    cov(p, p') = k D + k' D' + constant + b D D' + c (D² + D'²)
+    cov(p, p') = k D + k' D' + constant + b (D² + D'²) / 2
 
 The constant is noise that neighbours share without light (of a row, a column, the whole frame);
-bias frames measure it. Brighter-fatter makes a covariance that rises with the square of the level
-(b and c are free, the same for all pixels). Flats give k + k' only; in fringes D and D' differ,
-which separates the two.
+bias frames measure it. The squares are those of boundaries that charge shifts (brighter-fatter),
+and of shares that change with the level. Flats give k + k' only; in fringes D and D' differ, which
+separates the two.
 
 The products of residuals are summed pixel by pixel, so that they can be combined into classes of
 any period later.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
 from pixcal.estimators.crosstalk.links import Place
-from pixcal.estimators.crosstalk.residuals import STRIDE, UNIT, Residuals, all_residuals
+from pixcal.estimators.crosstalk.residuals import MAX_SAMPLES, UNIT, Residuals, all_residuals
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.kernels import inner, kernel
 from pixcal.kernels.crosstalk import Coupling
-from pixcal.model.arrays import F32, F64, Indices
+from pixcal.kernels.normal_matrix import inverse_normal, symmetric
+from pixcal.model.arrays import F32, F64, Mask
 
-Frames = tuple[F32, F32, F32]  # factor, charge over sigma, and one over sigma, all (t, y, x)
+Frames = tuple[F32, F32, Mask]  # values and charges (t, n) of the pixels of a mask (y, x)
 
 # least charge (10⁴ e-) of usable light; less is enough where its shot noise variance is this many
 # times that without light
 MIN_CHARGE, ABOVE_READ = 0.1, 4.0
-TINY = np.float32(1e-20)
-TERMS = 5  # D, D', 1, D D', D² + D'²
-# index of the normal sum of each two terms; terms 2 and 3 share theirs with 0 and 1
-NORMAL = np.array([
-    [0, 1, 3, 6, 9],
-    [1, 2, 4, 7, 10],
-    [3, 4, 5, 1, 11],
-    [6, 7, 1, 8, 12],
-    [9, 10, 11, 12, 13],
-])  # fmt: skip
-NORMALS = 14
+# prior 1-sigma of the covariance of neighbours over the square of their charge, 1/e-
+BRIGHTER_FATTER = 1e-6
+# Terms k, k', constant, b: (term, i, j) coefficients of the powers i and j of D and D'; and
+# products of each two terms, packed as in `symmetric`
+TERMS = np.zeros((4, 3, 3), np.float32)
+TERMS[0, 1, 0] = TERMS[1, 0, 1] = TERMS[2, 0, 0] = 1
+TERMS[3, 2, 0] = TERMS[3, 0, 2] = 0.5
+BOTH = np.zeros((10, 5, 5), np.float32)
+for _own, _i, _j in zip(BOTH, *np.triu_indices(4), strict=True):
+    for _n, _m in np.ndindex(3, 3):
+        _own[_n : _n + 3, _m : _m + 3] += TERMS[_i, _n, _m] * TERMS[_j]
+_BLOCK = 12  # columns whose products are made together
+_AT_ONCE = MAX_SAMPLES  # samples up to which sequences are gathered
+_ENOUGH = 32  # frames whose weights stand for those of a sequence
 
 
 @dataclass(frozen=True)
 class Products:
     """Sums over frames for each link and pixel; zero where the partner is out of the window."""
 
-    right: F32  # (link, 5, y, x) products of residuals with each of the `TERMS`; charge in 10⁴ e-
-    normal: F32  # (link, 14, y, x) of the terms with each other, in the order of `NORMAL`
-    # shot, shot_error: measured variance of a pixel over its shot noise: 1 for the right gain
-    shot: float
-    shot_error: float
-    # curve, curve_error: relative change of that variance with the charge, 1/(10⁴ e-)
-    curve: float
-    curve_error: float
+    # right, normal: (link, 4, y, x), (link, 10, y, x) sums of products of weighted residuals times
+    # `TERMS`, and of weights times `BOTH`; charges in 10⁴ e-
+    right: F32
+    normal: F32
+    line: F64  # (3, 4) normal equations of the variance of pixels: shot noise, constant, square
     read: float  # variance of a pixel without light
+
+    @property
+    def shot(self) -> tuple[float, float, float]:
+        """Measured variance over shot noise (1 for the right gain); its rise with the charge.
+
+        The latter with its error, 1/(10⁴ e-).
+        """
+        covariance = inverse_normal(self.line[:, :3], 1e-12)
+        shot, _, rise = covariance @ self.line[:, 3]
+        return float(shot), float(rise / shot), float(np.sqrt(2 * covariance[2, 2]))
+
+    def of(self, links: Sequence[int]) -> "Products":
+        """Those of some links."""
+        return replace(self, right=self.right[links], normal=self.normal[links])
 
 
 def products(
     evidence: Evidence, links: Sequence[Place], known: Sequence[Coupling] = ()
 ) -> Products | None:
-    """Sum the products of neighbours over all frames; None where no frames have light."""
-    ny, nx = evidence.good.shape
-    steps = np.array(links, int).reshape(-1, 2)
-    right = np.zeros((len(links), TERMS, ny, nx), np.float32)
-    normal = np.zeros((len(links), NORMALS, ny, nx), np.float32)
-    line, line_right = np.zeros((3, 3)), np.zeros(3)
-    brightest = 0.0
+    """Sum the products of neighbours over all frames; None where no frames have light.
+
+    ``known``: couplings that the frames are freed of first.
+    """
+    shape = evidence.good.shape
+    right = np.zeros((len(links), len(TERMS), *shape), np.float32)
+    normal = np.zeros((len(links), len(BOTH), *shape), np.float32)
+    line, brightest = np.zeros((3, 4)), 0.0
     for parts in _gathered(all_residuals(evidence, known)):
-        for part in parts:
-            brightest = max(brightest, part.brightness)
-            own, own_right = _variance(part)
-            line, line_right = line + own, line_right + own_right
-        _add(parts, steps, right, normal)
-        # Freed before the next ones, as they are large.
-        del parts, part
+        brightest = max(brightest, *(part.brightness for part in parts))
+        line += sum(map(_variance, parts))
+        _add([(part.e, part.charge, part.good) for part in parts], TERMS, links, right)
+        _add([_weights(part) for part in parts], BOTH, links, normal)
+        del parts  # freed before the next ones, which are as large
     if brightest < min(MIN_CHARGE, ABOVE_READ * evidence.read_noise**2 / UNIT):
         return None
-    covariance = np.linalg.pinv(line, rcond=1e-12, hermitian=True)
-    shot, _, curved = (float(v) for v in covariance @ line_right)
-    error, _, curved_error = (float(v) for v in np.sqrt(2 * np.diag(covariance)))
-    read = evidence.read_noise**2 / UNIT
-    return Products(right, normal, shot, error, curved / shot, curved_error / shot, read)
+    return Products(right, normal, line, evidence.read_noise**2 / UNIT)
 
 
-def _add(parts: Sequence[Residuals], steps: Indices, right: F32, normal: F32) -> None:
-    noise = [frames for p in parts for frames in ((p.e, p.charge, p.one), p.taken)]
-    for piece in _pieces(noise):
-        _add_right_sums(*_powers(piece, 2), steps, right)
-    for piece in _pieces([_weights(p) for p in parts]):
-        _add_normal_sums(*_powers(piece, 4), steps, normal)
+def joined(found: Sequence[Products | None]) -> Products | None:
+    """Sum over several parts of the frames."""
+    some = [one for one in found if one is not None]
+    if len(some) < 2:
+        return some[0] if some else None
+    names = "right", "normal", "line"
+    return replace(some[0], **{n: np.sum([getattr(o, n) for o in some], axis=0) for n in names})
+
+
+def share_sums(right: F64, normal: F64, read: float) -> tuple[F64, F64]:
+    """Least-squares sums (link, u, u), (link, u) of the shares, with the other terms free.
+
+    ``right``, ``normal``: as in `Products`, over classes instead of pixels. Unknown ``2 c`` is the
+    share that pixels of class c give over the link, ``2 c + 1`` the share that their partners give
+    back.
+    """
+    every = np.moveaxis(symmetric(np.moveaxis(normal, 1, -1)), 1, -1)
+    links, _, _, count = every.shape
+    own: F64 = np.zeros((links, count, 2, count, 2))
+    at = np.arange(count)
+    own[:, at, :, at] = np.moveaxis(every[:, :2, :2], -1, 0)
+    cross = np.moveaxis(every[:, :2, 2:], -1, 1).reshape(links, 2 * count, -1)
+    nuisance = every[:, 2:, 2:].sum(-1) + np.diag([read**-2, (BRIGHTER_FATTER * UNIT) ** -2])
+    taken = cross @ np.linalg.inv(nuisance)
+    shares = right[:, :2].swapaxes(1, 2).reshape(links, -1)
+    rest = shares - np.einsum("lun,ln->lu", taken, right[:, 2:].sum(-1))
+    return own.reshape(links, 2 * count, -1) - taken @ cross.swapaxes(1, 2), rest
+
+
+def square_terms(found: Products) -> tuple[F64, F64]:
+    """Covariance (link,) over the product of the charges, 1/(10⁴ e-), and its variance."""
+    right, normal = (part.sum((-2, -1), dtype=float) for part in (found.right, found.normal))
+    covariance = inverse_normal(symmetric(normal))
+    return np.einsum("lt,lt->l", covariance[:, -1], right), covariance[:, -1, -1]
 
 
 def _weights(part: Residuals) -> Frames:
-    """Frames whose products are the normal sums; one stands for all with the same charge."""
-    if not part.steady:
-        return part.one, part.charge, part.one
-    one = part.one.max(axis=0, keepdims=True)
-    # Both pixels of a pair count in a share of the frames; in all if neither is ever clipped.
-    weight = (part.one**2).sum(axis=0, keepdims=True) / np.float32(np.sqrt(len(part.one)))
-    return weight / np.maximum(one, TINY), part.charge.max(axis=0, keepdims=True), one
-
-
-_FAST = {"reassoc", "contract", "nsz", "arcp"}
-_LONG = 128  # frames up to which sequences are gathered
-_COLUMNS = 16  # columns processed at a time: with their partners they stay in the cache
+    """Few frames that stand for all (one where all are alike), as weights have no noise."""
+    every = slice(0, part.count, part.count if part.steady else -(-part.count // _ENOUGH))
+    weight, charge = part.weight[every], part.charge[every]
+    return weight * np.float32((part.count / len(weight)) ** 0.5), charge, part.good
 
 
 def _gathered(parts: Iterable[Residuals]) -> Iterator[list[Residuals]]:
-    """Short sequences together, as sums over few frames cost as much; long ones one by one."""
+    """Short sequences together, as sums over few frames cost as much."""
     some: list[Residuals] = []
     for part in parts:
-        if some and sum(len(p.e) for p in [*some, part]) > _LONG:
-            yield some
-            some = []
         some.append(part)
-        if len(part.e) >= _LONG:
-            # Freed before the next one, which is as large.
-            del part
+        del part
+        if sum(one.e.size for one in some) > _AT_ONCE:
             yield some
             some = []
     if some:
         yield some
 
 
-def _pieces(parts: Sequence[Frames]) -> Iterator[Sequence[Frames]]:
-    """Short sequences together and long ones in pieces, to limit the memory for powers."""
-    if short := [part for part in parts if len(part[0]) <= _LONG]:
-        yield short
-    for e, charge, one in parts:
-        if len(e) > _LONG:
-            for n in range(0, len(e), _LONG):
-                piece = slice(n, n + _LONG)
-                yield [(e[piece], charge[piece], one[piece])]
+def _add(parts: Sequence[Frames], terms: F32, links: Sequence[Place], sums: F32) -> None:
+    """Add to sums (link, term, y, x) products of the values of both pixels, over time."""
+    ny, nx = sums.shape[-2:]
+    reach, count = max((abs(dx) for _, dx in links), default=0), terms.shape[-1]
+    # With margins along x, so that all columns have partners.
+    time = sum(len(value) for value, *_ in parts)
+    powers, first = np.zeros((ny, nx + 2 * reach, count, time), np.float32), 0
+    for value, charge, good in parts:
+        own, inside = value.T, powers[:, reach : reach + nx, :, first : first + len(value)]
+        for power in range(count):
+            inside[:, :, power][good] = own
+            own = own * charge.T
+        first += len(value)
+    for dy, x in product({dy for dy, _ in links}, range(0, nx, _BLOCK)):
+        wide = min(_BLOCK, nx - x)
+        one, other = (
+            a.reshape(ny - dy, -1, powers.shape[-1])
+            for a in (powers[: ny - dy, reach + x : reach + x + wide],
+                      powers[dy:, x : x + wide + 2 * reach])
+        )  # fmt: skip
+        both = (one @ other.swapaxes(1, 2)).reshape(ny - dy, wide, count, -1, count)
+        for n, link in enumerate(links):
+            if link[0] == dy:
+                first = reach + link[1]
+                pairs = both[:, :, :, first : first + wide].diagonal(axis1=1, axis2=3)
+                sums[n, :, : ny - dy, x : x + wide] += np.tensordot(terms, pairs, ([1, 2],) * 2)
 
 
-def _powers(parts: Sequence[Frames], highest: int) -> tuple[F32, ...]:
-    """Factors over sigma, times the charge to the powers 0, 1, ...; one sequence after the other.
-
-    From (factor, charge over sigma, one over sigma), all (t, y, x), to (y, x, t).
-    """
-    count = sum(len(factor) for factor, _, _ in parts)
-    found = np.empty((highest + 1, *parts[0][0].shape[1:], count), np.float32)
-    first = 0
-    for factor, charge, one in parts:
-        # Row by row, to limit the memory for intermediate arrays.
-        for y in range(one.shape[1]):
-            value = factor[:, y] * one[:, y]
-            ratio = charge[:, y] / np.maximum(one[:, y], TINY)
-            for power in found[:, y, :, first : first + len(factor)]:
-                power[...] = value.T
-                value *= ratio
-        first += len(factor)
-    return tuple(found)
-
-
-@inner()
-def _add_pixels(sums: F32, y: int, first: int, out: F32) -> None:
-    """Add sums (pixel, link, n) of a row, from column ``first`` on, to all (link, n, y, x)."""
-    count = min(len(sums), out.shape[3] - first)
-    for n in range(out.shape[0]):
-        for i in range(out.shape[1]):
-            for x in range(count):
-                out[n, i, y, first + x] += sums[x, n, i]
-
-
-@kernel(fastmath=_FAST)
-def _add_right_sums(e0: F32, e1: F32, e2: F32, links: Any, right: F32) -> None:
-    """Add to the sums (link, 5, y, x), of powers of the charge times residuals (y, x, t)."""
-    ny, nx, nt = e0.shape
-    sums = np.empty((_COLUMNS, len(links), 5), np.float32)
-    for first in range(0, nx, _COLUMNS):
-        for y in range(ny):
-            sums[:] = 0
-            for x in range(first, min(first + _COLUMNS, nx)):
-                a0, a1, a2 = e0[y, x], e1[y, x], e2[y, x]
-                for n in range(len(links)):
-                    v, u = y + links[n, 0], x + links[n, 1]
-                    if v >= ny or u < 0 or u >= nx:
-                        continue
-                    b0, b1, b2 = e0[v, u], e1[v, u], e2[v, u]
-                    s10 = s01 = s00 = s11 = both20 = np.float32(0)
-                    for t in range(nt):
-                        s10 += a1[t] * b0[t]
-                        s01 += a0[t] * b1[t]
-                        s00 += a0[t] * b0[t]
-                        s11 += a1[t] * b1[t]
-                        both20 += a2[t] * b0[t] + a0[t] * b2[t]
-                    for i, value in enumerate((s10, s01, s00, s11, both20)):
-                        sums[x - first, n, i] = value
-            _add_pixels(sums, y, first, right)
-
-
-@kernel(fastmath=_FAST)
-def _add_normal_sums(w0: F32, w1: F32, w2: F32, w3: F32, w4: F32, links: Any, normal: F32) -> None:
-    """Add to the sums (link, 14, y, x), of powers of the charge over the variance (y, x, t)."""
-    ny, nx, nt = w0.shape
-    sums = np.empty((_COLUMNS, len(links), NORMALS), np.float32)
-    for first in range(0, nx, _COLUMNS):
-        for y in range(ny):
-            sums[:] = 0
-            for x in range(first, min(first + _COLUMNS, nx)):
-                a0, a1, a2, a3, a4 = w0[y, x], w1[y, x], w2[y, x], w3[y, x], w4[y, x]
-                for n in range(len(links)):
-                    v, u = y + links[n, 0], x + links[n, 1]
-                    if v >= ny or u < 0 or u >= nx:
-                        continue
-                    b0, b1, b2, b3, b4 = w0[v, u], w1[v, u], w2[v, u], w3[v, u], w4[v, u]
-                    s00 = s10 = s01 = s20 = s11 = s02 = np.float32(0)
-                    s21 = s12 = s22 = s30 = s03 = both31 = both40 = np.float32(0)
-                    for t in range(nt):
-                        s00 += a0[t] * b0[t]
-                        s10 += a1[t] * b0[t]
-                        s01 += a0[t] * b1[t]
-                        s20 += a2[t] * b0[t]
-                        s11 += a1[t] * b1[t]
-                        s02 += a0[t] * b2[t]
-                        s21 += a2[t] * b1[t]
-                        s12 += a1[t] * b2[t]
-                        s22 += a2[t] * b2[t]
-                        s30 += a3[t] * b0[t]
-                        s03 += a0[t] * b3[t]
-                        both31 += a3[t] * b1[t] + a1[t] * b3[t]
-                        both40 += a4[t] * b0[t] + a0[t] * b4[t]
-                    found = (
-                        s20, s11, s02, s10, s01, s00, s21, s12, s22, s30 + s12, s21 + s03,
-                        s20 + s02, both31, both40 + np.float32(2) * s22,
-                    )  # fmt: skip
-                    for i, value in enumerate(found):
-                        sums[x - first, n, i] = value
-            _add_pixels(sums, y, first, normal)
-
-
-def _variance(part: Residuals) -> tuple[F64, F64]:
-    """Sums of the variance of single pixels against shot noise, a constant and its square."""
-    # The squares of the modes are the variance that was removed from the residuals.
-    terms = np.stack([part.shot * part.one, part.one**2, part.shot**2]).reshape(3, -1)
-    some = terms.reshape(3, *part.one.shape)[:, ::STRIDE].reshape(3, -1)
-    removed_variance = (part.modes**2).sum(axis=0).ravel()
-    right = terms @ (part.e**2).ravel() + some @ removed_variance
-    return (terms @ terms.T).astype(float), right.astype(float)
+def _variance(part: Residuals) -> F64:
+    """Normal equations (3, 4) of the variance of single pixels."""
+    weight, charge = part.weight, part.charge
+    terms = np.stack([weight * charge, weight, weight * charge**2]).reshape(3, -1)
+    square = (part.e**2 / np.where(weight > 0, weight, 1)).ravel()
+    own = terms[:, : weight[: part.count].size]
+    return np.column_stack([own @ own.T, terms @ square]).astype(float)

@@ -14,20 +14,19 @@ from scipy.ndimage import maximum_filter, median_filter
 
 from pixcal.estimators.crosstalk.links import REACH, PixelClasses, Place
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.kernels.crosstalk import Coupling, couple, outflow
+from pixcal.kernels.crosstalk import Coupling, uncouple
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.arrays import F64, Indices, Mask
 
 MIN_SIGMAS = 40.0  # dark signal of a hot pixel over the noise of the others
 OVERLAP = 0.01  # signal of another hot pixel near a receiver, over the source, that spoils it
 OVERLAP_KNOWN = 0.5  # the same where its contribution is known and subtracted
-UNSURE = 0.3  # relative error of the subtracted contribution
 OWN_RING = 0.1  # a pixel below this share of a neighbour may be due to it: no source
 # values beyond this many errors from the median of their class are excluded, if they are few
 CLIP = 5.0
+DOUBT = 0.25  # relative error of the share from a single hot pixel: its neighbour may be warm
 RISE = 1e-4  # typical rise of a share with the charge by brighter-fatter, 1/ke-
 ENOUGH = 4  # values beyond the first that separate a rise with the charge from disagreement
-MIN_LEVELS = 3  # fewest hot pixels of a coupling for a change of its share with the signal
 MAX_PIXELS = 4000  # hot pixels used, the brightest
 
 
@@ -43,52 +42,26 @@ class HotPixels:
     value: F64
     sigma: F64
 
-    def corrected(self, outflow: F64, per_ke: float) -> "HotPixels":
-        """Shares of a hot pixel's original charge, at small signals, from those of what it kept.
-
-        Each pixel loses the share ``outflow`` (y, x), which changes with the charge by ``per_ke``,
-        1/ke-.
-        """
-        lost = outflow[self.y, self.x]
-        charge = self.charge / (1 - lost * (1 + per_ke * self.charge))
-        kept = (1 - lost * (1 + per_ke * charge)) / (1 + per_ke * charge)
-        at = kept[:, None, None]
-        return replace(self, charge=charge, value=self.value * at, sigma=self.sigma * np.abs(at))
+    def of(self, links: Sequence[int]) -> "HotPixels":
+        """Those of some links."""
+        return replace(self, value=self.value[:, links], sigma=self.sigma[:, links])
 
     def by_class(
-        self, classes: PixelClasses, links: tuple[Place, ...], doubt: float = 0.0
+        self, classes: PixelClasses, links: Sequence[Place], doubted: bool = False
     ) -> "ClassShares":
-        """Combined hot pixels of each class; ``doubt``: relative error of each."""
+        """Combined hot pixels of each class; ``doubted``: `DOUBT` even those that agree."""
         step = np.array(links)[:, :, None] * [0, 1]
         y, x = self.y[:, None, None] - step[:, 0], self.x[:, None, None] - step[:, 1]
         order = np.argsort(self.value, axis=0)
-        every = (self.value, np.hypot(self.sigma, doubt * self.value), classes.of(y, x))
-        value, sigma, number = (np.take_along_axis(a, order, 0) for a in every)
-        found = [
-            _agreed(value, np.where(number == n, sigma, np.inf), self.charge[order])
-            for n in range(classes.count)
-        ]
+        value, sigma = (np.take_along_axis(a, order, 0) for a in (self.value, self.sigma))
+        number = np.take_along_axis(classes.of(y, x), order, 0)
+        found = []
+        for n in range(classes.count):
+            near = np.where(number == n, sigma, np.inf)
+            alone = doubted | (np.isfinite(near).sum(axis=0) == 1)
+            doubt = np.where(alone, DOUBT, 0.0) * value
+            found.append(_agreed(value, np.hypot(near, doubt), self.charge[order]))
         return ClassShares(*np.stack(found, axis=2))
-
-    def level_dependence(
-        self, couplings: Sequence[Coupling], links: Sequence[Place], first: Place
-    ) -> tuple[float, float]:
-        """Relative change of the shares with the signal, 1/ke-, common to all, and its error."""
-        right = weight = 0.0
-        for c in couplings:
-            step, side = ((c.dy, c.dx), 0) if (c.dy, c.dx) in links else ((-c.dy, -c.dx), 1)
-            classes = PixelClasses(c.every_rows, c.every_columns, first)
-            own = classes.of(self.y, self.x) == c.row * c.every_columns + c.column
-            value = self.value[own, links.index(step), side]
-            sigma = self.sigma[own, links.index(step), side]
-            near = np.isfinite(sigma) & (np.abs(value - c.share) < 0.5 * abs(c.share))
-            if near.sum() < MIN_LEVELS:
-                continue
-            w, charge = sigma[near] ** -2, self.charge[own][near]
-            slope = c.share * (charge - np.average(charge, weights=w))
-            right += float((w * slope) @ value[near])
-            weight += float(w @ slope**2)
-        return (right / weight, weight**-0.5) if weight > 0 else (0.0, np.inf)
 
 
 @dataclass(frozen=True)
@@ -104,16 +77,6 @@ class ClassShares:
     # share
     square: F64
     product: F64
-    count: F64  # hot pixels used
-
-    def without(self, some: Mask) -> "ClassShares":
-        """The same with zero weight for ``some``."""
-        return replace(
-            self,
-            weight=np.where(some, 0.0, self.weight),
-            square=np.where(some, 0.0, self.square),
-            product=np.where(some, 0.0, self.product),
-        )
 
     def sums(self) -> tuple[F64, F64]:
         """Least-squares sums (link, u, u), (link, u) of the shares at small signals."""
@@ -129,26 +92,25 @@ class ClassShares:
 
 
 def hot_pixels(
-    evidence: Evidence, links: tuple[Place, ...], known: Sequence[Coupling] = ()
+    evidence: Evidence, links: Sequence[Place], known: Sequence[Coupling] = ()
 ) -> HotPixels | None:
-    """Find hot pixels and shares in their neighbours; None where no dark signal was measured."""
+    """Find hot pixels and shares in their neighbours; None where no dark signal was measured.
+
+    ``known``: couplings that the dark signal is freed of first; shares are what is left.
+    """
     exposures = [s.exptime_s for s in evidence.of_kind("dark") if np.isfinite(s.exptime_s)]
     if not exposures or not np.any(evidence.dark_rate):
         return None
-    signal = evidence.dark_rate * max(exposures)
+    signal = uncouple(evidence.dark_rate * max(exposures), known, evidence.origin)
     # Pixels far from saturation in every dark.
     usable = np.ones(evidence.good.shape, bool)
     for stack in evidence.of_kind("dark"):
         usable &= stack.adu.mean(axis=0) < 0.9 * evidence.saturation_adu
-    return hot_pixels_of(signal, usable, evidence.origin, links, known)
+    return hot_pixels_of(signal, usable, links, OVERLAP_KNOWN if known else OVERLAP)
 
 
 def hot_pixels_of(
-    signal: F64,
-    usable: Mask,
-    origin: Place,
-    links: tuple[Place, ...],
-    known: Sequence[Coupling] = (),
+    signal: F64, usable: Mask, links: Sequence[Place], overlap: float = OVERLAP
 ) -> HotPixels | None:
     """The same of the mean signal (y, x) of darks, e-, of pixels that do not saturate."""
     rest = signal - median_filter(signal, 2 * REACH + 5, mode="reflect")
@@ -161,51 +123,20 @@ def hot_pixels_of(
     y, x = y[order], x[order]
     if not len(y):
         return None
-    least = MIN_SIGMAS * noise / 10
-    warm = np.where((rest > least) & highest, rest, 0.0)
-    kept = 1 - outflow(known, rest.shape, origin)
-
-    def given(warm: F64) -> tuple[F64, F64]:
-        """Charge (y, x) received from all hot pixels, e-; the share (h, link, 2) of each in it."""
-        collected = warm / kept
-        got = couple(collected, known, origin) - collected * kept
-        shares = np.zeros((len(y), len(links), 2))
-        for c in known:
-            source = np.zeros(rest.shape)
-            source[c.places(rest.shape, origin)[0]] = c.share
-            step, side = ((c.dy, c.dx), 0) if (c.dy, c.dx) in links else ((-c.dy, -c.dx), 1)
-            level = 1 + c.per_ke * 1e-3 * collected[y, x]
-            shares[:, links.index(step), side] += source[y, x] * level / kept[y, x]
-        return got, shares
-
-    got, shares = given(warm)
-    if known:
-        # Pixels with much more signal than they receive are warm themselves.
-        warm = np.where((warm > 0) | (rest - got > np.maximum(least, got)), rest, 0.0)
-        got, shares = given(warm)
-    rest = rest - got
-    charge = rest[y, x]
+    charge, size = rest[y, x], 2 * REACH
+    # Warm pixels spoil receivers, their own and those around them.
+    around = _surroundings(rest, y, x, REACH)
+    warm = _surroundings(np.where((rest > MIN_SIGMAS / 10 * noise) & highest, rest, 0), y, x, size)
+    warm[:, size, size] = 0
+    strongest = maximum_filter(np.nan_to_num(warm), (1, size + 1, size + 1), mode="constant")
+    strongest = strongest[:, REACH:-REACH, REACH:-REACH]
+    around, strongest = (a / charge[:, None, None] for a in (around, strongest))
+    with np.errstate(invalid="ignore"):
+        clean = (around < OWN_RING) & (strongest < overlap)
     step = np.array(links)[:, :, None] * [1, -1]
     at = slice(None), REACH + step[:, 0], REACH + step[:, 1]
-    around, clean = _patches(rest, warm, y, x, OVERLAP_KNOWN if known else OVERLAP)
-    others = _surroundings(got, y, x, REACH)[at] / charge[:, None, None] - shares
-    value = around[at] / charge[:, None, None] + shares
-    sigma = np.hypot(noise / charge[:, None, None], UNSURE * others)
-    value, sigma = np.where(clean[at], value, 0.0), np.where(clean[at], sigma, np.inf)
-    return HotPixels(y, x, charge * 1e-3, value, sigma)
-
-
-def _patches(rest: F64, warm: F64, y: Indices, x: Indices, overlap: float) -> tuple[F64, Mask]:
-    """Surroundings (h, row, column) of hot pixels, and where no other hot pixel disturbs them."""
-    size = 2 * REACH
-    near = _surroundings(rest, y, x, REACH)
-    others = np.nan_to_num(_surroundings(warm, y, x, size))
-    others[:, size, size] = 0.0
-    strongest = maximum_filter(others, (1, size + 1, size + 1), mode="constant")
-    strongest = strongest[:, REACH:-REACH, REACH:-REACH]
-    charge = rest[y, x][:, None, None]
-    with np.errstate(invalid="ignore"):
-        return near, (near < OWN_RING * charge) & (strongest < overlap * charge)
+    sigma = np.where(clean[at], (noise / charge)[:, None, None], np.inf)
+    return HotPixels(y, x, charge * 1e-3, np.where(clean[at], around[at], 0.0), sigma)
 
 
 def _surroundings(values: F64, y: Indices, x: Indices, size: int) -> F64:
@@ -216,7 +147,7 @@ def _surroundings(values: F64, y: Indices, x: Indices, size: int) -> F64:
 
 
 def _agreed(v: F64, s: F64, q: F64) -> F64:
-    """Sums (6, ...) of `ClassShares`, of values (h, ...) in rising order and charges."""
+    """Sums (5, ...) of `ClassShares`, of values (h, ...) in rising order and charges."""
     w = s**-2.0
     used, half = w > 0, w.sum(axis=0) / 2
     middle = np.take_along_axis(v, np.argmax(np.cumsum(w, axis=0) >= half, axis=0)[None], 0)
@@ -241,4 +172,4 @@ def _agreed(v: F64, s: F64, q: F64) -> F64:
     usual = (1 - 2 / (9 * some) + 3.09 * np.sqrt(2 / (9 * some))) ** 3
     apart = (freedom > 0) & (rest > usual * freedom)
     less = np.where(apart, freedom / np.where(apart, rest, 1), 1)
-    return np.stack([total * less, mean, charge, square * less, product * less, count])
+    return np.stack([total * less, mean, charge, square * less, product * less])

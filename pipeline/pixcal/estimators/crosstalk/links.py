@@ -1,7 +1,7 @@
 """Pairs of pixels that may couple, and classes of pixels that may couple in the same way."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -40,20 +40,6 @@ class PixelClasses:
         """Class of pixels of the arrays."""
         row, column = (y + self.first[0]) % self.rows, (x + self.first[1]) % self.columns
         return np.asarray(row * self.columns + column)
-
-    def divisors(self) -> list["PixelClasses"]:
-        """Classes of all periods that divide this one, the shortest first."""
-        rows, columns = (
-            [n for n in range(1, period + 1) if period % n == 0]
-            for period in (self.rows, self.columns)
-        )
-        found = [replace(self, rows=n, columns=m) for n, m in product(rows, columns)]
-        return sorted(found, key=lambda classes: classes.count)
-
-    def groups_of(self, finer: "PixelClasses") -> Indices:
-        """Class of this period to which each class of a multiple of it belongs."""
-        row, column = np.divmod(np.arange(finer.count), finer.columns)
-        return np.asarray(row % self.rows * self.columns + column % self.columns)
 
 
 def periods(shape: tuple[int, ...]) -> list[Place]:

@@ -22,7 +22,7 @@ def trail_warnings(calibration: Place, source: Ingested, gain: float) -> list[st
         for name in ("dark_rate", "bias")
     )
     usable = bias + rate * seconds / gain < _FULL * source.saturation("dark")
-    found = hot_pixels_of(rate * seconds, usable, (y0, x0), LINKS)
+    found = hot_pixels_of(rate * seconds, usable, LINKS)
     trails = None if found is None else trails_of(found, rate.shape, (y0, x0))
     middle = (y0 + y1) / 2, (x0 + x1) / 2
     said = [

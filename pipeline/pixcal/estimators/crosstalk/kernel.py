@@ -1,0 +1,301 @@
+"""A whole kernel: every coupling within two pixels, shrunk by its error instead of dropped.
+
+All is linear in what remains of the shares once frames, dark signal and maps are freed of the
+couplings known so far (`sources`); a few steps of least squares give the kernel. A share is a sum
+of a part common to all classes and both directions, a part common to all classes in one direction,
+and its own part. The sizes of these parts are learnt from all couplings of a kind (empirical Bayes,
+by expectation and maximisation), which makes undetected parts small. Of all periods, the one of the
+greatest evidence is taken.
+"""
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+from math import lcm
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.special import chdtrc
+
+from pixcal.estimators.crosstalk.links import PixelClasses, Place, links
+from pixcal.estimators.crosstalk.sources import Sources, sources_of, total
+from pixcal.estimators.crosstalk.support import standing_out
+from pixcal.estimators.crosstalk.trails import SURE, trailing
+from pixcal.estimators.diagnosis.evidence import Evidence, central_crop
+from pixcal.kernels.crosstalk import Coupling, largest_outflow
+from pixcal.model.arrays import F64, Indices
+from pixcal.model.errors import InputError
+
+WITHIN = 2  # rows and columns of the kernel on either side of its centre
+MAX_SHARES = 480  # most shares measured together: time goes with the third power of their number
+ITERATIONS = 60  # of expectation and maximisation
+FEW = 20  # the same for a comparison of periods
+# prior size of a part of a share, and of a true pattern (px), with the weight of one value
+USUAL, PATTERN = 4e-4, 1e-4
+START = (1e-2, 1e-3)  # start values of these sizes
+STEPS = 6  # most steps of least squares
+STILL = 0.3  # standard errors by which a step that is not the last moves
+CERTAIN = 5.0  # sigmas beyond which a level dependence is accepted
+# sigmas beyond which a coupling is reported: with a hundred tested, one false in twenty kernels
+THERE = 3.5
+# most pixels of flats: their sums of pairs up to `links.REACH` apart fill 400 MB
+MOST_PIXELS = 1 << 17
+WORTH = 16.0  # fall in chi-square of the visibility required of another class of pixels
+ALIKE = 0.05  # p-value from which the shares of all classes are taken as equal
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """Couplings as measured."""
+
+    couplings: tuple[Coupling, ...]
+    covariance: F64  # (n, n) of their shares
+    methods: tuple[str, ...]  # of measurement
+    log_evidence: float
+    # relative change of the shares with the source's signal, 1/ke-, and its error
+    per_ke: tuple[float, float] = (0.0, np.inf)
+
+    @property
+    def shares(self) -> F64:
+        """Of the couplings."""
+        return np.array([c.share for c in self.couplings])
+
+    @property
+    def errors(self) -> F64:
+        """Of the shares."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def significance(evidence: Evidence) -> float | None:
+    """Of the strongest coupling, in sigmas, corrected for the number of trials."""
+    sources = _examined(evidence)[1]
+    return None if sources is None else standing_out(sources)[1]
+
+
+def measure(evidence: Evidence) -> tuple[Kernel | None, float] | None:
+    """All couplings within two pixels, if any is significant, and the significance.
+
+    None where there is neither light nor dark signal. Raises InputError if too many are significant
+    for a kernel, or its period is too long.
+    """
+    evidence, sources = _examined(evidence)
+    if sources is None:
+        return None
+    there, sigmas = standing_out(sources)
+    if not there:
+        return None, sigmas
+    near, classes = within(sources.shape, there), best_period(sources.of(there))
+    kernel = _kernel(sources.of(near), classes)
+    del sources  # large
+    for _ in range(STEPS):
+        found = sources_of([evidence], lambda _: near, _there(kernel))
+        assert found is not None
+        before, kernel = kernel, _with_level(_kernel(found, classes, kernel.per_ke[0]), found)
+        change = kernel.per_ke[0] - before.per_ke[0]
+        moved = np.abs(kernel.shares - before.shares) * largest_outflow(kernel.couplings)
+        if abs(change) < STILL * kernel.per_ke[1] and (moved < STILL * kernel.errors).all():
+            break
+    return kernel, sigmas
+
+
+def dense_kernel(parts: Iterable[Evidence], start: tuple[Coupling, ...]) -> Kernel | None:
+    """Measure all couplings of the period of a kernel; None without light and dark signal.
+
+    ``parts``: of the same pixels, with different frames. ``start``: couplings found so
+    far; they set the period and any coupling beyond `WITHIN`.
+    """
+    far = {(c.dy, c.dx) for c in start} | {(-c.dy, -c.dx) for c in start}
+    rows, columns = (lcm(*(getattr(c, n) for c in start)) for n in ("every_rows", "every_columns"))
+    found = sources_of(parts, lambda shape: within(shape, far), start)
+    return None if found is None else _kernel(found, PixelClasses(rows, columns, found.first))
+
+
+def within(shape: tuple[int, ...], far: Collection[Place] = ()) -> tuple[Place, ...]:
+    """Steps to partners within `WITHIN` pixels, and those in ``far``."""
+    return tuple(s for s in links(shape) if max(map(abs, s)) <= WITHIN or s in far)
+
+
+def significant(kernel: Kernel) -> tuple[tuple[Coupling, ...], F64]:
+    """The significant couplings, those alike in all classes as one, and their covariance."""
+    each = np.eye(len(kernel.couplings))
+    steps: dict[Place, list[int]] = {}
+    for n, c in enumerate(kernel.couplings):
+        steps.setdefault((c.dy, c.dx), []).append(n)
+    basis, found = [], []
+    for at in steps.values():
+        precision = np.linalg.inv(kernel.covariance[np.ix_(at, at)])
+        rest = kernel.shares[at] - precision.sum(axis=0) @ kernel.shares[at] / precision.sum()
+        alike = chdtrc(max(len(at) - 1, 1), max(float(rest @ precision @ rest), 0.0)) > ALIKE
+        for group in [at] if alike else [[n] for n in at]:
+            # Noise alone measures the sum of the shares there and back (neighbours in the list): a
+            # pair whose sum is significant has both, as long as they cannot be distinguished.
+            own, back = (each[[n ^ way for n in group]].sum(axis=0) for way in (0, 1))
+            both, apart = _sigmas(kernel, own + back), _sigmas(kernel, own - back)
+            if _sigmas(kernel, own) > THERE or both > THERE > apart:
+                one = kernel.couplings[group[0]]
+                if alike:
+                    one = replace(one, every_rows=1, row=0, every_columns=1, column=0)
+                basis.append(own)
+                found.append(one)
+    if not found:
+        return (), np.zeros((0, 0))
+    precision, columns = np.linalg.inv(kernel.covariance), np.array(basis).T
+    covariance = np.linalg.inv(columns.T @ precision @ columns)
+    shares = covariance @ columns.T @ precision @ kernel.shares
+    # Shares that may be equal keep their individual errors.
+    for n, column in enumerate(columns.T > 0):
+        covariance[n, n] = max(covariance[n, n], np.diag(kernel.covariance)[column].mean())
+    named = zip(found, shares.tolist(), strict=True)
+    return tuple(replace(c, share=share) for c, share in named), covariance
+
+
+def _sigmas(kernel: Kernel, column: F64) -> float:
+    """Significance of the sum of some shares."""
+    return abs(float(column @ kernel.shares)) / float(np.sqrt(column @ kernel.covariance @ column))
+
+
+def _examined(evidence: Evidence) -> tuple[Evidence, Sources | None]:
+    """The pixels examined, and what frames tell of all their links."""
+    if trailing(evidence) > SURE:
+        raise InputError(
+            "not decided: charge trails hot pixels in one direction, the farther they are from the "
+            "output the more, as incomplete charge transfer leaves it; this is no crosstalk"
+        )
+    if not evidence.fringes:
+        evidence = central_crop(evidence, MOST_PIXELS)
+    every = links(evidence.good.shape)
+    return evidence, sources_of([evidence], lambda _: every) if every else None
+
+
+def _there(kernel: Kernel) -> tuple[Coupling, ...]:
+    """Couplings that are significant by themselves."""
+    there = np.abs(kernel.shares) > THERE * kernel.errors
+    return tuple(c for c, own in zip(kernel.couplings, there, strict=True) if own)
+
+
+def best_period(sources: Sources) -> PixelClasses:
+    """The classes of the period of the greatest evidence."""
+
+    def score(found: tuple[PixelClasses, F64, F64]) -> float:
+        classes, normal, right = found
+        own = shrunk(block_diag(*normal), right.ravel(), sources.links, classes.count, rounds=FEW)
+        pattern = 0.0 if sources.maps is None else sources.maps.pattern(classes)
+        return own[-1] + (pattern - WORTH * (classes.count - 1)) / 2
+
+    return max(sources.every_period(), key=score)[0]
+
+
+def _with_level(kernel: Kernel, found: Sources) -> Kernel:
+    """The kernel with the relative fall (1/ke-) of shares with the signal."""
+    # Shares that rise may be due to brighter-fatter; those that fall are not.
+    more, error = found.level_dependence(_there(kernel))
+    now = kernel.per_ke[0] + more
+    now = now if now < -CERTAIN * error else 0.0
+    couplings = tuple(replace(c, per_ke=now) for c in kernel.couplings)
+    return replace(kernel, couplings=couplings, per_ke=(now, error))
+
+
+def _kernel(sources: Sources, classes: PixelClasses, per_ke: float = 0.0) -> Kernel:
+    """All couplings of the links for the classes of a period.
+
+    With ``per_ke``, maps are not used, as they are of one level.
+    """
+    every = tuple(
+        coupling_of(classes, *divmod(u, 2), step)
+        for step in sources.links
+        for u in range(2 * classes.count)
+    )
+    if len(every) > MAX_SHARES:
+        raise InputError(
+            "not decided: a kernel of that period has more couplings than can be measured"
+        )
+    known = _shares_of(every, sources.known)
+    by_source = sources.of_period(classes)
+    normal, right = total(by_source)
+    whole, rights, free = block_diag(*normal), right.ravel(), 0
+    if sources.maps is not None and not per_ke:
+        free = 2 * classes.count
+        more, of_maps = sources.maps.sums(every, classes)
+        whole = block_diag(whole, np.zeros((free, free))) + more
+        rights = np.concatenate([rights, np.zeros(free)]) + of_maps
+    rights = rights + whole[:, : len(every)] @ known
+    shares, covariance, log_evidence = shrunk(whole, rights, sources.links, classes.count, free)
+    couplings = zip(every, shares.tolist(), strict=True)
+    return Kernel(
+        tuple(replace(c, share=share, per_ke=per_ke) for c, share in couplings),
+        covariance,
+        (*by_source, *["maps"] * bool(free)),
+        log_evidence,
+        (per_ke, np.inf),
+    )
+
+
+def coupling_of(classes: PixelClasses, number: int, back: int, step: Place) -> Coupling:
+    """What a class gives over a step, or gets back; without its share."""
+    (dy, dx), (row, column) = step, divmod(number, classes.columns)
+    if back:
+        # From the partner, which is of another class.
+        row, column, dy, dx = (row + dy) % classes.rows, (column + dx) % classes.columns, -dy, -dx
+    return Coupling(dy, dx, 0.0, classes.rows, row, classes.columns, column)
+
+
+def _shares_of(every: Sequence[Coupling], known: Sequence[Coupling]) -> F64:
+    """Shares of all couplings where some, of shorter periods too, are known."""
+    shares = np.zeros(len(every))
+    for k in known:
+        for n, c in enumerate(every):
+            same = (k.dy, k.dx, k.row, k.column)
+            if same == (c.dy, c.dx, c.row % k.every_rows, c.column % k.every_columns):
+                shares[n] += k.share
+    return shares
+
+
+def shrunk(
+    normal: F64,
+    right: F64,
+    steps: Sequence[Place],
+    classes: int,
+    free: int = 0,
+    rounds: int = ITERATIONS,
+) -> tuple[F64, F64, float]:
+    """Shares, their covariance, and the logarithm of the evidence.
+
+    From least-squares sums (n + free, n + free), (n + free,) of the shares, and of a true pattern.
+    """
+    basis, group = _parts(steps, classes)
+    shares = len(basis)
+    basis = block_diag(basis, np.eye(free))
+    group = np.concatenate([group, np.full(free, group.max() + 1)])
+    inner, inner_right = basis.T @ normal @ basis, basis.T @ right
+    usual = np.full(group.max() + 1, USUAL)
+    size = np.full(len(usual), START[0])
+    if free:
+        usual[-1], size[-1] = PATTERN, START[1]
+    count = np.bincount(group)
+    for _ in range(rounds):
+        covariance = np.linalg.inv(inner + np.diag(size[group] ** -2.0))
+        value = covariance @ inner_right
+        square = np.bincount(group, value**2 + np.diag(covariance))
+        last, size = size, np.sqrt((square + usual**2) / (count + 1))
+    evidence = (
+        value @ inner_right + np.linalg.slogdet(covariance)[1] - 2 * np.log(last[group]).sum()
+    )
+    own = basis @ covariance @ basis.T
+    return (basis @ value)[:shares], own[:shares, :shares], float(evidence / 2)
+
+
+def _parts(steps: Sequence[Place], classes: int) -> tuple[F64, Indices]:
+    """Parts of shares (share, part), and which of them (part,) have a common size."""
+    size = 2 * classes
+    common = np.kron(np.eye(len(steps)), np.ones((size, 1)))
+    one_way = common * np.tile([1.0, -1.0], len(steps) * classes)[:, None]
+    # Couplings of similar size: along rows, along columns, or diagonal, by distance.
+    kinds = [
+        (abs(dy), abs(dx)) if not dy * dx else (max(abs(dy), abs(dx)),) * 2 for dy, dx in steps
+    ]
+    names = sorted(set(kinds))
+    number = np.array([names.index(kind) for kind in kinds])
+    columns, groups = [common, one_way], [number, len(names) + number]
+    if classes > 1:
+        columns.append(np.eye(size * len(steps)))
+        groups.append(2 * len(names) + np.repeat(number, size))
+    return np.hstack(columns), np.concatenate(groups)
