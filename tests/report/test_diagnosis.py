@@ -513,10 +513,8 @@ def a_map(sigma: float, after: float) -> dict[str, Any]:
 def test_the_map_shows_the_cell_that_is_off_where_it_lies() -> None:
     (panel,) = maps.panels((70, 90), (), [a_map(8.0, 1.0), a_map(1.0, 0.5), a_curve()])
     assert len(panel.spots) == 16
-    (off,) = [s for s in panel.spots if s.sigmas[0] > 1]
-    assert off.rows == (17.5, 35.0)
-    assert off.columns == (45.0, 67.5)
-    assert off.sigmas == (8.0, 1.0)
+    (off,) = panel.spots[panel.spots[:, 4] > 1].tolist()
+    assert off == [17.5, 35.0, 45.0, 67.5, 8.0, 1.0]
     drawn = [
         picture(maps.where_figure((70, 90), [panel], with_after=after)) for after in (False, True)
     ]
@@ -534,12 +532,11 @@ def test_windows_of_a_large_detector_are_drawn_where_they_are_and_large_enough()
     ]
     (panel,) = maps.panels((8320, 5456), places, [a_map(50.0, 50.0)])
     assert panel.title == "space"
-    for spot in panel.spots:
-        (top, left), (high, wide) = maps._shown(spot, (8320, 5456))
-        assert high > 1000
-        assert wide > 600
-        assert top <= spot.rows[0] <= spot.rows[1] <= top + high <= 8320
-        assert left <= spot.columns[0] <= spot.columns[1] <= left + wide <= 5456
+    for spot in panel.spots.tolist():
+        for (first, last), whole, least in ((spot[:2], 8320, 1000), (spot[2:4], 5456, 600)):
+            start, size = maps._shown(first, last, whole)
+            assert size > least
+            assert start <= first <= last <= start + size <= whole
 
 
 @pytest.mark.usefixtures("without_figures")

@@ -1,7 +1,6 @@
 """The figure of a budget: precision against frames, and the gain of changes of the bench."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import cycle
 from typing import Any
 
@@ -14,6 +13,8 @@ from pixcal.model.arrays import F64
 from pixcal.report.colours import BAR, BLUE, GREEN, GREY, INK, MARKS, RED
 from pixcal.report.drawing import WIDE, finish, new_figure, note, plain_ticks, second_axis
 from pixcal.report.text import duration, number
+
+Facts = Mapping[str, Any]
 
 COLOURS = (BLUE, GREEN, *MARKS)
 CLOCK = {
@@ -28,21 +29,6 @@ CLOCK = {
 }
 
 
-@dataclass(frozen=True)
-class PrecisionLine:
-    """Precision against frames: one over their root."""
-
-    label: str
-    median: float  # median, worst: bound of one frame, px, for the median and for the worst pixel
-    worst: float
-    planned: int  # frames of the bench
-
-    @property
-    def spread(self) -> bool:
-        """Whether the worst pixel is noticeably worse than the median one."""
-        return self.worst > 1.01 * self.median
-
-
 def budget_figure(result: Mapping[str, Any]) -> Figure:
     """Of ``budget.json``: precision against frames, and time with each change of the bench."""
     figure = new_figure(WIDE, 4.9)
@@ -53,54 +39,52 @@ def budget_figure(result: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _lines(entries: Mapping[str, Any]) -> list[PrecisionLine]:
-    lines = []
-    for name, facts in entries.items():
-        period = f" ({facts['interfringe_px']:.3g} px)" if "interfringe_px" in facts else ""
-        frame, planned = facts["frame_px"], facts["planned"]["frames"]
-        lines.append(PrecisionLine(name + period, frame["median"], frame["worst"], planned))
-    return lines
-
-
-def _span(
-    sets: Sequence[PrecisionLine], joined: Sequence[PrecisionLine], result: Mapping[str, Any]
-) -> F64:
+def _span(sets: Sequence[Facts], every: Sequence[Facts], result: Facts) -> F64:
     """Range of the frame axis, with a margin around all marks."""
-    precision, frames = result["precision_px"], result["frames"]
-    marks = [float(line.planned) for line in (*sets, *joined)]
-    if frames:
-        marks.append(float(frames))
+    precision, marks = result["precision_px"], [float(one["planned"]["frames"]) for one in every]
+    if result["frames"]:
+        marks.append(float(result["frames"]))
     if precision:
-        bounds = [*(line.median for line in (*sets, *joined)), *(line.worst for line in sets)]
+        bounds = [one["frame_px"]["median"] for one in every]
+        bounds += [one["frame_px"]["worst"] for one in sets]
         marks += [(bound / precision) ** 2 for bound in bounds]
     low, high = np.log10(max(min(marks) / 5, 1.0)), np.log10(max(marks) * 4)
     return np.logspace(low, high, 61)
 
 
+def _uneven(facts: Facts) -> bool:
+    """Whether the worst pixel is noticeably worse than the median one."""
+    return bool(facts["frame_px"]["worst"] > 1.01 * facts["frame_px"]["median"])
+
+
 def _precision(axes: Axes, result: Mapping[str, Any], period: float) -> None:
-    sets = _lines(result["sets"])
-    joined = _lines(result["joined"]["components"]) if len(sets) > 1 else []
+    sets = result["sets"]
+    joined = result["joined"]["components"] if len(sets) > 1 else {}
+    every = [*sets.values(), *joined.values()]
     wanted, given = result["precision_px"], result["frames"]
-    frames = _span(sets, joined, result)
-    for order, (line, colour) in enumerate(zip(sets, cycle(COLOURS), strict=False)):
+    frames = _span([*sets.values()], every, result)
+    for order, ((name, facts), colour) in enumerate(zip(sets.items(), cycle(COLOURS))):
         # Sets are often alike: later ones are thinner, so that none is hidden.
         before = len(sets) - 1 - order
-        bound = line.median / np.sqrt(frames)
-        axes.plot(frames, bound, color=colour, lw=2.0 + 3.0 * before, label=line.label)
-        if line.spread:
-            worst = line.worst / np.sqrt(frames)
+        median, planned = facts["frame_px"]["median"], facts["planned"]["frames"]
+        if "interfringe_px" in facts:
+            name += f" ({facts['interfringe_px']:.3g} px)"
+        bound = median / np.sqrt(frames)
+        axes.plot(frames, bound, color=colour, lw=2.0 + 3.0 * before, label=name)
+        if _uneven(facts):
+            worst = facts["frame_px"]["worst"] / np.sqrt(frames)
             axes.fill_between(frames, bound, worst, color=colour, alpha=0.18, lw=0)
-        reached = line.median / np.sqrt(line.planned)
-        axes.plot(line.planned, reached, "o", color=colour, ms=8 + 3 * before)
-    for line, colour, style in zip(joined, (INK, GREY), ("-", "--"), strict=False):
-        bound, label = line.median / np.sqrt(frames), f"{line.label}, frames of all sets"
+        axes.plot(planned, median / np.sqrt(planned), "o", color=colour, ms=8 + 3 * before)
+    styles = zip(joined.items(), (INK, GREY), ("-", "--"), strict=False)
+    for (name, facts), colour, style in styles:
+        bound, label = facts["frame_px"]["median"] / np.sqrt(frames), f"{name}, frames of all sets"
         axes.plot(frames, bound, color=colour, ls=style, lw=1.4, label=label)
     if wanted:
         axes.axhline(wanted, color=RED, lw=1.2)
         text = f"wanted {number(wanted)} px"
         note(axes, text, (frames[0], wanted), (4, 4), color=RED, fontsize=10)
-        for line in (*sets, *joined):
-            axes.plot((line.median / wanted) ** 2, wanted, "s", color=RED)
+        for facts in every:
+            axes.plot((facts["frame_px"]["median"] / wanted) ** 2, wanted, "s", color=RED)
     if given:
         axes.axvline(given, color=RED, lw=1.2)
         text = f"{number(given)} frames of each set"
@@ -111,7 +95,7 @@ def _precision(axes: Axes, result: Mapping[str, Any], period: float) -> None:
     plain_ticks(axes.yaxis, *axes.get_ylim(), most=9)
     _clock(axes, period)
     axes.plot([], [], "o", color=GREY, label="planned")
-    if any(line.spread for line in sets):
+    if any(map(_uneven, sets.values())):
         axes.fill_between([], [], [], color=GREY, alpha=0.25, label="median to worst pixel")
     label = "1σ bound of a pixel's offset (px)"
     finish(axes, legend="upper right", xlabel="frames", ylabel=label)

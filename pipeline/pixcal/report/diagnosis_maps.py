@@ -10,6 +10,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from pixcal.model.arrays import F64
 from pixcal.report.colours import DIVERGING, GREY, INK
 from pixcal.report.drawing import TITLE, WIDE, axes_grid
 
@@ -21,25 +22,18 @@ SMALLEST = 0.17
 
 
 @dataclass(frozen=True)
-class Spot:
-    """A part of the detector and its deviation."""
-
-    rows: tuple[float, float]  # rows, columns: ends
-    columns: tuple[float, float]
-    sigmas: tuple[float, float]  # before and after
-
-
-@dataclass(frozen=True)
 class DeviationMap:
     """A map of one statistic or domain."""
 
     title: str
-    spots: tuple[Spot, ...]
+    # (spot, 6) parts of the detector: ends of rows, ends of columns, and deviation before and
+    # after, standard deviations
+    spots: F64
 
     @property
     def largest(self) -> float:
         """Largest deviation of any spot, before or after, in standard deviations."""
-        return max(abs(s) for spot in self.spots for s in spot.sigmas)
+        return float(np.abs(self.spots[:, 4:]).max())
 
 
 def panels(
@@ -50,36 +44,20 @@ def panels(
     By the windows in ``places`` of ``diagnosis.json`` (none for a small detector), else by cells of
     ``curves``. ``shape``: (y, x) of the detector's window.
     """
-    maps = _of_windows(places) if places else _of_cells(shape, curves)
+    maps = [_of_cells(shape, curve) for curve in curves if curve["x_label"] == CELLS and not places]
+    for domain in places[0]["domains"] if places else ():
+        spots = [[*np.ravel(p["window"]), *p["domains"][domain]] for p in places]
+        maps.append(DeviationMap(domain, np.array(spots, float)))
     maps = [panel for panel in maps if panel.largest > ASIDE]
     return sorted(maps, key=lambda panel: -panel.largest)[:3]
 
 
-def _of_windows(places: Sequence[Mapping[str, Any]]) -> list[DeviationMap]:
-    maps = []
-    for domain in places[0]["domains"]:
-        spots = []
-        for place in places:
-            rows, columns = map(tuple, place["window"])
-            spots.append(Spot(rows, columns, tuple(place["domains"][domain])))
-        maps.append(DeviationMap(domain, tuple(spots)))
-    return maps
-
-
-def _of_cells(shape: tuple[int, int], curves: Sequence[Mapping[str, Any]]) -> list[DeviationMap]:
-    maps = []
-    for curve in curves:
-        if curve["x_label"] != CELLS:
-            continue
-        count = round(len(curve["z"]) ** 0.5)
-        edges = [np.linspace(0, size, count + 1) for size in shape]
-        spots = []
-        for n, sigmas in enumerate(zip(curve["z"], curve["z_after"], strict=True)):
-            row, column = divmod(n, count)
-            rows, columns = edges[0][row : row + 2], edges[1][column : column + 2]
-            spots.append(Spot((rows[0], rows[1]), (columns[0], columns[1]), sigmas))
-        maps.append(DeviationMap(f"{curve['title']}\nset {curve['set']}", tuple(spots)))
-    return maps
+def _of_cells(shape: tuple[int, int], curve: Mapping[str, Any]) -> DeviationMap:
+    count = round(len(curve["z"]) ** 0.5)
+    y, x = (np.linspace(0, size, count + 1) for size in shape)
+    row, column = np.divmod(np.arange(count**2), count)
+    spots = [y[row], y[row + 1], x[column], x[column + 1], curve["z"], curve["z_after"]]
+    return DeviationMap(f"{curve['title']}\nset {curve['set']}", np.array(spots, float).T)
 
 
 def where_figure(
@@ -118,9 +96,9 @@ def _draw(
 ) -> None:
     ny, nx = shape
     axes.add_patch(Rectangle((0, 0), nx, ny, fill=False, ec=GREY, lw=1))
-    for spot in panel.spots:
-        (low, left), (high, wide) = _shown(spot, shape)
-        sigma = spot.sigmas[after]
+    for y0, y1, x0, x1, before, later in panel.spots.tolist():
+        (low, high), (left, wide) = _shown(y0, y1, ny), _shown(x0, x1, nx)
+        sigma = later if after else before
         colour = DIVERGING(scale(sigma))
         axes.add_patch(Rectangle((left, low), wide, high, fc=colour, ec="white", lw=1))
         dark = abs(scale(sigma) - 0.5) > 0.33
@@ -136,12 +114,7 @@ def _draw(
     axes.set(xlim=(-0.02 * nx, 1.02 * nx), ylim=(-0.02 * ny, 1.02 * ny), aspect="equal")
 
 
-def _shown(spot: Spot, shape: tuple[int, int]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """First row and column, and height and width, enlarged to a visible size within the window."""
-    starts, sizes = [], []
-    for (first, after), whole in zip((spot.rows, spot.columns), shape, strict=True):
-        size = max(after - first, SMALLEST * whole)
-        start = (first + after - size) / 2
-        starts.append(min(max(start, 0.0), whole - size))
-        sizes.append(size)
-    return (starts[0], starts[1]), (sizes[0], sizes[1])
+def _shown(first: float, last: float, whole: int) -> tuple[float, float]:
+    """Start and size of a spot along an axis, enlarged to a visible size within the window."""
+    size = max(last - first, SMALLEST * whole)
+    return min(max((first + last - size) / 2, 0.0), whole - size), size
