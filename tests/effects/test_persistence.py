@@ -20,7 +20,7 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.recording import recordings
 from pixcal.stages.advice import size_of
 from pixcal.stages.diagnose.frames import in_series
-from pixcal.stages.reduce.dark_levels import DarkLevels, LateRate, late_rate
+from pixcal.stages.reduce.dark_current import DarkLevels, LateRate, late_rate
 from pixcal.stages.reduce.exposures import group_exposures
 from pixcal.stages.reduce.ingested import Ingested
 

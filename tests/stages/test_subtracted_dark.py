@@ -14,7 +14,7 @@ from pixcal.estimators.detector.subtracted_dark import subtracted_dark
 from pixcal.stages import reduce
 from pixcal.stages.evidence import load_evidence
 from pixcal.stages.ingest import stage as ingest
-from pixcal.stages.reduce.dark_levels import LateRate
+from pixcal.stages.reduce.dark_current import LateRate
 
 GAIN, READ, BIAS, DARK = 3.3, 2.6, 128.0, 300.0  # e-/ADU, ADU, ADU, e-/s
 SHAPE = (121, 134)

@@ -25,7 +25,7 @@ from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Allan as Config
 from pixcal.model.options import Region
 from pixcal.stages.steps import run_steps
-from pixcal.stages.tiles import spans
+from pixcal.stages.tiles import Part, Range, spans
 from pixcal.storage import cube
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import ArrayReader, ArrayWriter
@@ -39,9 +39,6 @@ COUNT_BYTES = 64 << 20  # counts of the digits of all values of a map (`quantile
 TILES_HIGH = 4
 # levels of the quantiles that describe the noise over a region
 NOISE_LEVELS = (np.arange(64) + 0.5) / 64
-
-Range = tuple[int, int]
-Tile = tuple[Range, Range]
 
 
 @dataclass(frozen=True)
@@ -68,12 +65,12 @@ class Batches:
         frames, lengths = facts["batch_frames"], averaging_lengths(len(time))
         return cls(folder, len(time), lengths, (ny, nx), (cy, cx), frames, step, note)
 
-    def tiles(self, area: Region, times: int = 1) -> list[Tile]:
+    def tiles(self, area: Region, times: int = 1) -> list[Part]:
         """Tiles of ``times`` vertically stacked chunks, cut to an area."""
         (y0, y1, x0, x1), (cy, cx) = area, self.chunks
         return list(product(spans(y1, times * cy, y0), spans(x1, cx, x0)))
 
-    def read(self, name: str, tile: Tile) -> F32:
+    def read(self, name: str, tile: Part) -> F32:
         """``batch_delta`` or ``batch_sigma`` (batch, y, x) of a tile, px."""
         return ArrayReader(self.folder / name).read((0, self.n), *tile)
 
@@ -164,7 +161,7 @@ def _write_maps(made: Build, folder: Path, batches: Batches, runtime: Runtime) -
     cube.write_array(folder / "seconds", seconds, dims=("length",), attrs={"units": "s"})
 
 
-def _maps_task(batches: Batches, adev: ArrayWriter, expected: ArrayWriter, square: Tile) -> None:
+def _maps_task(batches: Batches, adev: ArrayWriter, expected: ArrayWriter, square: Part) -> None:
     ((y0, y1), (x0, x1)), lengths = square, batches.lengths
     deviations = np.empty((len(lengths), y1 - y0, x1 - x0), np.float32)
     white = np.empty((y1 - y0, x1 - x0), np.float32)
@@ -263,7 +260,7 @@ def sums_of_region(
     return np.sum([s[0] for s in sums], axis=0), grams
 
 
-def _sums_task(batches: Batches, expected: Path, square: Tile) -> tuple[I64, list[F64]]:
+def _sums_task(batches: Batches, expected: Path, square: Part) -> tuple[I64, list[F64]]:
     """Number of pixels with each batch, and products of differences that pixels may share."""
     counts = np.zeros(batches.n, np.int64)
     grams: list[Any] = [0.0] * len(batches.lengths)

@@ -15,14 +15,13 @@ from pixcal.stages.fit.sweep import read_frames
 from pixcal.stages.reduce.black_cut_off import Black
 from pixcal.stages.reduce.ingested import Ingested, begin_mjd, starts_of
 from pixcal.stages.reduced_set import ReducedSet
+from pixcal.stages.tiles import Part
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.header_values import DAY_S
 from pixcal.storage.manifest import read_json
 from pixcal.storage.place import Local
 from pixcal.storage.stage import read_acquisition, require
 
-# rows and columns of the window: ((y0, y1), (x0, x1))
-Part = tuple[tuple[int, int], tuple[int, int]]
 # first row and column in, and shape of, a window
 Window = tuple[tuple[int, int], tuple[int, int]]
 

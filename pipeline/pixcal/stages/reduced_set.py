@@ -8,7 +8,7 @@ import numpy as np
 
 from pixcal.estimators.fringe_fit.tile_fit import Coding, Tile
 from pixcal.model.arrays import F64, U8, U16
-from pixcal.stages.tiles import STRIP, Index, Strip, extent, grid, indices, map_chunk, strips
+from pixcal.stages.tiles import STRIP, Index, Part, Strip, extent, grid, indices, map_chunk, strips
 from pixcal.storage.cube import ArrayReader, CachedReader
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.place import Local, Place
@@ -92,7 +92,7 @@ class ReducedSet:
         """Time of each frame, s."""
         return ArrayReader(self.place / "time").read().astype(float)
 
-    def ranges(self, tile: Index) -> tuple[tuple[int, int], tuple[int, int]]:
+    def ranges(self, tile: Index) -> Part:
         """((y0, y1), (x0, x1)) of a tile, given its row and column."""
         return extent(self.shape, tile)
 

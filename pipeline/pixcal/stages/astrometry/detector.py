@@ -22,10 +22,8 @@ from pixcal.estimators.fringe_fit.shapes.paraxial import Paraxial
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
-from pixcal.stages.tiles import spans
+from pixcal.stages.tiles import Range, spans
 from pixcal.storage.products import FitsMap
-
-Range = tuple[int, int]
 
 DRAW_TILE = 64  # side of the tiles of pixels that share a generator of errors, px
 LARGEST = 1.0  # largest valid offset, px; pixels beyond are left out

@@ -33,6 +33,7 @@ from pixcal.stages.astrometry.detector import (
 from pixcal.stages.astrometry.stars import ErrorMaps, Telescope
 from pixcal.stages.astrometry.summary import TARGET_PX, axis_facts, table
 from pixcal.stages.fitted_shape import fitted_shape
+from pixcal.stages.tiles import centred
 from pixcal.storage.artefact import Build
 from pixcal.storage.formats import STAGES
 from pixcal.storage.manifest import Manifest, file_digest, read_json, write_json
@@ -226,8 +227,7 @@ def _warnings(result: Mapping[str, Any]) -> list[str]:
 def _view(
     result: dict[str, Any], detector: PixelPositions, observed: Star, maps: ErrorMaps, photons: F64
 ) -> AstrometryView:
-    ny, nx = detector.shape
-    y, x = ((max(0, (n - DETAIL) // 2), min(n, (n + DETAIL) // 2)) for n in (ny, nx))
+    y, x = centred(detector.shape, DETAIL)
     return AstrometryView(
         result=result,
         target_px=TARGET_PX,

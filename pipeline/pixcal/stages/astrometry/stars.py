@@ -16,8 +16,8 @@ from pixcal.model.acquisition import Detector as Declared
 from pixcal.model.arrays import C128, F64
 from pixcal.model.errors import InputError
 from pixcal.model.options import Astrometry as Config
-from pixcal.stages.astrometry.detector import PixelPositions, Range
-from pixcal.stages.tiles import spans
+from pixcal.stages.astrometry.detector import PixelPositions
+from pixcal.stages.tiles import Part, Range, spans
 from pixcal.storage.cube import ArrayWriter, create_group, create_map
 
 FULL_WELL_E = 50_000.0  # if the acquisition declares none (paper, table 1)
@@ -195,9 +195,7 @@ def error_maps(folder: Path, detector: PixelPositions, star: Star, runtime: Runt
     return ErrorMaps(squares, sums[-1], block)
 
 
-def _tile(
-    detector: PixelPositions, star: Star, writers: list[ArrayWriter], tile: tuple[Range, Range]
-) -> F64:
+def _tile(detector: PixelPositions, star: Star, writers: list[ArrayWriter], tile: Part) -> F64:
     """Write a part of the maps; sums over its blocks (map + 1, y, x): squares, valid pixels."""
     _, block = tile_side(detector.shape)
     errors = place_errors(detector, star, *tile)

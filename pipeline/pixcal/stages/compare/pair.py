@@ -13,7 +13,8 @@ from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.arrays import F64, I64
 from pixcal.stages.compare.agreement import Grouping, Part, Projection, double, halve
-from pixcal.stages.compare.sides import Side, Tile, Vector
+from pixcal.stages.compare.sides import Side, Vector
+from pixcal.stages.tiles import Part as Tile
 from pixcal.stages.tiles import spans
 
 COARSE = 256  # most blocks along the longer side that are kept in memory

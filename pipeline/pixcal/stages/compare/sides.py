@@ -22,12 +22,11 @@ from pixcal.estimators.fringe_fit.shapes import FringeShape
 from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
 from pixcal.stages.fitted_shape import fitted_shape
+from pixcal.stages.tiles import Part as Tile
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.manifest import read_json
 from pixcal.storage.stage import read_acquisition, require
 
-Range = tuple[int, int]
-Tile = tuple[Range, Range]
 Vector = tuple[float, float]
 
 PART_OF = 1e-3  # least share of a set in a direction to include its modes there

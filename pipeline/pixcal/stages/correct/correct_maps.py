@@ -35,8 +35,8 @@ from pixcal.stages.correct.sweep_to_correct import (
     padded,
 )
 from pixcal.stages.correct.uncertainty import parameter_variance, task_bytes
-from pixcal.stages.evidence import Part
 from pixcal.stages.fit.sweep import BATCH_MAPS
+from pixcal.stages.tiles import Part
 from pixcal.storage import cube
 from pixcal.storage.cube import ArrayReader, ArrayWriter
 from pixcal.storage.folder import link_files

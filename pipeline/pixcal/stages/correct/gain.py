@@ -17,7 +17,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.arrays import F64
 from pixcal.stages.correct.correct_maps import mean_of
 from pixcal.stages.correct.sweep_to_correct import HALVES, Swept
-from pixcal.stages.evidence import Part
+from pixcal.stages.tiles import Part
 from pixcal.storage.cube import ArrayReader
 
 PERIOD = 4  # rows or columns after which patterns repeat (paper, section 5.1: period of four rows)

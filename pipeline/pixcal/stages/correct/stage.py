@@ -33,7 +33,7 @@ from pixcal.stages.correct.sweep_to_correct import RestoredSet, Swept
 from pixcal.stages.correct.uncertainty import parameter_errors
 from pixcal.stages.diagnose.diagnosis_input import ESTIMATE_BYTES, EVIDENCE_BYTES
 from pixcal.stages.diagnose.windows import chosen_windows
-from pixcal.stages.evidence import Part, load_evidence
+from pixcal.stages.evidence import load_evidence
 from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
 from pixcal.stages.fit.maps import Totals, write_maps
 from pixcal.stages.fit.stage import Header, header_of, publish_maps, published
@@ -41,6 +41,7 @@ from pixcal.stages.fit.sweep import load_run, sweep_set
 from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
+from pixcal.stages.tiles import Part
 from pixcal.stages.treatment import HYPERBOLIC, SUFFIX, Treatment, Treatments, treatments
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import create_group

@@ -18,8 +18,9 @@ from pixcal.model.errors import InputError
 from pixcal.model.flags import PixelFlag
 from pixcal.simulation.effect import Effect, FittedFrames, FringeMaps
 from pixcal.stages.diagnose.fitted_set import corrected_on_samples
-from pixcal.stages.evidence import Part, fitted_theta
+from pixcal.stages.evidence import fitted_theta
 from pixcal.stages.reduced_set import ReducedSet
+from pixcal.stages.tiles import Part
 from pixcal.stages.treatment import Treatment
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.manifest import read_json

@@ -29,6 +29,7 @@ from pixcal.stages.crests.windows import N_SUMS, CrestCarrier, Vector, Windows, 
 from pixcal.stages.fit.sweep import load_run
 from pixcal.stages.fitted_shape import nominal_geometry
 from pixcal.stages.reduced_set import ReducedSet
+from pixcal.stages.tiles import Range
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import ArrayReader, create_group, write_array
 from pixcal.storage.formats import STAGES
@@ -39,8 +40,6 @@ SCHEMA = "pixcal/crests/1"
 MAP_SIDE = 21  # places along each side of a cost map; odd, so that the minimum is one of them
 MAP_REACH = 0.04  # how far the maps go from the minimum, as a share of distance and baseline
 FIGURE_BYTES = 128 << 20  # Matplotlib and one figure
-
-Range = tuple[int, int]
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:

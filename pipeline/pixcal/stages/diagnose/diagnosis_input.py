@@ -26,9 +26,10 @@ from pixcal.stages.diagnose.measure_nominal import nominal_bench
 from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, RunFrames, evidence_of, take
 from pixcal.stages.diagnose.trial import Curves, Window, averaged, measured_curves
 from pixcal.stages.diagnose.windows import chosen_windows
-from pixcal.stages.evidence import Part, excess_noise_factor
+from pixcal.stages.evidence import excess_noise_factor
 from pixcal.stages.reduce.black_cut_off import Black
 from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.tiles import Part
 from pixcal.storage.manifest import read_json
 from pixcal.storage.stage import read_acquisition, require
 

@@ -20,13 +20,13 @@ from pixcal.model.arrays import Indices
 from pixcal.model.config import to_plain
 from pixcal.model.options import Sweep
 from pixcal.stages import evidence, reduce
-from pixcal.stages.evidence import Part
 from pixcal.stages.fit.fringe_set import fit_sets
 from pixcal.stages.fit.maps import write_offsets
 from pixcal.stages.fit.sweep import sweep_sets
 from pixcal.stages.reduce.black_cut_off import Black
 from pixcal.stages.reduce.ingested import Ingested, begin_mjd
 from pixcal.stages.reduce.stage import reduce_frames
+from pixcal.stages.tiles import Part
 from pixcal.storage.cube import CHUNK
 from pixcal.storage.header_values import DAY_S
 from pixcal.storage.manifest import write_json

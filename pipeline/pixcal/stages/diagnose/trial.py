@@ -22,7 +22,7 @@ from pixcal.model.errors import DamagedError, InputError
 from pixcal.simulation.effect import Again, Effect, Estimate
 from pixcal.stages.diagnose.nominal import NominalBench
 from pixcal.stages.diagnose.parts import FrameSubset, evidence_of
-from pixcal.stages.evidence import Part
+from pixcal.stages.tiles import Part
 from pixcal.storage.manifest import digest, read_json, write_json
 
 # the slowest so far took 16 s: telegraph noise of 40,000 pixels with different read noise

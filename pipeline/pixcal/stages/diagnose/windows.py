@@ -3,7 +3,7 @@
 import math
 
 from pixcal.stages.diagnose.frames import SAMPLES
-from pixcal.stages.evidence import Part
+from pixcal.stages.tiles import Part
 
 SIDE = 128  # side (pixels) of a window on a large detector: the width of a chunk of the cube
 LARGEST = 288  # most rows or columns of a detector used whole; beyond, windows do not overlap

@@ -1,16 +1,29 @@
-"""Mean dark signal of a detector, and what the clipping of outliers leaves out of it."""
+"""Mean dark signal of a detector, and what the clipping of outliers leaves out of it.
+
+From the levels of single frames without light, and the charge that light before them left there.
+"""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pixcal.estimators.detector import emva
-from pixcal.stages.reduce.dark_levels import DarkLevels, late_rate, middle_rows
+from pixcal.estimators.detector.persistence import Persistence, released_late, told_from_drift
+from pixcal.estimators.diagnosis.evidence import Stack
+from pixcal.model.arrays import F64, Mask
+from pixcal.report.text import number
+from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.frame_statistics import Measuring
-from pixcal.stages.reduce.halves import Window
-from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.reduce.halves import frames_of
+from pixcal.stages.reduce.ingested import Ingested, starts_of
+from pixcal.stages.tiles import Part
 from pixcal.storage.artefact import Build
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube import CHUNK, ArrayReader
 
 _NO_ERROR = 1e-9  # ADU/s: below it all samples have one code
 # relative error of the change of dark current by correcting noise that is cut off: it is not known
@@ -18,6 +31,9 @@ _NO_ERROR = 1e-9  # ADU/s: below it all samples have one code
 _OF_CORRECTION = 0.5
 # least signal in outliers that is reported: errors, and share of the whole
 _SURE, _NOTABLE = 5.0, 0.05
+_GONE = 5  # decays after which hardly any charge is left
+_ROUNDS = 5  # of levels of frames and pixels in turn
+_NO_SAMPLES = np.zeros((0, 0, 0), np.float32)
 
 
 class DarkCurrent(NamedTuple):
@@ -35,7 +51,7 @@ def dark_current(
     job: Measuring,
     conversion: tuple[float, float | None],
     scale: float,
-    middle: Window,
+    middle: Part,
 ) -> DarkCurrent | None:
     """The dark current; its error is from frames, bias drift included. None if it is unknown.
 
@@ -96,3 +112,143 @@ def _temperature(tables: Mapping[str, Mapping[str, Any]]) -> str:
         return "temperature not in the headers"
     low, high = min(known), max(known)
     return f"at {low:.1f} °C" if high - low < 0.05 else f"at {low:.1f} to {high:.1f} °C"
+
+
+# Levels of frames, and charge from before them
+
+
+@dataclass(frozen=True)
+class DarkLevels:
+    """Series of frames without light, and flats, in the middle rows of a window."""
+
+    groups: tuple[Group, ...]
+    levels: tuple[F64, ...]  # mean (ADU) of each frame of each group
+    pixels: int  # that a mean is of
+
+    @classmethod
+    def of(cls, source: Ingested, middle: Part, good: Mask) -> "DarkLevels":
+        """Read the frames; ``good``: (y, x) pixels of the window that count."""
+        # Samples that are not finite do not count, nor do frames and groups without any others.
+        (y0, _), columns = middle
+        rows = middle_rows(middle)
+        window, pixels = ((y0 + rows.start, y0 + rows.stop), columns), good[rows]
+        flats = source.exposures.flat if _follows_light(source) else []
+        groups, levels = [], []
+        for group in (*source.exposures.dark, *flats) if pixels.any() else ():
+            own = _frame_levels(partial(_samples, source, group, window, pixels))
+            kept = tuple(n for n, one in zip(group.frames, own, strict=True) if np.isfinite(one))
+            if kept:
+                groups.append(replace(group, frames=kept))
+                levels.append(own[np.isfinite(own)])
+        return cls(tuple(groups), tuple(levels), int(pixels.sum()))
+
+    @property
+    def times(self) -> F64:
+        """Exposure time of each frame without light, s."""
+        dark = [[g.exptime] * len(g.frames) for g in self.groups if g.array != "flat"]
+        return np.concatenate([*dark, []])
+
+    @property
+    def means(self) -> F64:
+        """Mean of each frame without light, ADU."""
+        pairs = zip(self.groups, self.levels, strict=True)
+        return np.concatenate([*(own for g, own in pairs if g.array != "flat"), []])
+
+
+def _frame_levels(read: Callable[[], Iterable[NDArray[Any]]]) -> F64:
+    """Mean (t,) of the pixels of each frame, as if none were missing; NaN without any sample."""
+    with np.errstate(invalid="ignore"):
+        levels = np.array([samples.mean(dtype=float) for samples in read()])
+    if np.isfinite(levels).all():
+        return levels
+    # Pixels differ by their own levels: which ones are missing must not shift a mean.
+    pixel = count = np.zeros(1)
+    for _ in range(_ROUNDS):
+        total, count = np.zeros(1), np.zeros(1)
+        for n, samples in enumerate(read()):
+            there = np.isfinite(samples)
+            levels[n] = (samples - pixel)[there].mean(dtype=float) if there.any() else np.nan
+            if there.any():
+                total = total + np.where(there, samples - levels[n], 0)
+                count = count + there
+        pixel = total / np.maximum(count, 1)
+    return levels + (pixel[count > 0].mean() if count.any() else 0)
+
+
+def _samples(source: Ingested, group: Group, window: Part, pixels: Mask) -> Iterator[NDArray[Any]]:
+    """Samples (pixel,) of each frame of a group."""
+    return (frame[pixels] for frame in frames_of(source, group.array, group.frames, window))
+
+
+def middle_rows(middle: Part) -> slice:
+    """Rows of a chunk in the middle of a window, from its first row on."""
+    height = middle[0][1] - middle[0][0]
+    first = height // CHUNK[1] // 2 * CHUNK[1]
+    return slice(first, min(first + CHUNK[1], height))
+
+
+@dataclass(frozen=True)
+class LateRate:
+    """Charge in dark frames that light before them left, as if it were dark signal."""
+
+    rate: float  # e-/s, or e-/exposure
+    error: float  # of the dark signal without it
+    lag: Persistence
+    sure: bool  # whether it is told from a drift of the bias
+
+    def warning(self, unit: str) -> str:
+        """What it means for the map of the dark signal; ``unit``: of the rates."""
+        of_time = "s" if self.lag.in_seconds else "frames"
+        decays = [self.lag.decay, self.lag.slow] if self.lag.slow_part else [self.lag.decay]
+        decay = " and ".join(f"{number(one, 2)} {of_time}" for one in decays)
+        gone = f"{number(_GONE * decays[-1], 2)} {of_time}"
+        if not self.sure:
+            return (
+                "the level of the darks falls: charge from light before them, or a drift of the "
+                f"bias; record darks before the light, or {gone} or more after it"
+            )
+        return (
+            f"the darks hold charge that light before them left, which decays over {decay}: the "
+            f"map of the dark signal holds {number(self.rate, 2)} {unit} of it on average; record "
+            f"darks {gone} or more after light"
+        )
+
+
+def late_rate(
+    source: Ingested, levels: DarkLevels, gain: float, read_noise: float
+) -> LateRate | None:
+    """Charge that light left in the darks, by the fit of the diagnosis; None if insignificant.
+
+    ``gain``: e-/ADU; ``read_noise``: e-. Not where fringes are among the light.
+    """
+    if not any(g.array == "flat" for g in levels.groups) or len(levels.times) < 3:
+        return None
+    unlit = levels.means[levels.times == levels.times.min()].mean()
+    series = []
+    for group, own in zip(levels.groups, levels.levels, strict=True):
+        frames, start = np.array(group.frames), starts_of(source.tables)[group.array]
+        time = np.array(source.tables[group.array]["time_s"], float)[frames]
+        stack = Stack(group.array, group.exptime, frames, time, _NO_SAMPLES, start)
+        series.append((stack, gain * (own - unlit)))
+    least = read_noise**2 / levels.pixels
+    found = released_late(series, least)
+    if found is None:
+        return None
+    lag, late = found
+    pairs = zip(levels.groups, late, strict=True)
+    dark = np.concatenate([own for g, own in pairs if g.array != "flat"])
+    slope = emva.dark_slope(levels.times, gain * levels.means - dark)
+    of_late = emva.dark_slope(levels.times, dark)
+    if slope is None or of_late is None:
+        return None
+    error = float(np.hypot(slope[1], of_late[0] * lag.share_error / lag.share))
+    return LateRate(of_late[0], error, lag, told_from_drift(series, late, least))
+
+
+def _follows_light(source: Ingested) -> bool:
+    """Whether darks follow flats, which are all the light there is."""
+    starts = starts_of(source.tables)
+    if not {"dark", "flat"} <= set(starts) or source.exposures.fringes:
+        return False
+    last = starts["dark"] + float(np.max(np.array(source.tables["dark"]["time_s"], float)))
+    return bool(starts["flat"] < last)

@@ -4,13 +4,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pixcal.estimators.crosstalk.hot_pixels import hot_pixels_of
+from pixcal.estimators.crosstalk.trails import LINKS, trails_of
+from pixcal.estimators.crosstalk.trails import SURE as TRAILS
 from pixcal.estimators.detector.calibration import Linearity
 from pixcal.kernels.gain_fit import GainFit
 from pixcal.kernels.photon_transfer import SHARED
 from pixcal.model.arrays import F64
 from pixcal.report.text import with_error
 from pixcal.stages.reduce.detector_summary import Summary
+from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduce.read_noise import Nearby
+from pixcal.stages.tiles import centred
+from pixcal.storage.cube import ArrayReader
+from pixcal.storage.place import Place
 
 _ROUGH = 10.0  # reduced chi-square above which a photon-transfer curve is not smooth
 _LINEARITY = 0.02
@@ -21,6 +28,9 @@ _SURE, _LATE, _CURVED = 5.0, 0.005, 20.0
 _FEWEST, _DRIFT, _SCATTER = 4, 0.01, 0.02
 # least declared over measured gain that an electron-multiplying register explains
 _MULTIPLIED = 3.0
+# of trails of hot pixels: longest side of the middle of the detector that is looked at, and share
+# of the converter's range that a hot pixel may fill
+_TRAILS_SIDE, _HOT_FULL = 512, 0.9
 _OF_STEP = 0.1  # relative tolerance to recognise a gain declared per step of the converter
 
 
@@ -232,3 +242,32 @@ def _declared_gain_warnings(fit: GainFit, summary: Summary, used: float) -> list
             else "the measured value is used"
         )
     ]
+
+
+def trail_warnings(calibration: Place, source: Ingested, gain: float) -> list[str]:
+    """That charge trails hot pixels, the more the farther from an output (charge transfer)."""
+    seconds = max((group.exptime for group in source.exposures.dark), default=0.0)
+    if not (source.exposures.has_rate and seconds > 0):
+        return []
+    (y0, y1), (x0, x1) = centred(source.shape, _TRAILS_SIDE)
+    rate, bias = (
+        ArrayReader(calibration / name).read((y0, y1), (x0, x1)).astype(float)
+        for name in ("dark_rate", "bias")
+    )
+    usable = bias + rate * seconds / gain < _HOT_FULL * source.saturation("dark")
+    found = hot_pixels_of(rate * seconds, usable, LINKS)
+    trails = None if found is None else trails_of(found, rate.shape, (y0, x0))
+    middle = (y0 + y1) / 2, (x0 + x1) / 2
+    said = [
+        f"along {lines} that are read out towards the {'first' if one.output <= first else 'last'} "
+        f"{line}, {with_error(*one.loss)} of {one.level_e:.0f} e- per transfer"
+        for one, lines, line, first in zip(
+            trails or (), ("columns", "rows"), ("row", "column"), middle, strict=False
+        )
+        if one.significance > TRAILS
+    ]
+    return [
+        "charge trails hot pixels, the more the farther they are from the output, as incomplete "
+        f"transfer leaves it (CTI): {'; '.join(said)}. It correlates the noise of neighbours too, "
+        "which is not crosstalk"
+    ] * bool(said)

@@ -11,6 +11,7 @@ import numpy as np
 
 from pixcal.engine.run import Runtime
 from pixcal.estimators.detector import emva
+from pixcal.estimators.detector.amplifiers import Outputs, differing_outputs
 from pixcal.estimators.detector.emva import Measure, Nonuniformity
 from pixcal.estimators.detector.pair_noise import shared_by_lines
 from pixcal.kernels.rounding import level_before_rounding
@@ -18,16 +19,18 @@ from pixcal.model.arrays import F64, Mask
 from pixcal.report.text import with_error
 from pixcal.stages.reduce.dark_current import dark_current
 from pixcal.stages.reduce.detector_summary import Summary, pair_sums
-from pixcal.stages.reduce.frame_statistics import Measuring
+from pixcal.stages.reduce.frame_statistics import STATISTICS, Measuring
 from pixcal.stages.reduce.halves import Halves, middle_of, read_halves
 from pixcal.stages.reduce.ingested import Ingested
-from pixcal.stages.reduce.outputs import outputs_of, report_outputs
 from pixcal.stages.reduce.read_noise import Nearby
+from pixcal.stages.tiles import Part
 from pixcal.storage.artefact import Build
+from pixcal.storage.cube import ArrayReader
 from pixcal.storage.manifest import write_json
 
 Json = dict[str, Any]
 
+_NAMED = 8  # most outputs that a sentence names
 _WELL = 0.97  # share of the converter's range below which saturation is due to full wells
 
 
@@ -55,9 +58,9 @@ def characterise(
     middle = middle_of(source.shape)
     halves = read_halves(made, source, summary, top, middle, entry["used"], runtime)
     note = "" if measured else "declared, not measured"
-    outputs = outputs_of(made, summary, middle)
+    outputs = _outputs_of(made, summary, middle)
     if outputs is not None:
-        note = report_outputs(outputs, gain[0], facts, source.shape)
+        note = _report_outputs(outputs, gain[0], facts, source.shape)
     found: Json = {"conversion_gain": _figure("conversion gain", "e-/ADU", gain, note)}
     noise = _read_noise(found, summary, gain[0], source.quantum)
     excess = 1.0 if summary.gain is None else summary.gain.excess[0]
@@ -173,6 +176,46 @@ def _full_well(
         electrons = noise[0] * gain[0], noise[1] * gain[0]
         ratio, error, decibels = emva.dynamic_range(well, electrons)
         found["dynamic_range"] = figure("dynamic range", "", (ratio, error), f"{decibels:.1f} dB")
+
+
+# Outputs of a detector whose conversion gains differ
+
+
+def _outputs_of(made: Build, summary: Summary, middle: Part) -> Outputs | None:
+    """Outputs that read the middle of the detector, if gains differ; None if that is unknown."""
+    if summary.gain is None:
+        return None
+    maps, at = made.folder / "calibration.zarr", STATISTICS.index("shot")
+    shot = ArrayReader(made.scratch / "statistics" / "maps").read((at, at + 1), *middle)[0]
+    flat, mask = (ArrayReader(maps / name).read(*middle) for name in ("flat", "mask"))
+    first = middle[0][0], middle[1][0]
+    return differing_outputs(flat.astype(float), shot.astype(float), mask == 0, first)
+
+
+def _report_outputs(
+    found: Outputs, gain: float, facts: dict[str, Any], shape: tuple[int, ...]
+) -> str:
+    """Words on the gain of each output, which is also added to the contents of ``reduce.json``.
+
+    ``gain``: of all outputs together (e-/ADU). ``shape``: of the detector.
+    """
+    sides = found.of_pixel.shape
+    looked_at = "" if sides == shape else " in the middle {} × {} pixels".format(*sides)
+    each = zip(found.names, gain * found.gain, gain * found.gain * found.error, strict=True)
+    entries: list[dict[str, Any]] = []
+    entries += [{"where": n, "gain": float(g), "error": float(e)} for n, g, e in each if g > 0]
+    said = [f"{e['where']}: {with_error(e['gain'], e['error'])}" for e in entries]
+    if len(said) > _NAMED:
+        order = sorted(entries, key=lambda entry: float(entry["gain"]))
+        ends = [f"{e['gain']:.4g} ({e['where']})" for e in (order[0], order[-1])]
+        said = [" to ".join(ends)]
+    words = "; ".join(said) + " e-/ADU"
+    facts["gain_e_per_adu"]["outputs"] = entries
+    facts["warnings"].append(
+        f"the gain differs between outputs{looked_at} ({words}): electrons are counted by one gain "
+        "for all, and the flat map removes the steps"
+    )
+    return f"of all outputs together: {words}"
 
 
 # Nonuniformity

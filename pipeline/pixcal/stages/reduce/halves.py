@@ -16,11 +16,9 @@ from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.detector_summary import Summary
 from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.tiles import Part
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import CHUNK, ArrayReader
-
-# first row and the one after the last; same for columns
-Window = tuple[tuple[int, int], tuple[int, int]]
 
 SIDE = 1024  # longest side of the middle of the detector whose nonuniformity is measured
 _MIN_PIXELS = 16
@@ -36,7 +34,7 @@ class Halves:
     good: Mask  # (y, x)
 
 
-def middle_of(shape: tuple[int, int]) -> Window:
+def middle_of(shape: tuple[int, int]) -> Part:
     """Rows and columns of the middle of the detector, starting at chunk borders."""
     ends = []
     for n, chunk in zip(shape, CHUNK[1:], strict=True):
@@ -50,7 +48,7 @@ def read_halves(
     source: Ingested,
     summary: Summary,
     top: Measure | None,
-    middle: Window,
+    middle: Part,
     gain: float,
     runtime: Runtime,
 ) -> Halves:
@@ -97,7 +95,7 @@ def _half_full(source: Ingested, summary: Summary, top: Measure | None) -> Group
     return source.exposures.flat[min(offers)[1]] if offers else None
 
 
-def _averages(source: Ingested, series: tuple[Group, ...], window: Window) -> F64:
+def _averages(source: Ingested, series: tuple[Group, ...], window: Part) -> F64:
     """Averages of the even and of the odd frames of each series, (2 series, y, x)."""
     (y0, y1), (x0, x1) = window
     made = np.zeros((2 * len(series), y1 - y0, x1 - x0))
@@ -110,7 +108,7 @@ def _averages(source: Ingested, series: tuple[Group, ...], window: Window) -> F6
 
 
 def frames_of(
-    source: Ingested, array: str, numbers: Sequence[int], window: Window
+    source: Ingested, array: str, numbers: Sequence[int], window: Part
 ) -> Iterator[NDArray[Any]]:
     """Samples (y, x) of given frames, read in the blocks in which they are stored."""
     for block, held in groupby(numbers, key=lambda number: number // CHUNK[0]):

@@ -17,6 +17,7 @@ from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.halves import frames_of
 from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.tiles import centred
 
 _SIDE = 512  # longest side of the middle of the detector whose frames are read
 _FRAMES = 16  # most frames of a level that are read
@@ -32,10 +33,8 @@ def with_excess_noise(summary: Summary, source: Ingested, job: Measuring) -> Sum
     slope, variance = 1 / gain.gain, max(gain.read_variance[0], job.quantum**2 / 12)
 
     def of(group: Group, level: float) -> Skew | None:
-        sizes = [(n, min(n, _SIDE)) for n in job.shape]
-        window = tuple(((n - m) // 2, (n + m) // 2) for n, m in sizes)
-        used = group.frames[:_FRAMES]
-        frames = np.stack([*frames_of(source, group.array, used, (window[0], window[1]))])
+        used, window = group.frames[:_FRAMES], centred(job.shape, _SIDE)
+        frames = np.stack([*frames_of(source, group.array, used, window)])
         good = np.ones(frames.shape[1:], np.bool_)
         return skew(frames.astype(np.float32), level, variance, slope, good, job.quantum)
 

@@ -22,10 +22,9 @@ from pixcal.model.flags import PixelFlag
 from pixcal.model.options import Reduce
 from pixcal.stages.reduce.black_cut_off import cut_off_warnings
 from pixcal.stages.reduce.calibration import FLAT_FLOOR, Finishing, calibration_writers, finish
-from pixcal.stages.reduce.charge_trails import trail_warnings
 from pixcal.stages.reduce.columns import run_noted, strip_width
 from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
-from pixcal.stages.reduce.detector_warnings import detector_warnings, lamp_warnings
+from pixcal.stages.reduce.detector_warnings import detector_warnings, lamp_warnings, trail_warnings
 from pixcal.stages.reduce.electrons import convert_bytes
 from pixcal.stages.reduce.figures_of_merit import characterise
 from pixcal.stages.reduce.flat_survey import rough_gain
