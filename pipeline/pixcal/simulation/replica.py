@@ -14,6 +14,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.beams import Light
 from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.scene import DetectorMaps, FrameStates, Rows
+from pixcal.model.acquisition import Detector
 from pixcal.model.arrays import F32, F64, Indices
 from pixcal.model.bench import (
     SCHEMA,
@@ -209,18 +210,8 @@ def _bench(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Bench:
     contrast = [np.median(np.hypot(*s.theta[1:])[s.good] / s.theta[0][s.good]) for s in sets]
     return plain_bench(
         evidence,
-        SimulatedDetector(
-            shape=evidence.good.shape,
-            pitch_um=evidence.pitch_um,
-            gain_e_per_adu=evidence.gain,
-            read_noise_e=evidence.amplifier_noise,
-            step_adu=evidence.step_adu,
-            chip=sets[0].window if sets else None,
-            origin_px=evidence.origin if sets else None,
-            saturation_adu=min(evidence.saturation_adu, TOP_ADU),
-            lowest_adu=int(evidence.lowest_adu or 0),
-            bias_adu=0.0,
-        ),
+        sets[0].window if sets else None,
+        min(evidence.saturation_adu, TOP_ADU),
         float(np.mean(contrast)) if contrast else 1.0,
         (max([*exposures[:1], MIN_S]), _period(sets[0].time_s) if sets else 0.0),
         [(s.name, s.baseline_mm, len(s.g), 2 * float(np.median(s.theta[0][s.good]))) for s in sets],
@@ -229,17 +220,34 @@ def _bench(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Bench:
 
 def plain_bench(
     evidence: Evidence,
-    detector: SimulatedDetector,
+    chip: tuple[int, int] | None,
+    saturation_adu: float,
     visibility: float,
     times_s: tuple[float, float],
     sets: Sequence[tuple[str, tuple[float, float], int, float]],
+    declared: Detector | None = None,
 ) -> Bench:
     """Bench properties that effects use, for pixels and light from an acquisition.
 
+    ``chip``: rows and columns of the whole window, if the place of the evidence in it is known.
     ``times_s``: exposure time and period. ``sets``: name, baseline (mm), frames and brightest
     fringe (e-) of each fringe set. The bias is that of the evidence.
     """
     exposure, period = times_s
+    detector = SimulatedDetector(
+        shape=evidence.good.shape,
+        pitch_um=evidence.pitch_um,
+        gain_e_per_adu=evidence.gain,
+        read_noise_e=evidence.amplifier_noise,
+        step_adu=evidence.step_adu,
+        name=declared.name if declared else "",
+        chip=chip,
+        origin_px=evidence.origin if chip else None,
+        saturation_adu=saturation_adu,
+        lowest_adu=int(evidence.lowest_adu or 0),
+        bias_adu=0.0,
+        full_well_e=declared.full_well_e if declared else None,
+    )
     bias = float(np.clip(np.median(evidence.bias), 0, detector.top_adu - 1))
     return Bench(
         schema=SCHEMA,

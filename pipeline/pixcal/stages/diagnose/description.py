@@ -11,7 +11,7 @@ from pixcal.estimators.detector.flat_ladder import light_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F64, Indices
-from pixcal.model.bench import Bench, SimulatedDetector
+from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import TOP_ADU, plain_bench
@@ -33,27 +33,12 @@ def bench_of(
     dtypes: Mapping[str, np.dtype[Any]],
 ) -> Bench:
     """Bench properties that effects use; `Measured` replaces the pixels and light."""
-    d = acquisition.detector
     listed = [f"fringes/{s.name}" for s in acquisition.frames.fringes]
     table = tables[listed[0]] if listed else next(iter(tables.values()))
     times = np.array(table["time_s"], float)
     exposure = max(float(table["exptime_s"][0] or 0.0), 1e-6)
     period = float(np.median(np.diff(times))) if len(times) > 1 else exposure
     contrast = [float(np.median(s.contrast)) for s in sets]
-    detector = SimulatedDetector(
-        shape=evidence.good.shape,
-        pitch_um=d.pitch_um,
-        gain_e_per_adu=evidence.gain,
-        read_noise_e=evidence.amplifier_noise,
-        step_adu=evidence.step_adu,
-        name=d.name,
-        chip=whole,
-        origin_px=evidence.origin,
-        saturation_adu=_top(acquisition, evidence, sets, dtypes),
-        lowest_adu=int(evidence.lowest_adu or 0),
-        bias_adu=0.0,
-        full_well_e=d.full_well_e,
-    )
     counts = [len(tables[name]["time_s"]) for name in listed]
     peaks = [float(np.max(truth.light * (1 + truth.contrast))) for truth in sets]
     listed_sets = [
@@ -61,7 +46,9 @@ def bench_of(
         for s, count, peak in zip(acquisition.frames.fringes, counts, peaks, strict=True)
     ]
     visibility = float(np.mean(contrast)) if contrast else 1.0
-    return plain_bench(evidence, detector, visibility, (exposure, period), listed_sets)
+    top, times_s = _top(acquisition, evidence, sets, dtypes), (exposure, period)
+    declared = acquisition.detector
+    return plain_bench(evidence, whole, top, visibility, times_s, listed_sets, declared)
 
 
 def pedestal_of(
