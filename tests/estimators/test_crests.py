@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pixcal.estimators.fringe_fit.shapes.hyperbolic import prior_errors
 from pixcal.kernels.optics import Geometry, paraxial_vector, phase
 from pixcal.model.errors import InputError
 from pixcal.stages.crests.crest_fit import (
     CrestFit,
-    Prior,
     cost_map,
     falls_then_rises,
     fit_crests,
@@ -45,12 +45,11 @@ class ArrayFrames:
         return sums
 
 
-def no_prior(nominal: Geometry) -> Prior:
-    return Prior(nominal, np.full(6, np.inf))
+NO_PRIOR = np.full(6, np.inf)
 
 
 def fit_freely(paths: CrestPaths, start: Geometry) -> CrestFit:
-    return fit_crests(paths, start, no_prior(start))
+    return fit_crests(paths, start, NO_PRIOR)
 
 
 def crests_of_frames(
@@ -186,10 +185,10 @@ def test_errors_are_honest(pitch: float) -> None:
     points, pulls = [], []
     for _ in range(seeds):
         truth = nominal = fibres(shape, 6.0, 0.3, pitch)
-        prior = no_prior(nominal)
+        prior = NO_PRIOR
         if pitch == 4.4e-3:
-            prior = Prior.of_bench(nominal)
-            truth = nominal.with_vector(nominal.vector() + prior.sigma * rng.normal(size=6))
+            prior = prior_errors(nominal)
+            truth = nominal.with_vector(nominal.vector() + prior * rng.normal(size=6))
         frame = exposed(shape, truth, rng, phi=rng.uniform(0, 6), beam=400.0)
         paths = crests_of_frames(frame, paraxial_vector(truth))
         fit = fit_crests(paths, nominal, prior)
@@ -336,7 +335,7 @@ def test_what_is_held_stays_and_what_is_known_pulls(seen: tuple[CrestPaths, Geom
     free = fit_freely(paths, truth)
 
     def with_sigma(sigma: list[float]) -> CrestFit:
-        return fit_crests(paths, truth, Prior(truth, np.array(sigma)))
+        return fit_crests(paths, truth, np.array(sigma))
 
     inf = np.inf
     held = with_sigma([inf, inf, 0.0, inf, inf, 0.0])
@@ -354,8 +353,8 @@ def test_the_outermost_paths_alone(seen: tuple[CrestPaths, Geometry]) -> None:
     assert len(np.unique(few.k)) == 6
     assert few.k.min() == paths.k.min()
     assert few.k.max() == paths.k.max()
-    fit = fit_crests(few, truth, Prior.of_bench(truth))
-    every = fit_crests(paths, truth, Prior.of_bench(truth))
+    fit = fit_crests(few, truth, prior_errors(truth))
+    every = fit_crests(paths, truth, prior_errors(truth))
     assert np.all(fit.sigma >= every.sigma)
     assert np.abs((fit.geometry.vector() - truth.vector()) / fit.sigma).max() < 4
 

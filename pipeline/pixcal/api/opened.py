@@ -104,6 +104,14 @@ class OffsetMap:
         return Picture(png(offsets(self.name, delta, sigma)))
 
 
+class Contents(cached_property[dict[str, Any]]):
+    """Contents of a JSON file of a `Run`: read on first use and kept."""
+
+    def __init__(self, stage: str, doc: str, file: str = "") -> None:
+        super().__init__(lambda run: run._read(stage, file or stage))
+        self.__doc__ = doc
+
+
 @dataclass(frozen=True)
 class Run:
     """A run directory, opened. Arrays and tables are read on first use and kept.
@@ -123,9 +131,9 @@ class Run:
     def __fspath__(self) -> str:
         return str(self.path)
 
-    def _read(self, stage: str, file: str | None = None) -> dict[str, Any]:
+    def _read(self, stage: str, file: str) -> dict[str, Any]:
         require(self.path, stage)
-        return dict(read_json(self.path / stage / f"{file or stage}.json"))
+        return dict(read_json(self.path / stage / f"{file}.json"))
 
     @cached_property
     def acquisition(self) -> Acquisition:
@@ -141,25 +149,20 @@ class Run:
         """
         return self._read("ingest", "frames")
 
-    @cached_property
-    def reduction(self) -> dict[str, Any]:
-        """Contents of ``reduce.json``: gain, read noise, linearity, counts of flags, warnings."""
-        return self._read("reduce")
-
-    @cached_property
-    def fit(self) -> dict[str, Any]:
-        """Contents of ``fit.json``."""
-        return self._read("fit")
-
-    @cached_property
-    def allan(self) -> dict[str, Any]:
-        """Contents of ``allan.json``."""
-        return self._read("allan")
-
-    @cached_property
-    def diagnosis(self) -> dict[str, Any]:
-        """Contents of ``diagnosis.json``: verdict, causes, residual gap."""
-        return self._read("diagnose", "diagnosis")
+    reduction = Contents(
+        "reduce",
+        "Contents of ``reduce.json``: gain, read noise, linearity, counts of flags, warnings.",
+    )
+    fit = Contents("fit", "Contents of ``fit.json``.")
+    allan = Contents("allan", "Contents of ``allan.json``.")
+    diagnosis = Contents(
+        "diagnose", "Contents of ``diagnosis.json``: verdict, causes, residual gap.", "diagnosis"
+    )
+    correction = Contents(
+        "corrected",
+        "Contents of ``correction.json``: how each identified effect was treated.",
+        "correction",
+    )
 
     @cached_property
     def detector(self) -> dict[str, NDArray[Any]]:
@@ -177,11 +180,6 @@ class Run:
     def maps(self) -> dict[str, OffsetMap]:
         """The maps of offsets: ``delta_x`` and ``delta_y``, or ``delta_fringe`` alone."""
         return self._maps(self.fit["outputs"], "")
-
-    @cached_property
-    def correction(self) -> dict[str, Any]:
-        """Contents of ``correction.json``: how each identified effect was treated."""
-        return self._read("corrected", "correction")
 
     @cached_property
     def corrected(self) -> dict[str, OffsetMap]:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
-from pixcal.estimators.fringe_fit.shapes.hyperbolic import prior_errors
 from pixcal.kernels.optics import PARAMETERS, Geometry, phase, phase_jacobian
 from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F64, Mask
@@ -17,21 +16,6 @@ from pixcal.stages.crests.crests import CrestPaths
 OUTLIER = 5.0  # robust standard deviations from the fit above which points are left out
 MAP_POINTS = 400  # points used to compute a cost map, which is scaled to all points
 NOTABLE_CHI2 = 3.0  # reduced chi-square of the points above which a warning is given
-
-
-@dataclass(frozen=True)
-class Prior:
-    """Prior knowledge of the geometry."""
-
-    nominal: Geometry
-    # (6,) 1-sigma errors, mm, in the order of `PARAMETERS`; 0 fixes a parameter, infinity frees
-    # it; equal for baseline_x and baseline_y
-    sigma: F64
-
-    @classmethod
-    def of_bench(cls, nominal: Geometry) -> "Prior":
-        """Errors of a bench's nominal values as assumed by the hyperbolic fit."""
-        return cls(nominal, prior_errors(nominal))
 
 
 @dataclass(frozen=True)
@@ -50,7 +34,8 @@ class CrestFit:
     # the points
     spread: float
     evaluations: int  # of the model, in the last fit
-    prior: Prior
+    nominal: Geometry
+    prior: F64  # (6,) 1-sigma errors of the nominal geometry, mm
 
     @property
     def sigma(self) -> F64:
@@ -60,7 +45,7 @@ class CrestFit:
     @property
     def from_prior(self) -> Mask:
         """Parameters (6,) that the prior constrains more than the points do."""
-        return np.asarray(self.sigma > np.sqrt(0.5) * self.prior.sigma)
+        return np.asarray(self.sigma > np.sqrt(0.5) * self.prior)
 
     def warnings(self) -> list[str]:
         """Sentences on the scatter of the points and on outliers."""
@@ -77,8 +62,8 @@ class CrestFit:
 
     def geometry_facts(self) -> dict[str, float]:
         """Each parameter with its error, its nominal value and the error of the prior, mm."""
-        nominal = self.prior.nominal.vector()
-        columns = np.array([self.geometry.vector(), self.sigma, nominal, self.prior.sigma])
+        nominal = self.nominal.vector()
+        columns = np.array([self.geometry.vector(), self.sigma, nominal, self.prior])
         suffixes = ("_mm", "_sigma_mm", "_nominal_mm", "_prior_sigma_mm")
         names = [name + suffix for name in PARAMETERS for suffix in suffixes]
         return dict(zip(names, columns.T.ravel().tolist(), strict=True))
@@ -90,24 +75,28 @@ def relative_phase(paths: CrestPaths, geometry: Geometry) -> F64:
     return np.asarray(phase(paths.x, paths.y, geometry) - phase(rx, ry, geometry))
 
 
-def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior) -> CrestFit:
-    """Fit equation 7 by weighted least squares over fibre positions and phase."""
+def fit_crests(paths: CrestPaths, nominal: Geometry, prior: F64) -> CrestFit:
+    """Fit equation 7 by weighted least squares over fibre positions and phase.
+
+    ``prior``: (6,) 1-sigma errors of the nominal geometry, mm, in the order of `PARAMETERS`; 0
+    fixes a parameter, infinity frees it; equal for baseline_x and baseline_y.
+    """
     # Distant starts converge (tested: 10 mm of distance, 18 mm of offset, 5 % of the baseline).
     # Without a prior, only a large window determines all six parameters.
-    unknown, number = 1 + int(np.isinf(prior.sigma).sum()), len(np.unique(paths.k))
+    unknown, number = 1 + int(np.isinf(prior).sum()), len(np.unique(paths.k))
     if len(paths) <= unknown or number < 3:
         raise InputError(
             f"too few fringes: {len(paths)} points on {number} crests and valleys, {unknown} "
             "unknowns"
         )
-    nominal, sigma = _polar(prior.nominal), prior.sigma.copy()
-    sigma[ANGLE] /= nominal[LENGTH]
-    origin = np.where(sigma > 0, _polar(start), nominal)
+    expected, sigma = _polar(nominal), prior.copy()
+    sigma[ANGLE] /= expected[LENGTH]
+    origin = expected
     used, spread = np.ones(len(paths), bool), 1.0
     for _ in range(4):
         some = paths.take(used)
         some = replace(some, sigma=some.sigma * np.sqrt(spread))
-        solved, geometry, chain = _solve(some, start, origin, nominal, sigma, 1e-15)
+        solved, geometry, chain = _solve(some, nominal, origin, expected, sigma, 1e-15)
         origin = _polar(geometry)
         residual = float(solved.x[0]) + relative_phase(paths, geometry) - paths.k * np.pi
         pull = residual / paths.sigma
@@ -128,6 +117,7 @@ def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior) -> CrestFit:
         chi2,
         spread,
         int(solved.nfev),
+        nominal,
         prior,
     )
 
@@ -215,13 +205,13 @@ def _least_cost(
     # At constant ratio the phases hardly change: this follows the valley.
     origin[LENGTH] *= distance / origin[DISTANCE]
     origin[DISTANCE] = distance
-    sigma = fit.prior.sigma.copy() if refit else np.zeros(len(origin))
+    sigma = fit.prior.copy() if refit else np.zeros(len(origin))
     sigma[ANGLE] /= origin[LENGTH]
     sigma[DISTANCE], sigma[LENGTH] = 0.0, np.inf
     if length is not None:
         origin[LENGTH], sigma[LENGTH] = length, 0.0
-    nominal = _polar(fit.prior.nominal)
-    solved, geometry, _ = _solve(paths, fit.geometry, origin, nominal, sigma, 1e-9)
+    expected = _polar(fit.nominal)
+    solved, geometry, _ = _solve(paths, fit.geometry, origin, expected, sigma, 1e-9)
     return 2 * float(solved.cost), float(_polar(geometry)[LENGTH])
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pixcal import __version__
 from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
+from pixcal.estimators.fringe_fit.shapes.hyperbolic import prior_errors
 from pixcal.kernels.optics import paraxial_vector
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.config import result_options
@@ -23,7 +24,7 @@ from pixcal.model.options import Crests as Config
 from pixcal.report.crest_figures import CrestView, Extract, crest_figure, outermost
 from pixcal.report.drawing import png
 from pixcal.stages.crests import crest_fit
-from pixcal.stages.crests.crest_fit import CrestFit, Prior
+from pixcal.stages.crests.crest_fit import CrestFit
 from pixcal.stages.crests.crests import SEED_PIXELS, CrestPaths, find_crests, seed_vector
 from pixcal.stages.crests.windows import N_SUMS, CrestCarrier, Vector, Windows, tile_sums
 from pixcal.stages.fit.sweep import load_run
@@ -60,7 +61,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
                 nominal = nominal_geometry(acquisition, name, centre)
                 with naming(f"{run_dir}: fringe set {name!r}"):
                     frames, paths = _trace(source, paraxial_vector(nominal), config, runtime)
-                    fit = crest_fit.fit_crests(paths, nominal, Prior.of_bench(nominal))
+                    fit = crest_fit.fit_crests(paths, nominal, prior_errors(nominal))
                 maps = _write_arrays(made.folder / "crests.zarr" / name, paths, fit)
                 picture = crest_figure(_view(source, frames[0], paths, fit, maps))
                 (made.folder / f"crests-{name}.png").write_bytes(png(picture))
