@@ -10,11 +10,11 @@ from astropy.io import fits
 
 from pixcal.engine.run import Runtime
 from pixcal.estimators.detector.persistence import Persistence
-from pixcal.estimators.detector.subtracted_dark import subtracted_dark
 from pixcal.stages import reduce
 from pixcal.stages.evidence import load_evidence
 from pixcal.stages.ingest import stage as ingest
 from pixcal.stages.reduce.dark_current import LateRate
+from pixcal.stages.reduce.subtracted import subtracted_dark
 
 GAIN, READ, BIAS, DARK = 3.3, 2.6, 128.0, 300.0  # e-/ADU, ADU, ADU, e-/s
 SHAPE = (121, 134)

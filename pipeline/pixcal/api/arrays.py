@@ -15,7 +15,7 @@ from pixcal.model.acquisition import SCHEMA, Acquisition
 from pixcal.model.config import StrPath, parse
 from pixcal.model.errors import InputError
 from pixcal.model.yaml_file import to_yaml
-from pixcal.storage.fits_out import FrameWriter
+from pixcal.storage.products import FrameWriter
 
 Frames = NDArray[Any]
 # frames (t, y, x) and their exposure time (s), by the name of the file that they go to

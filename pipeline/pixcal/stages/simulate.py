@@ -36,7 +36,6 @@ from pixcal.simulation.exposure import Camera, states_of
 from pixcal.simulation.recording import Recording, recordings
 from pixcal.stages.tiles import spans
 from pixcal.storage.artefact import artefact_key
-from pixcal.storage.fits_out import COMPRESSED, FrameWriter
 from pixcal.storage.formats import STAGES, ArtefactKind
 from pixcal.storage.lock import lock
 from pixcal.storage.manifest import (
@@ -47,6 +46,7 @@ from pixcal.storage.manifest import (
     write_json,
     write_manifest,
 )
+from pixcal.storage.products import COMPRESSED, FrameWriter
 
 STAGE, TRUTH = STAGES["simulate"], STAGES["simulate-truth"]
 FRAMES_PER_TASK = 128  # frames for which the maps of a block of rows are computed once

@@ -1,11 +1,12 @@
-"""Maps of a detector in FITS files; a map of 46 Mpix need not be in memory.
+"""FITS images: maps of a detector, and frames; one of 46 Mpix need not be in memory.
 
-Products are written aside, a band of rows at a time, and renamed.
+Maps are written a band of rows at a time, frames piece by piece from several tasks, under another
+name (hidden, ``.aside``). A file is renamed when it is complete: one that exists is whole.
 """
 
 import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +21,10 @@ from pixcal import __version__
 from pixcal.model.arrays import F32, U8, Source
 from pixcal.model.errors import DamagedError, reason_of
 from pixcal.model.flags import PixelFlag
-from pixcal.storage.fits_out import BLOCK
-from pixcal.storage.folder import written_aside
+from pixcal.storage.folder import aside_of, written_aside
 
+BLOCK = 2880
+COMPRESSED = ".fits.fz"
 _TYPES = {8: ">u1", -32: ">f4", -64: ">f8"}
 _PIECE = 8 << 20
 
@@ -116,6 +118,7 @@ def encoded(total: int) -> str:
 BAND = 128  # rows written at a time: those of a chunk
 
 Card = tuple[str, Any, str]
+Cards = Mapping[str, Any]  # header keywords: a value, or (value, comment)
 _NOT_A_MAP = (OSError, KeyError, TypeError, ValueError, AstropyUserWarning, fits.VerifyError)
 
 
@@ -211,3 +214,75 @@ def read_map(path: Path) -> tuple[F32, F32, U8, dict[str, Any]]:
     except _NOT_A_MAP as error:
         raise _not_a_map(path, error) from error
     return data, sigma, mask, header
+
+
+# Frames
+
+
+@dataclass(frozen=True)
+class FrameWriter:
+    """A FITS image that is written in pieces, from any thread or process that sees the folder."""
+
+    path: Path  # name of the file once it is complete
+    shape: tuple[int, ...]  # (y, x), or (time, y, x) for a cube
+    dtype: str  # `uint16` (through BZERO), `uint8` or `float32`
+    data_at: int  # byte where the data begin
+
+    @classmethod
+    def create(
+        cls, path: Path, shape: tuple[int, ...], dtype: str, cards: Cards | None = None
+    ) -> "FrameWriter":
+        """Write the header and allocate the space on disk; OSError if there is none."""
+        header = _header(shape, dtype, cards or {}).tostring(padding=True).encode("ascii")
+        data_bytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        blocks = -(-data_bytes // BLOCK)
+        with aside_of(path).open("wb") as file:
+            file.write(header)
+            file.flush()
+            os.posix_fallocate(file.fileno(), 0, len(header) + blocks * BLOCK)
+        return cls(path, shape, dtype, len(header))
+
+    def write_rows(self, row: int, data: NDArray[Any], plane: int = 0) -> None:
+        """Write whole rows (rows, x) of a plane; different ones may be written at the same time."""
+        ny, nx = self.shape[-2:]
+        if data.dtype != self.dtype or data.shape[1] != nx or row + data.shape[0] > ny:
+            raise ValueError(f"{self.path}: {data.dtype} {data.shape} at row {row} does not fit")
+        stored = data ^ np.uint16(0x8000) if self.dtype == "uint16" else data  # as BZERO does
+        body = stored.astype(stored.dtype.newbyteorder(">"), order="C").data.cast("B")
+        at = self.data_at + (plane * ny + row) * nx * data.itemsize
+        with aside_of(self.path).open("r+b", buffering=0) as file:
+            while body:
+                done = os.pwrite(file.fileno(), body, at)
+                body, at = body[done:], at + done
+
+    def finish(self) -> Path:
+        """Put the file in place, once all rows are written."""
+        with written_aside(self.path, durable=True):
+            return self.path
+
+    def finish_compressed(self) -> Path:
+        """Put the file in place tile-compressed (RICE, lossless for integers), as ``.fits.fz``."""
+        plain, packed = aside_of(self.path), self.path.with_name(self.path.stem + COMPRESSED)
+        with written_aside(packed, durable=True) as aside, fits.open(plain, memmap=False) as file:
+            image = file[0]
+            tile = (1,) * (len(self.shape) - 2) + (min(16, self.shape[-2]), self.shape[-1])
+            fits.CompImageHDU(
+                image.data, image.header, compression_type="RICE_1", tile_shape=tile
+            ).writeto(aside, overwrite=True)
+        plain.unlink()
+        return packed
+
+
+def _header(shape: tuple[int, ...], dtype: str, cards: Cards) -> fits.Header:
+    header = fits.Header()
+    header["SIMPLE"] = (True, "conforms to FITS standard")
+    header["BITPIX"] = ({"uint16": 16, "uint8": 8, "float32": -32}[dtype], "array data type")
+    header["NAXIS"] = len(shape)
+    for number, length in enumerate(reversed(shape), start=1):
+        header[f"NAXIS{number}"] = length
+    if dtype == "uint16":
+        header["BSCALE"] = 1
+        header["BZERO"] = (32768, "unsigned 16-bit samples")
+    for key, card in cards.items():
+        header[key] = card
+    return header

@@ -1,12 +1,17 @@
-"""Dark signal that the camera subtracts, from the frames without light of a run."""
+"""Dark signal that the camera subtracts, as the noise of frames without light still shows it.
+
+Cameras that clamp black to their shielded pixels, or compensate for dark current, give frames
+without light of one level at all exposure times. The shot noise of the dark signal stays: its
+variance grows with exposure time (EMVA 1288, release 4.0, section 7: dark current by the variance
+method, for cameras that compensate for it).
+"""
 
 import math
 
 import numpy as np
 
 from pixcal.estimators.detector.calibration import usual_variance
-from pixcal.estimators.detector.emva import Measure
-from pixcal.estimators.detector.subtracted_dark import subtracted_dark
+from pixcal.estimators.detector.emva import Measure, dark_slope
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
@@ -16,6 +21,10 @@ from pixcal.stages.reduce.ingested import Ingested
 
 _FRAMES = 16  # of each exposure time
 _HOT = 5.0  # standard deviations from the median beyond which a pixel is hot
+_CERTAIN = 6.0  # errors beyond which variance grows by more than the level explains
+_GAIN_ERROR = 0.1  # of a gain that is declared, or roughly measured
+_LEAST = 0.1  # smallest share of the variance of the longest darks that counts
+_MOSTLY = 0.5  # least share of the dark signal that is subtracted: else the gain may be wrong
 
 
 def subtracted_rate(source: Ingested, gain: float) -> Measure:
@@ -44,6 +53,29 @@ def subtracted_rate(source: Ingested, gain: float) -> Measure:
         for one in (gain, *_of_flats(source))
     ]
     return found[0] if found[0] and all(found) else (0.0, 0.0)
+
+
+def subtracted_dark(
+    levels: tuple[F64, F64], noise: tuple[F64, F64, F64], gain: float
+) -> Measure | None:
+    """Dark signal (ADU/s) that frames without light lack, and its error; None if they lack none.
+
+    levels : exposure time (s) and mean (ADU) of each frame without light
+    noise : exposure time (s) of each series, variance of a usual sample (ADU²) and its error
+    gain : rough, e-/ADU
+    """
+    times, variance, error = noise
+    slope = dark_slope(*levels)
+    if slope is None or len(times) < 2 or not np.ptp(times) > 0 or not error.min() > 0:
+        return None
+    weight = error**-2
+    lever = times - weight @ times / weight.sum()
+    square = float(weight @ lever**2)
+    grows = gain * float(weight @ (lever * variance)) / square
+    lost = grows - max(slope[0], 0.0)
+    off = math.hypot(gain / math.sqrt(square), slope[1], _GAIN_ERROR * slope[0])
+    seen = lost / gain * float(times.max()) > _LEAST * float(variance[np.argmax(times)])
+    return (lost, off) if lost > max(_CERTAIN * off, _MOSTLY * grows) and seen else None
 
 
 def _of_pairs(source: Ingested, group: Group) -> tuple[list[float], list[float], int]:
