@@ -16,7 +16,6 @@ from pixcal.estimators.detector.calibration import usual_variance
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.arrays import F32, F64, U8
 from pixcal.model.flags import PixelFlag
-from pixcal.model.options import Reduce
 from pixcal.stages import tiles
 from pixcal.stages.reduce.frame_statistics import STATISTICS, Measuring
 from pixcal.stages.tiles import STRIP, Index, Strip
@@ -24,6 +23,7 @@ from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_g
 from pixcal.storage.place import Place
 
 _SAMPLES = 1 << 20
+_MIN_READ_FRAMES = 8  # fewest to measure the noise of each pixel; else that of the detector is used
 FLAT_FLOOR = 0.05  # least relative response in the map, which pixels without light have
 # weight of the detector's read variance relative to a pixel's own, in degrees of freedom, for read
 # noise that differs by 13 % rms among pixels. A few frames alone would give good pixels wrong
@@ -104,17 +104,13 @@ def usual(job: Measuring, folder: Place, light: F64) -> Usual:
 class Finishing:
     """Input of the second task of a column."""
 
-    statistics: Place  # what `measure` wrote
-    shape: tuple[int, int]  # of the detector's window (y, x)
+    measured: Measuring  # input of the first task
+    statistics: Place  # what it wrote
     usual: Usual  # typical values over the detector
     light: F64  # light of each tile over that of the detector
     gain: float  # to use (e-/ADU)
     read_noise: float  # of the detector (e-)
-    read_dof: int  # degrees of freedom of a pixel's own read noise; 0: use the detector's for all
     floor: float  # least read noise of a pixel (e-): the rounding of the converter
-    has_rate: bool  # has_rate, has_flat: whether dark signal and response were measured
-    has_flat: bool
-    options: Reduce  # limits of the flags
     writers: Mapping[str, ArrayWriter]  # arrays for the maps
 
 
@@ -135,7 +131,7 @@ def finish(job: Finishing, strip: Strip) -> F64:
     Returns (column, 4) over the good pixels: least and largest flat, largest bias (ADU) and dark
     signal (e-/s); infinity of the opposite sign without good pixels.
     """
-    rows, columns = tiles.span(job.shape, strip)
+    rows, columns = tiles.span(job.measured.shape, strip)
     block = ArrayReader(job.statistics / "maps").read((0, len(STATISTICS)), rows, columns)
     parts = [_maps(job, *one) for one in zip(strip, tiles.by_column(block), strict=True)]
     for name, writer in job.writers.items():
@@ -149,15 +145,16 @@ def _maps(job: Finishing, index: Index, block: F32) -> dict[str, NDArray[Any]]:
     found = dict(zip(STATISTICS, block.astype(float), strict=True))
     flat = np.ones_like(found["bias"])
     error = np.zeros_like(flat)
-    if job.has_flat:
+    if job.measured.flat:
         light = job.light[index] / job.usual.response
         flat, error = (light * found[name] for name in ("response", "response_error"))
     mask = _flags(job, found, flat, error)
     read = np.full_like(flat, job.read_noise)
-    if job.read_dof:
-        own = job.gain**2 * np.maximum(found["read_variance"], 0)
-        shared = job.read_dof * own + _PRIOR_DOF * job.read_noise**2
-        of_pixel = np.sqrt(shared / (job.read_dof + _PRIOR_DOF))
+    series = job.measured.read_series
+    if series is not None and len(series.frames) >= _MIN_READ_FRAMES:
+        own, dof = job.gain**2 * np.maximum(found["read_variance"], 0), len(series.frames) - 1
+        shared = dof * own + _PRIOR_DOF * job.read_noise**2
+        of_pixel = np.sqrt(shared / (dof + _PRIOR_DOF))
         read = np.where(np.isfinite(of_pixel), np.maximum(of_pixel, job.floor), read)
     return {
         "bias": np.nan_to_num(found["bias"]),
@@ -179,16 +176,16 @@ def _ends(maps: Mapping[str, NDArray[Any]]) -> tuple[float, float, float, float]
 
 def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> U8:
     mask = found["flags"].astype(np.uint8)
-    limits, medians = job.options, job.usual
+    limits, medians = job.measured.options, job.usual
     # A level at the boundary of two codes gives either one, however low the noise.
     least = 3 * (job.floor / job.gain) ** 2
     warm = np.zeros(mask.shape, np.bool_)
-    if job.has_rate:
+    if len({group.exptime for group in job.measured.dark}) > 1:
         warm = hot(
             found["dark_rate"], found["dark_rate_error"], medians.dark_rate_sigma, limits.hot_sigma
         )
         mask[warm] |= np.uint8(PixelFlag.HOT)
-    if job.has_flat:
+    if job.measured.flat:
         told = mask & (PixelFlag.SATURATED | PixelFlag.NO_DATA) > 0
         mask[~np.isfinite(flat) & ~told] |= np.uint8(PixelFlag.NO_DATA)
         where = dead(flat, error, limits.dead_below, limits.dead_above, FLAT_FLOOR)

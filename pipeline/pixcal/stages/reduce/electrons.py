@@ -1,6 +1,6 @@
 """Fringe frames in electrons: from FITS files, or ``raw.zarr``, to ``reduced.zarr``."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,16 +77,6 @@ def _range_e(
     return float(ends[0][good].min()), float(ends[1][good].max())
 
 
-@dataclass(frozen=True)
-class Converting:
-    """Input of the task of a column."""
-
-    fringes: FringeSet
-    scale: Scale  # codes of the electrons
-    # arrays of the dataset, and ``counts`` for what `convert` counts
-    writers: dict[str, ArrayWriter]
-
-
 def set_writers(
     folder: Place, scratch: Place, frames: int, shape: tuple[int, int], scale: Scale
 ) -> dict[str, ArrayWriter]:
@@ -147,21 +137,21 @@ STRAY_SAMPLES = 2  # saturated samples allowed per pixel in a short run
 class _Column:
     """A column of chunks during conversion."""
 
-    def __init__(self, job: Converting, index: Index, maps: dict[str, NDArray[Any]]) -> None:
-        self.job, self.index, self.maps = job, index, maps
+    def __init__(
+        self, fringes: FringeSet, scale: Scale, index: Index, maps: dict[str, NDArray[Any]]
+    ) -> None:
+        self.fringes, self.scale, self.index, self.maps = fringes, scale, index, maps
         self.coefficients = coefficients(
-            job.scale,
-            job.fringes.gain,
-            *(self.maps[name] for name in ("bias", "dark_rate", "flat")),
+            scale, fringes.gain, *(self.maps[name] for name in ("bias", "dark_rate", "flat"))
         )
         self.saturated = np.zeros(self.maps["flat"].shape, np.uint32)
         self.lost = np.zeros_like(self.saturated)
         self.codes = np.empty((CHUNK[0], *self.lost.shape), np.uint16)
         self.total = self.largest = 0
 
-    def add(self, first: int, samples: NDArray[Any], begin: int) -> None:
+    def add(self, first: int, samples: NDArray[Any], begin: int, signal: ArrayWriter) -> None:
         """Convert frames of a strip's columns from ``begin`` on; write full chunks."""
-        fringes, last = self.job.fringes, first + len(samples)
+        fringes, last = self.fringes, first + len(samples)
         at = first % CHUNK[0]
         held = at + len(samples)
         self.total += encode(
@@ -176,14 +166,14 @@ class _Column:
         )
         if held == CHUNK[0] or last == fringes.frames:
             (y0, _), (x0, _) = tiles.extent(fringes.raw.shape[1:], self.index)
-            self.job.writers["signal"].write((last - held, y0, x0), self.codes[:held])
+            signal.write((last - held, y0, x0), self.codes[:held])
 
     def result(self) -> dict[str, NDArray[Any]]:
         """Maps and counts, by the names of their arrays."""
-        fringes, maps = self.job.fringes, self.maps
+        fringes, maps = self.fringes, self.maps
         flat, rate, seconds = maps["flat"], maps["dark_rate"], float(fringes.exptime.mean())
         read = (maps["read_noise"] ** 2 + np.maximum(rate, 0) * seconds) / flat**2
-        read = read + self.job.scale.variance
+        read = read + self.scale.variance
         often = self.saturated > max(STRAY_SHARE * fringes.frames, STRAY_SAMPLES)
         mask = maps["mask"] | PixelFlag.SATURATED * often | PixelFlag.NO_DATA * (self.lost > 0)
         without = int(self.saturated.sum()), int(self.lost.sum())
@@ -192,7 +182,9 @@ class _Column:
         return {"read_variance": read, "shot_factor": 1 / flat, "mask": mask, "counts": counts}
 
 
-def convert(job: Converting, parts: Sequence[Strip]) -> None:
+def convert(
+    fringes: FringeSet, scale: Scale, writers: Mapping[str, ArrayWriter], parts: Sequence[Strip]
+) -> None:
     """Write columns of chunks in electrons, their maps, and their counts.
 
     The counts are: saturated samples; other samples without weight; samples with weight; the sum of
@@ -200,18 +192,18 @@ def convert(job: Converting, parts: Sequence[Strip]) -> None:
     """
     found: dict[Index, dict[str, NDArray[Any]]] = {}
     for strip in parts:
-        own = zip(strip, job.fringes.maps(strip), strict=True)
-        columns = [_Column(job, index, maps) for index, maps in own]
-        for first, samples in blocks(job.fringes.raw, strip):
+        own = zip(strip, fringes.maps(strip), strict=True)
+        columns = [_Column(fringes, scale, index, maps) for index, maps in own]
+        for first, samples in blocks(fringes.raw, strip):
             largest = int(samples.max()) if samples.dtype.kind in "iu" else 0
             for n, column in enumerate(columns):
-                column.add(first, samples, n * CHUNK[2])
+                column.add(first, samples, n * CHUNK[2], writers["signal"])
                 column.largest = max(column.largest, largest)
         found |= {column.index: column.result() for column in columns}
     for strip in tiles.strips(list(found), STRIP):
-        (y0, _), (x0, _) = tiles.extent(job.fringes.raw.shape[1:], strip[0])
+        (y0, _), (x0, _) = tiles.extent(fringes.raw.shape[1:], strip[0])
         for name in found[strip[0]]:
-            writer = job.writers[name]
+            writer = writers[name]
             data = np.concatenate([found[index][name] for index in strip], axis=1)
             start = (*strip[0], 0) if name == "counts" else (y0, x0)
             writer.write(start, data.astype(writer.dtype))

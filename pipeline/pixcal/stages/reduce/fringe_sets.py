@@ -10,7 +10,7 @@ from pixcal.kernels.quantise import Scale, choose_scale
 from pixcal.model.arrays import I64
 from pixcal.stages.reduce import electrons
 from pixcal.stages.reduce.columns import run_noted, strip_width
-from pixcal.stages.reduce.electrons import Converting, FringeSet
+from pixcal.stages.reduce.electrons import FringeSet
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.tiles import indices, strips
 from pixcal.storage.artefact import Workspace
@@ -82,11 +82,10 @@ def write_set(
         scale = choose_scale(low, high, bounds.smallest_variance, share)
     folder = made.cubes / "reduced.zarr" / fringes.name
     scratch = made.scratch / "counts" / fringes.name
-    job = Converting(
-        fringes, scale, electrons.set_writers(folder, scratch, fringes.frames, source.shape, scale)
-    )
-    run_noted(made, partial(electrons.convert, job), todo, width, runtime, name)
-    for writer in job.writers.values():
+    writers = electrons.set_writers(folder, scratch, fringes.frames, source.shape, scale)
+    task = partial(electrons.convert, fringes, scale, writers)
+    run_noted(made, task, todo, width, runtime, name)
+    for writer in writers.values():
         writer.finish()
     electrons.write_coordinates(folder, source.tables[name]["time_s"], source.shape)
     return {

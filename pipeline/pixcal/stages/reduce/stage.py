@@ -51,7 +51,6 @@ from pixcal.storage.stage import make, working
 
 SCHEMA = "pixcal/reduce/1"
 
-_MIN_READ_FRAMES = 8  # fewest to measure the noise of each pixel
 _SHARED_BYTES = 64 << 20
 _LINES = 4  # fewest neighbouring rows or columns without light to report
 
@@ -150,7 +149,7 @@ def reduce_frames(made: Workspace, source: Ingested, config: Config, runtime: Ru
     summary = summarise(job, made.scratch / "statistics", source)
     summary = with_excess_noise(summary, source, job)
     gain = summary.gain_to_use(config.gain)
-    bounds = _calibrate(made, source, summary, gain, config, runtime)
+    bounds = _calibrate(made, source, summary, job, gain, runtime)
     sets = {}
     for name in exposures.fringes:
         sets[name.partition("/")[2]] = write_set(
@@ -198,26 +197,20 @@ def _calibrate(
     made: Workspace,
     source: Ingested,
     summary: Summary,
+    measured: Measuring,
     gain: float,
-    config: Config,
     runtime: Runtime,
 ) -> Bounds:
     """Write ``calibration.zarr``; return its extremes over the good pixels."""
-    series = source.exposures.read_series
     read_noise = summary.read_noise_e(gain)
-    frames = 0 if series is None else len(series.frames)
     job = Finishing(
+        measured=measured,
         statistics=made.scratch / "statistics",
-        shape=source.shape,
         usual=summary.usual,
         light=summary.light,
         gain=gain,
         read_noise=read_noise,
-        read_dof=frames - 1 if frames >= _MIN_READ_FRAMES else 0,
         floor=gain * ROUNDING_ADU * source.quantum,
-        has_rate=source.exposures.has_rate,
-        has_flat=bool(source.exposures.flat),
-        options=config,
         writers=calibration_writers(made.folder / "calibration.zarr", source.shape),
     )
     todo = strips(indices(source.shape), STRIP)
