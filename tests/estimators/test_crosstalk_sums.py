@@ -58,7 +58,7 @@ def test_one_frame_stands_for_all_of_one_charge_and_few_for_many() -> None:
         weight=np.ones_like(part.weight),
         steady=True,
     )
-    for one, frames, accuracy in ((part, 29, 0.2), (flat, 1, 1e-4)):
+    for one, frames, accuracy in ((part, 50, 0.2), (flat, 1, 1e-4)):
         value, charge, good = covariance._weights(one)
         assert len(value) == len(charge) == frames
         few = expected([(value, charge, good)], (0, 1))[1].sum(axis=(1, 2))

@@ -45,7 +45,7 @@ for _own, _i, _j in zip(BOTH, *np.triu_indices(4), strict=True):
         _own[_n : _n + 3, _m : _m + 3] += TERMS[_i, _n, _m] * TERMS[_j]
 _BLOCK = 12  # columns whose products are made together
 _AT_ONCE = MAX_SAMPLES  # samples up to which sequences are gathered
-_ENOUGH = 32  # frames whose weights stand for those of a sequence
+_ENOUGH = 64  # frames whose weights stand for those of a sequence
 
 
 @dataclass(frozen=True)
