@@ -29,11 +29,13 @@ def sigmas_of(*families: tuple[float, int]) -> float:
     ``families``: the largest chi-square of tests made together, and their number; all families
     have the same share of the chance.
     """
-    log_any = min(
-        log_of_any(float(np.log(2) + log_ndtr(-np.sqrt(best))), INDEPENDENT * count * len(families))
-        for best, count in families
-    )
-    return -float(ndtri_exp(min(log_any, -1e-300)))
+    sigmas = []
+    for best, count in families:
+        log_one, tests = np.log(2) + log_ndtr(-np.sqrt(best)), INDEPENDENT * count * len(families)
+        none = tests * np.log1p(-np.exp(log_one))
+        rare = none > -0.5
+        sigmas.append(-ndtri_exp(log_of_any(float(log_one), tests)) if rare else ndtri_exp(none))
+    return float(max(sigmas))
 
 
 def standing_out(sources: Sources) -> tuple[tuple[Place, ...], float]:
