@@ -11,6 +11,7 @@ from pixcal.effects.flat_error import FlatError
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.maps.map_fit import polynomial, without
 from pixcal.model.bench import Bench
+from pixcal.model.errors import InputError
 from pixcal.simulation.recording import recordings
 
 
@@ -73,6 +74,36 @@ def test_its_size_is_found(acquired: Callable[..., Evidence], pixel_rms: float) 
     assert abs(found.effect.smooth_rms - 2.5 * pixel_rms) < 4 * error < 2.5 * pixel_rms
     assert abs(found.effect.scale_px - 4.0) < 4 * found.errors["scale_px"] < 2.0
     assert found.significance > 6
+
+
+@pytest.mark.quick(1)
+def test_a_pattern_of_any_form_is_measured_mode_by_mode(
+    acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench]
+) -> None:
+    # Three lengths, and no whole number of waves on the window: its modes are others.
+    x, y = (0.31, 0.83, 0.12), (0.23, -0.41, 1.37)
+    cos, sin = (0.004, 0.0, -0.003), (0.0, 0.004, 0.002)
+    waves = {"wave_x_rad_px": x, "wave_y_rad_px": y, "wave_cos": cos, "wave_sin": sin}
+    true = FlatError(0.0, 0.0, 8.0, x, y, cos, sin)
+    on = {name: list(values) for name, values in waves.items()}
+    evidence = acquired(None, {"flat_error": on | {"pixel_rms": 0.0, "smooth_rms": 0.0}})
+    found = FlatError.estimate(evidence)
+    assert found is not None
+    assert isinstance(found.in_full, FlatError)
+    (ny, nx), (y0, x0) = evidence.good.shape, evidence.origin
+    at = {"detector.shape": [ny, nx], "detector.chip": None, "detector.origin_px": [y0, x0]}
+    detector = make_effect_bench(at).detector
+    wanted, measured = (e.ratio(detector, (0, ny)) - 1 for e in (true, found.in_full.scaled(1.0)))
+    smooth = replace(found.in_full, pixel_rms=0.0).ratio(detector, (0, ny)) - 1
+    left = (smooth - wanted)[evidence.good]
+    assert left.std() < 0.35 * wanted[evidence.good].std()
+    # Of its size in all: what stands out in no mode counts as white.
+    assert measured.std() == pytest.approx(wanted.std(), rel=0.1)
+
+
+def test_a_wave_has_four_numbers() -> None:
+    with pytest.raises(InputError, match="wave_cos, wave_sin: give as many numbers of each"):
+        FlatError(wave_x_rad_px=(0.1,), wave_y_rad_px=(0.2,), wave_cos=(0.01,))
 
 
 CROSSED = {"parent": "crossed"}

@@ -1,15 +1,13 @@
 """A flat that is not the pixels' response to the light of the fringes.
 
-Waves of random direction and one length make a ring in the power that two maps share. Each scale,
-the wavelength over 2 pi, gives a template of such waves on the window, less a parabola; with white
-power beside it, it is fitted to the cross power of two maps of independent noise.
+Its smooth part is fitted as waves of one length (`ring_power`). A pattern of another form, such as
+interference in the window of the sensor, is measured as the Fourier modes in which both maps stand
+out and agree.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-from scipy.special import j0
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.maps.map_fit import (
@@ -19,6 +17,7 @@ from pixcal.estimators.maps.map_fit import (
     polynomial,
     without,
 )
+from pixcal.estimators.maps.ring_power import Ring, ring_power
 from pixcal.kernels.beams import LightMaps
 from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.scene import TILE, DetectorMaps, Rows, chip_map
@@ -26,6 +25,7 @@ from pixcal.kernels.significance import root_with_error
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.bench import SimulatedDetector
 from pixcal.model.config import quantity
+from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.recording import Recording
 
@@ -35,18 +35,10 @@ AGREE = 3.0  # standard deviations within which waves of one length explain the 
 _CLIP = 5.0
 _MIN_PIXELS = 200
 _MIN_FRAMES = 8
-SHORTEST = 1.25  # shortest scale, px: crests of shorter waves are a few pixels apart
-# ratio of the window's width to the longest scale: longer waves resemble parabolas
-WIDEST = 4
-STEP = 0.1  # step of the logarithm of the trial scales
-# ratio of the window's width to a scale above which the removed parabola does not matter
-NARROW = 12
-# error of a wave's phase across the window, rad; larger in windows below `FEW` scales, where it
-# depends on the position of few crests, and a parabola absorbs much
-APART, FEW_APART, FEW = 0.5, 2.0, 10
-DIRECTIONS = 16  # directions of longer waves, whose ring has few resolution elements
-EDGE = 0.02  # power at the edge of the ring, over the template's highest power
-_PARABOLA = 2
+# power of a mode of the measured pattern, over that of noise and pixels: chance exceeds it once in
+# 8,000 modes
+STANDS_OUT = 9.0
+_WAVES = ("wave_x_rad_px", "wave_y_rad_px", "wave_cos", "wave_sin")  # numbers of each wave
 
 
 @dataclass(frozen=True)
@@ -61,7 +53,7 @@ class FlatError(Effect):
     acts_at = Stage.PIXEL
     order = 2
     domains = ("space",)
-    strengths = ("pixel_rms", "smooth_rms")
+    strengths = ("pixel_rms", "smooth_rms", "wave_cos", "wave_sin")
     absorbed_because = "it scales level and fringes of a pixel equally and leaves the phase"
     frames_needed = ("flat", "axis")
     sources = (
@@ -76,11 +68,27 @@ class FlatError(Effect):
     scale_px: float = quantity(
         8.0, unit="px", above=1, high=1e5, doc="length scale of the smooth part: wavelength / 2 pi"
     )
+    wave_x_rad_px: tuple[float, ...] = quantity(
+        (), unit="rad/px", low=-7, high=7, doc="wave vectors of a measured pattern, along x"
+    )
+    wave_y_rad_px: tuple[float, ...] = quantity(
+        (), unit="rad/px", low=-7, high=7, doc="wave vectors of a measured pattern, along y"
+    )
+    wave_cos: tuple[float, ...] = quantity(
+        (), low=-0.5, high=0.5, doc="cosine amplitudes of these waves, from the chip's first pixel"
+    )
+    wave_sin: tuple[float, ...] = quantity((), low=-0.5, high=0.5, doc="sine amplitudes")
+
+    def __post_init__(self) -> None:
+        if len({len(getattr(self, name)) for name in _WAVES}) > 1:
+            raise InputError(f"{', '.join(_WAVES)}: give as many numbers of each, one for a wave")
 
     def ratio(self, detector: SimulatedDetector, rows: Rows) -> F32:
         """Response to the fringes over the flat (y, x), on rows of the window."""
         pixels = chip_map(detector, rows, self.name, lambda rng: rng.standard_normal(TILE))
         error = self.pixel_rms * pixels + self.smooth_rms * self._smooth(detector, rows)
+        if self.wave_cos:
+            error += self._measured(detector, rows)
         return np.asarray(np.maximum(1 + error, 0), np.float32)
 
     def _smooth(self, detector: SimulatedDetector, rows: Rows) -> F64:
@@ -94,6 +102,13 @@ class FlatError(Effect):
             for d, p in zip(direction, phase, strict=True)
         ]
         return np.asarray(np.sum(waves, axis=0) * np.sqrt(2 / WAVES))
+
+    def _measured(self, detector: SimulatedDetector, rows: Rows) -> F64:
+        y = np.arange(*rows) + detector.origin[0]
+        x = np.arange(detector.shape[1]) + detector.origin[1]
+        sizes = np.array(self.wave_cos) - 1j * np.array(self.wave_sin)
+        along_y = np.exp(1j * np.outer(y, self.wave_y_rad_px)) * sizes
+        return np.asarray((along_y @ np.exp(1j * np.outer(self.wave_x_rad_px, x))).real)
 
     def pixels(
         self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
@@ -129,13 +144,43 @@ class FlatError(Effect):
         )
         pixel, whole = (min(float(v), 0.5) for v in rms)
         waves = ring.variance > SMOOTH_SEEN * ring.noise
+        common, chance = float(all_of_it.mean()), float(all_of_it.std() / np.sqrt(weight))
+        full = _in_full(common, np.mean(iotas, axis=0), np.mean(alphas, axis=0), evidence.origin)
         return Estimate(
             cls(pixel, whole, ring.scale if waves else cls().scale_px),
             {"pixel_rms": float(errors[0]), "smooth_rms": float(errors[1])}
             | ({"scale_px": ring.scale_error} if waves else {}),
-            float(all_of_it.mean() / all_of_it.std() * np.sqrt(weight)),
+            common / chance,
             "structure common to mean light and fringe amplitude after division by the flat",
+            in_full=full,
+            size={} if full is None else _size(common, chance),
         )
+
+
+def _size(variance: float, error: float) -> dict[str, float | str]:
+    """The pattern's rms as the size of the effect."""
+    (rms,), (own,) = root_with_error(np.array([variance]), np.array([error]))
+    return {"value": float(rms), "error": float(own), "unit": "", "of": "rms of the response"}
+
+
+def _in_full(variance: float, iota: F64, alpha: F64, origin: tuple[int, int]) -> FlatError | None:
+    """The pattern of a variance that two maps (y, x) share, as measured; None without one."""
+    (ny, nx), (y0, x0) = iota.shape, origin
+    qy, qx = 2 * np.pi * np.fft.fftfreq(ny)[:, None], 2 * np.pi * np.fft.rfftfreq(nx)
+    a, b = np.fft.rfft2(iota) / iota.size, np.fft.rfft2(alpha) / alpha.size
+    pattern, common = (a + b) / 2, (a * b.conj()).real
+    # One mode of each pair of opposite vectors, without those that have no opposite.
+    single = np.where(qx > 0, qx < np.pi, (qy > 0) & (qy < np.pi)) & (np.abs(qy) < np.pi)
+    power = np.abs(pattern) ** 2
+    rest = float(np.median(power[single])) / np.log(2)  # mean of their exponential distribution
+    rows, columns = np.nonzero(single & (power > STANDS_OUT * rest) & (common > power / 2))
+    if not len(rows):
+        return None
+    y, x, mode = qy[rows, 0], qx[columns], pattern[rows, columns]
+    sizes = 2 * mode * (1 - rest / np.abs(mode) ** 2) * np.exp(-1j * (y * y0 + x * x0))
+    waves = [tuple(one.tolist()) for one in (x, y, sizes.real, -sizes.imag)]
+    pixels = max(variance - float((np.abs(sizes) ** 2).sum()) / 2, 0.0)
+    return FlatError(np.sqrt(pixels), 0.0, FlatError().scale_px, *waves)
 
 
 def _two_flats(evidence: Evidence) -> tuple[F64, F64] | None:
@@ -172,7 +217,7 @@ def _structure(
     return maps[0], maps[1]
 
 
-def _smooth(neighbours: F64, ring: "Ring") -> tuple[float, float, float]:
+def _smooth(neighbours: F64, ring: Ring) -> tuple[float, float, float]:
     """Variance of the smooth part, its error by noise, and its error as a sample of its kind."""
     # From the covariance of neighbours; from waves of one length if these explain it, as they are
     # better known.
@@ -180,98 +225,3 @@ def _smooth(neighbours: F64, ring: "Ring") -> tuple[float, float, float]:
     if abs(ring.variance - variance) < AGREE * np.hypot(noise, ring.noise):
         return ring.variance, ring.noise, ring.error
     return variance, noise, float(np.hypot(noise, ring.error))
-
-
-@dataclass(frozen=True)
-class Ring:
-    """Waves of one length common to two maps."""
-
-    # variance, noise: of the waves in this window, with the part that a parabola absorbs; error
-    variance: float
-    noise: float
-    # error of the variance as that of all waves of the kind, as a window holds few modes
-    error: float
-    # scale, scale_error: wavelength over 2 pi, px; the error is infinite without waves
-    scale: float
-    scale_error: float
-
-
-def ring_power(power: F64) -> Ring:
-    """Fit a ring to the cross power (y, x) of two maps: ``fft2(a) * conj(fft2(b))`` over px²."""
-    shape = (power.shape[0], power.shape[1])
-    scales, templates = _templates(shape)
-    white = np.full(power.size, 1 / power.size)
-    data = power.ravel()
-    fits = [np.linalg.lstsq(np.stack([white, t], axis=1), data, rcond=None)[0] for t in templates]
-    # Waves with negative power count as zero.
-    both = zip(fits, templates, strict=True)
-    left = [np.sum((data - c[0] * white - max(c[1], 0.0) * t) ** 2) for c, t in both]
-    best = int(np.clip(np.argmin(left), 1, len(scales) - 2))
-    variance, noise, modes = _sum_of_ring(data, templates[best])
-    if variance <= 0:
-        return Ring(variance, noise, noise, float(scales[best]), np.inf)
-    slope = (templates[best + 1] - templates[best - 1]) / (2 * STEP)
-    design = np.stack([white, templates[best], float(fits[best][1]) * slope], axis=1)
-    unit = np.sqrt((design**2).sum(axis=0)) + 1e-300
-    rows = np.linalg.pinv(design / unit, rcond=1e-8) / unit[:, None]
-    projected = rows @ data
-    # Waves fill the ring unevenly, so their scatter about it gives the error (Huber's sandwich),
-    # which the resolution of the window limits.
-    width = float(np.sqrt(2 * ((rows[2] * (data - design @ projected)) ** 2).sum()))
-    scale = float(scales[best] * np.exp(np.clip(projected[2], -STEP, STEP)))
-    apart = FEW_APART if scale * FEW > min(shape) else APART
-    width = min(float(np.hypot(width, apart * scale / min(shape))), 0.75)
-    # Error of the wavelength, larger towards longer wavelengths.
-    width /= 1 - width
-    # Relative to the expected variance, which may be larger than the measured one.
-    draws = min(float(np.sqrt(2 / modes)), 0.75)
-    error = float(np.hypot(noise, variance * draws / (1 - draws)))
-    # A parabola absorbs more of longer waves.
-    places = np.clip([best - width / STEP, best + width / STEP], 0, len(scales) - 1)
-    ends = [_sum_of_ring(data, templates[int(n)])[0] for n in np.rint(places)]
-    error = float(np.hypot(error, np.mean(np.abs(np.array(ends) - variance))))
-    return Ring(variance, noise, error, scale, scale * width)
-
-
-def _sum_of_ring(data: F64, template: F64) -> tuple[float, float, float]:
-    """Variance of the waves from the ring's total power, its error by noise, number of modes."""
-    # Waves fill the ring unevenly, which does not affect the sum. Modes k and -k of a real map
-    # are equal.
-    inside = template > EDGE * template.max()
-    white, noise = float(data[~inside].mean()), float(data[~inside].var())
-    power, share = float((data[inside] - white).sum()), float(template[inside].sum())
-    # The waves' own power beats with the noise.
-    spread = 2 * np.count_nonzero(inside) * noise + max(power, 0.0) * np.sqrt(2 * noise)
-    modes = share**2 / float((template[inside] ** 2).sum())
-    return power / share, max(float(np.sqrt(spread)) / share, 1e-300), modes
-
-
-@lru_cache(maxsize=4)
-def _templates(shape: tuple[int, int]) -> tuple[F64, F64]:
-    """Scales (n,) and the mean power (n, y * x) of waves of unit variance on a window."""
-    longest = max(min(shape) / WIDEST, SHORTEST * np.exp(4 * STEP))
-    scales = np.exp(np.arange(np.log(SHORTEST), np.log(longest), STEP))
-    short = [_of_short_waves(shape, s) for s in scales if s < min(shape) / NARROW]
-    long = [_of_long_waves(shape, s) for s in scales[len(short) :]]
-    return scales, np.stack([*short, *long]).reshape(len(scales), -1)
-
-
-def _of_short_waves(shape: tuple[int, int], scale: float) -> F64:
-    """Mean power (y, x) of all directions: the transform of a Bessel function."""
-    ny, nx = shape
-    dy, dx = np.arange(1 - ny, ny)[:, None], np.arange(1 - nx, nx)
-    products = (1 - abs(dy) / ny) * (1 - abs(dx) / nx) * j0(np.hypot(dy, dx) / scale)
-    wrapped = np.zeros(shape)
-    np.add.at(wrapped, (dy % ny, dx % nx), products)
-    return np.asarray(np.fft.fft2(wrapped).real / wrapped.size)
-
-
-def _of_long_waves(shape: tuple[int, int], scale: float) -> F64:
-    """Mean power (y, x) of waves of several directions, each minus its fitted parabola."""
-    free = polynomial(shape, _PARABOLA).reshape(-1, shape[0] * shape[1]).T
-    y, x = np.mgrid[: shape[0], : shape[1]].reshape(2, -1).astype(float)
-    angle = np.pi * (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS
-    phase = (np.outer(x, np.cos(angle)) + np.outer(y, np.sin(angle))) / scale
-    waves = without(np.sqrt(2) * np.hstack([np.cos(phase), np.sin(phase)]), free)
-    power = np.abs(np.fft.fft2(waves.T.reshape(-1, *shape))) ** 2
-    return np.asarray(power.mean(axis=0) / y.size**2)

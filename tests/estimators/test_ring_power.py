@@ -4,8 +4,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pixcal.effects.flat_error import NARROW, Ring, _of_long_waves, _of_short_waves, ring_power
 from pixcal.estimators.maps.map_fit import polynomial, without
+from pixcal.estimators.maps.ring_power import (
+    NARROW,
+    Ring,
+    _of_long_waves,
+    _of_short_waves,
+    ring_power,
+)
 
 F64 = NDArray[np.float64]
 SHAPE = (61, 67)
