@@ -25,10 +25,10 @@ from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.stages import ingest, reduce
+from pixcal.stages.diagnose.benches import CONFIRM_SIMULATIONS
 from pixcal.stages.diagnose.candidates import Considered
 from pixcal.stages.diagnose.comparison import Trial, differing, shrinkage
 from pixcal.stages.diagnose.diagnosis_input import prepare_input
-from pixcal.stages.diagnose.search import CONFIRM_SIMULATIONS
 from pixcal.stages.diagnose.search_run import REFERENCES
 from pixcal.stages.diagnose.trial import Trials
 from pixcal.storage.manifest import read_json

@@ -12,16 +12,11 @@ from pixcal.estimators.test_statistics.gap import compare, flagged
 from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import DOMAINS, Effect, Estimate, Stage
+from pixcal.stages.diagnose.benches import CONFIRM_SIMULATIONS, SCREEN_SIMULATIONS, SIMULATIONS
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
 from pixcal.stages.diagnose.comparison import Comparison, Trial, differing, gap_interval, shrinkage
 from pixcal.stages.diagnose.rejection import doubtful, unhelpful
-from pixcal.stages.diagnose.search import (
-    CONFIRM_SIMULATIONS,
-    MAX_CAUSES,
-    SCREEN_SIMULATIONS,
-    SIMULATIONS,
-    Search,
-)
+from pixcal.stages.diagnose.search import MAX_CAUSES, Search
 from pixcal.stages.diagnose.thresholds import MIN_LOGLIK_GAIN, MIN_LOGLIK_GAIN_WEAK
 
 KEYS: tuple[Key, ...] = (

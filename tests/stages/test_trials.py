@@ -13,7 +13,12 @@ from pixcal.engine.run import Runtime
 from pixcal.estimators.test_statistics import Curve
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose import trial
-from pixcal.stages.diagnose.search import LEAST_SIMULATIONS, SEARCH_SAMPLES, SIMULATIONS, affordable
+from pixcal.stages.diagnose.benches import (
+    LEAST_SIMULATIONS,
+    SEARCH_SAMPLES,
+    SIMULATIONS,
+    affordable,
+)
 from pixcal.stages.diagnose.trial import Trials
 
 LAG, ROWS = Lag(share=0.002), RowNoise()

@@ -16,6 +16,13 @@ from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose import rejection
+from pixcal.stages.diagnose.benches import (
+    CONFIRM_SIMULATIONS,
+    SCREEN_SIMULATIONS,
+    SIMULATIONS,
+    Benches,
+    Simulate,
+)
 from pixcal.stages.diagnose.candidates import (
     Addition,
     Additions,
@@ -23,7 +30,8 @@ from pixcal.stages.diagnose.candidates import (
     SearchResult,
     likeliest,
 )
-from pixcal.stages.diagnose.comparison import Comparison, Trial
+from pixcal.stages.diagnose.comparison import Comparison
+from pixcal.stages.diagnose.pruning import Pruning
 from pixcal.stages.diagnose.thresholds import (
     MIN_JOINT_GAP_CLOSED,
     MIN_LOGLIK_GAIN,
@@ -32,10 +40,8 @@ from pixcal.stages.diagnose.thresholds import (
     MIN_SIGMA_WEAK,
     SIMILAR,
 )
-from pixcal.stages.diagnose.trial import Curves, Effects
+from pixcal.stages.diagnose.trial import Effects
 
-SCREEN_SIMULATIONS = 3  # simulations of a candidate,
-CONFIRM_SIMULATIONS = 8  # and of the accepted causes
 PROMISING = 0.25  # share of the best gain above which a candidate is simulated more than once,
 # largest significance credited after one simulation: its scatter is unknown
 MAX_SINGLE_SIMULATION_SIGMA = 3.0
@@ -43,17 +49,6 @@ MAX_CAUSES = 5  # most causes that are accepted
 # significance in one simulation, sigma, up to which chance produces it, not the causes
 BY_CHANCE = 2.5
 TIE_MARGIN = 0.1  # relative difference from the best gain within which candidates are equal
-# most simulations of a search (two causes take about 80); number of samples that limits them if
-# each has many; least number even then. Never the time: results must not depend on the machine.
-SIMULATIONS, SEARCH_SAMPLES, LEAST_SIMULATIONS = 300, 3_000_000_000, 100
-
-
-def affordable(samples: int) -> int:
-    """Number of simulations that a search may use; each of ``samples`` samples."""
-    return int(np.clip(SEARCH_SAMPLES // max(samples, 1), LEAST_SIMULATIONS, SIMULATIONS))
-
-
-Simulate = Callable[[Sequence[Effects], int, str, Sequence[str]], Sequence[list[Curves] | str]]
 Estimates = Callable[[Effects, Sequence[str]], Mapping[str, float]]
 Measure = Callable[[str, Effects], Estimate | None]
 
@@ -77,10 +72,9 @@ class Search:
         most: int = SIMULATIONS,
         measure: Measure = lambda *_: None,
     ) -> None:
-        self._ask, self._estimates, self._most = simulate, estimates, most
-        self._measure = measure
-        self._made: dict[frozenset[Effect], int] = {}  # simulations of each bench
+        self._estimates, self._measure = estimates, measure
         self.comparison = Comparison(reference, data)
+        self._benches = Benches(self.comparison, simulate, most)
         self._current = self.comparison.nominal  # the bench with all causes accepted so far
         # fraction of each remaining candidate's significance that the causes do not produce
         self._shares: dict[str, float] = {}
@@ -102,16 +96,11 @@ class Search:
         if len(self._effects) == MAX_CAUSES:
             for candidate in remaining.values():
                 candidate.reason = f"not tested: the search stops after {MAX_CAUSES} causes"
-        return self._prune_causes()
+        return Pruning(self._benches, candidates).of(self._effects, self._current, self._alike)
 
     @property
     def _bench(self) -> Effects:
         return tuple(self._effects.values())
-
-    @property
-    def _left(self) -> int:
-        """Simulations that the search may still use."""
-        return self._most - sum(self._made.values())
 
     def _accept_all(self) -> None:
         while len(self._effects) < MAX_CAUSES and self._accept_one():
@@ -129,7 +118,7 @@ class Search:
         if effect is None or self._unexplainable(laws, replays):
             return False
         del remaining[best]
-        confirmed = self._confirmed((*self._bench, effect), asked=[*remaining])
+        confirmed = self._benches.confirmed((*self._bench, effect), asked=[*remaining])
         if isinstance(confirmed, str):
             candidates[best].reason = f"cannot be simulated: {confirmed}"
             return True
@@ -167,7 +156,7 @@ class Search:
         """Whether effects that close little alone compensate each other."""
         if len(effects) < 2:
             return False
-        (curves,) = self._simulate([effects], 1, "all candidates", ())
+        (curves,) = self._benches.simulate([effects], 1, "all candidates", ())
         if isinstance(curves, str):
             return False
         trial = self.comparison.trial(effects, curves)
@@ -186,7 +175,7 @@ class Search:
         remaining, candidates = self._remaining, self._candidates
         options = rejection.exchanges(self._effects, candidates)
         count = len(self._effects) + 1
-        left = self._left - CONFIRM_SIMULATIONS * (1 + count * (count + 1) // 2)
+        left = self._benches.left - CONFIRM_SIMULATIONS * (1 + count * (count + 1) // 2)
         if not self.comparison.differs(self._current):
             return False
         options += self._measured_apart()
@@ -195,7 +184,7 @@ class Search:
         benches = [tuple(one.effects.values()) for one in options]
         # Choose by one simulation of each, then by a few, before the choice is confirmed.
         for seeds, needed in ((1, 0.0), (SCREEN_SIMULATIONS, MIN_LOGLIK_GAIN_WEAK)):
-            tried = self._simulate([self._bench, *benches], seeds, "exchanged", ())
+            tried = self._benches.simulate([self._bench, *benches], seeds, "exchanged", ())
             likely = [
                 -np.inf if isinstance(c, str) else self.comparison.trial(b, c).log_likelihood
                 for b, c in zip([self._bench, *benches], tried, strict=True)
@@ -205,7 +194,7 @@ class Search:
                 return False
             options, benches = (options[place],), [benches[place]]
         (best,) = options
-        trial = self._confirmed(tuple(best.effects.values()))
+        trial = self._benches.confirmed(tuple(best.effects.values()))
         if isinstance(trial, str) or trial.log_likelihood < (
             self._current.log_likelihood + MIN_LOGLIK_GAIN_WEAK
         ):
@@ -312,22 +301,16 @@ class Search:
             count * (2 * CONFIRM_SIMULATIONS + SCREEN_SIMULATIONS)
             + count * (count - 1) // 2 * CONFIRM_SIMULATIONS
         )
-        left = self._left - CONFIRM_SIMULATIONS - weighed
+        left = self._benches.left - CONFIRM_SIMULATIONS - weighed
         for name in sorted(sizes, key=lambda n: -sizes[n]):
             candidate = remaining[name]
             left -= SCREEN_SIMULATIONS * (len(candidate.variants(self._shares.get(name, 1.0))) + 1)
             if left < 0:
                 candidate.reason = (
-                    f"not decided: too few of the search's {self._most} simulations are left"
+                    f"not decided: too few of the search's {self._benches.most} simulations are "
+                    "left"
                 )
                 del remaining[name]
-
-    def _simulate(
-        self, benches: Sequence[Effects], seeds: int, label: str, asked: Sequence[str]
-    ) -> Sequence[list[Curves] | str]:
-        for bench in map(frozenset, benches):
-            self._made[bench] = max(self._made.get(bench, 0), seeds)
-        return self._ask(benches, seeds, label, asked)
 
     def _tried(self) -> tuple[Additions, Additions]:
         """Add each candidate to the causes: its likeliest variant by law, and its replay."""
@@ -375,11 +358,11 @@ class Search:
     ) -> list[Addition]:
         """Variants added to the causes, with their gains; ``drop`` those that were refused."""
         candidates = self._candidates
-        beside = self._start(self._bench, simulations)
+        beside = self._benches.start(self._bench, simulations)
         start = self.comparison.allowing_for_laws(beside, self._current)
         benches = [(*self._bench, effect) for _, effect in options]
         label = f"{label}, round {len(self._effects) + 1}"
-        simulated = self._simulate(benches, simulations, label, ())
+        simulated = self._benches.simulate(benches, simulations, label, ())
         made: list[Addition] = []
         refused: dict[str, str] = {}
         for (name, effect), bench, curves in zip(options, benches, simulated, strict=True):
@@ -404,20 +387,6 @@ class Search:
                 del self._remaining[name]
         return made
 
-    def _confirmed(
-        self, effects: Effects, simulations: int = CONFIRM_SIMULATIONS, asked: Sequence[str] = ()
-    ) -> Trial | str:
-        """A bench with the given effects, or why it cannot be simulated."""
-        (curves,) = self._simulate([effects], simulations, "confirm", asked)
-        return curves if isinstance(curves, str) else self.comparison.trial(effects, curves)
-
-    def _start(self, effects: Effects, simulations: int = CONFIRM_SIMULATIONS) -> Trial:
-        """A bench with the given effects; the nominal one if there are none or they are refused."""
-        # A bench that was simulated with more effects is hardly ever refused with fewer.
-        nominal = self.comparison.nominal
-        trial = self._confirmed(effects, simulations) if effects else nominal
-        return nominal if isinstance(trial, str) else trial
-
     def _unexplained(self) -> dict[str, float]:
         """Fraction of each remaining candidate's significance that the causes do not produce."""
         if not self._remaining:
@@ -428,104 +397,3 @@ class Search:
             name: max(1 - produced.get(name, 0.0) / c.significance, 0.0)
             for name, c in self._remaining.items()
         }
-
-    def _prune_causes(self) -> SearchResult:
-        """Leave each cause out in turn, and reject redundant and doubtful ones."""
-        candidates, effects, current = self._candidates, self._effects, self._current
-        self._weigh_alone(effects)
-        while True:
-            without = self._each_left_out(effects)
-            rejected = (
-                rejection.redundant(self.comparison, current, without)
-                or rejection.unhelpful(self.comparison, current, without, candidates)
-                or rejection.doubtful(self.comparison, current, without, candidates)
-            )
-            if rejected is None:
-                break
-            name, reason = rejected
-            rest = tuple(e for n, e in effects.items() if n != name)
-            fewer = self._confirmed(rest) if rest else self.comparison.nominal
-            if isinstance(fewer, str):
-                break
-            _reject(name, reason, effects, candidates)
-            current = fewer
-        while (replayed := self._replaceable_by_replay(effects, current)) is not None:
-            name, by, current = replayed
-            _reject(name, rejection.explained_by_other_law(by), effects, candidates)
-            effects |= {one: e for one in effects for e in current.effects if e.name == one}
-            without = self._each_left_out(effects)
-        self._weigh_alone(effects)
-        alike = self._alike
-        alike = {n: tuple(a for a in alike[n] if a not in effects) for n in effects}
-        return SearchResult(
-            self.comparison.nominal,
-            current,
-            tuple(effects),
-            without,
-            candidates,
-            {name: others for name, others in alike.items() if others},
-            self._by_laws(effects),
-        )
-
-    def _weigh_alone(self, effects: Mapping[str, Effect]) -> None:
-        """Simulate each cause alone as often as all causes: few show random effects poorly."""
-        for name, effect in effects.items():
-            alone = self._confirmed((effect,))
-            if not isinstance(alone, str):
-                self._candidates[name].alone = alone
-
-    def _replaceable_by_replay(
-        self, effects: Mapping[str, Effect], current: Trial
-    ) -> tuple[str, str, Trial] | None:
-        """A cause made redundant by another of the same step and domains; the bench without it."""
-        candidates = self._candidates
-        for name in sorted(effects, key=lambda n: candidates[n].significance):
-            own = effects[name]
-            replays = {
-                n: replay
-                for n, e in effects.items()
-                if n != name and e.acts_at == own.acts_at and set(e.domains) >= set(own.domains)
-                if (replay := candidates[n].replay) is not None and replay != e
-            }
-            if not replays or self._left < CONFIRM_SIMULATIONS:
-                continue
-            rest = tuple(replays.get(n, e) for n, e in effects.items() if n != name)
-            trial = self._confirmed(rest)
-            if (
-                isinstance(trial, Trial)
-                and self.comparison.gain_over(trial, current) < MIN_LOGLIK_GAIN
-            ):
-                return name, next(iter(replays)), trial
-        return None
-
-    def _by_laws(self, effects: Mapping[str, Effect]) -> dict[str, Trial]:
-        """The bench with each effect alone, by its best-fitting law."""
-        trials = {}
-        for name, effect in effects.items():
-            law = self._candidates[name].by_law(effect)
-            if law is not None and law != effect:
-                trial = self._confirmed((law,), SCREEN_SIMULATIONS)
-                if isinstance(trial, Trial):
-                    trials[name] = trial
-        return trials
-
-    def _each_left_out(self, effects: Mapping[str, Effect]) -> dict[str, Trial]:
-        """The bench with all effects but one, by its name."""
-        benches = {
-            name: tuple(e for n, e in effects.items() if n != name)
-            for name in (effects if len(effects) > 1 else ())
-        }
-        # Simulate all in parallel; the next line finds the results.
-        self._simulate(list(benches.values()), CONFIRM_SIMULATIONS, "each cause left out", ())
-        return {name: self._start(benches.get(name, ())) for name in effects}
-
-
-def _reject(
-    name: str, reason: str, effects: dict[str, Effect], candidates: Mapping[str, Candidate]
-) -> None:
-    """Reject a cause, and the candidates that were rejected as similar to it."""
-    candidates[name].reason = reason
-    for candidate in candidates.values():
-        if candidate.reason == rejection.similar_to(name):
-            candidate.reason = f"similar to {name}, which was rejected: {reason}"
-    del effects[name]
