@@ -86,6 +86,13 @@ def test_the_signal_is_conserved_and_found_again(effect: Ipc) -> None:
     np.testing.assert_allclose(uncouple(read, effect.couplings), charge, rtol=1e-11)
 
 
+def test_couplings_that_cannot_be_inverted_do_not_overflow() -> None:
+    # At 2e5 e- a share of 0.2 that doubles with every 50 ke- exceeds all of the signal.
+    steep = [Coupling(dy, dx, 0.2, per_ke=0.02) for dy, dx in ((0, 1), (1, 0), (0, -1), (-1, 0))]
+    charge = np.random.default_rng(2).uniform(0, 2e5, (9, 11))
+    assert np.isfinite(uncouple(charge, steep)).all()
+
+
 def test_a_symmetric_kernel_leaves_a_flat_flat_and_one_of_rows_does_not() -> None:
     flat = np.full((24, 24), 2e4)
     np.testing.assert_allclose(couple(flat, Ipc.nearest(0.02).couplings), flat)

@@ -198,11 +198,17 @@ def _inverse(
     # last digit.
     found = data.copy()
     size = float(np.max(np.abs(data), initial=0.0))
+    before = np.inf
     for _ in range(steps):
         rest = data - forward(found)
-        found += rest
-        if float(np.max(np.abs(rest), initial=0.0)) <= CONVERGED * size:
+        left = float(np.max(np.abs(rest), initial=0.0))
+        # A trial of couplings that grow steeply with the signal may have no inverse.
+        if not left <= 2 * before:
             break
+        found += rest
+        if left <= CONVERGED * size:
+            break
+        before = left
     return found
 
 
