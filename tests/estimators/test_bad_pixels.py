@@ -178,12 +178,17 @@ def test_the_glow_of_an_amplifier_is_not_hot() -> None:
     assert np.argwhere(hot(rate, np.full(y.shape, 3.0), 3, 10)).tolist() == [[40, 50]]
 
 
+def measured_variance(seed: int, spread: float, dof: int) -> F64:
+    """Variances (y, x) of pixels whose noise is lognormal, from ``dof`` degrees of freedom."""
+    rng = np.random.default_rng(seed)
+    noise = 3 * rng.lognormal(0, spread, (200, 300))
+    return np.asarray(noise**2 * rng.chisquare(dof, noise.shape) / dof)
+
+
 @pytest.mark.parametrize("dof", [24, 49, 400])
 @pytest.mark.parametrize("spread", [0.0, 0.25])
 def test_a_population_of_pixels_that_differ_is_not_noisy(spread: float, dof: int) -> None:
-    rng = np.random.default_rng(6)
-    noise = 3 * rng.lognormal(0, spread, (200, 300))
-    variance = noise**2 * rng.chisquare(dof, noise.shape) / dof
+    variance = measured_variance(6, spread, dof)
     same = np.ones_like(variance)
     factor = noisy_factor(1.5, variance, dof, 1.0)
     expected = float(np.median(variance)) * same
@@ -210,9 +215,7 @@ def test_noise_below_a_step_has_a_population_too() -> None:
 @pytest.mark.parametrize("dof", [2, 4, 7])
 @pytest.mark.parametrize("spread", [0.0, 0.3])
 def test_few_frames_take_no_population_for_noisy_pixels(spread: float, dof: int) -> None:
-    rng = np.random.default_rng(7)
-    noise = 3 * rng.lognormal(0, spread, (200, 300))
-    variance = noise**2 * rng.chisquare(dof, noise.shape) / dof
+    variance = measured_variance(7, spread, dof)
     same = np.ones_like(variance)
     factor = noisy_factor(1.5, variance, dof, 1.0)
     if not spread:  # as if no factor was asked for
