@@ -108,7 +108,7 @@ def _main(
         os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT), number)
     sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115
     sys.stderr = open(2, "w", closefd=False, buffering=1)  # noqa: SIM115
-    from pixcal_cli.__main__ import _leave
+    from pixcal_cli.interrupted import leave
     from pixcal_cli.main import main
 
     if before is not None:
@@ -120,4 +120,4 @@ def _main(
         listens.set()
         main()
     except KeyboardInterrupt:  # as `pixcal_cli.__main__` does
-        _leave()
+        leave()

@@ -48,7 +48,8 @@ def loading(bench: Bench, stage: str, times: int) -> Outcome:
     rng = bench.rng("loading", stage)
     while outcome.tried < times:
         run = bench.before(stage, "loading")
-        line = [sys.executable, "-c", MAIN, *bench.command(stage, run), "--quiet"]
+        line = [sys.executable, "-Xfaulthandler", "-c", MAIN]
+        line += [*bench.command(stage, run), "--quiet"]
         # A shell that starts us in the background may have it ignored.
         before = signal.signal(signal.SIGINT, signal.default_int_handler)
         streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
@@ -56,7 +57,11 @@ def loading(bench: Bench, stage: str, times: int) -> Outcome:
             signal.signal(signal.SIGINT, before)
             time.sleep(rng.uniform(0, LOADING_S))
             process.send_signal(signal.SIGINT)
-            _, said = process.communicate(timeout=PATIENCE_S)
+            try:
+                _, said = process.communicate(timeout=PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                process.send_signal(signal.SIGABRT)  # which prints where all threads are
+                raise AssertionError(f"hangs: {process.communicate()[1]}") from None
         if process.returncode == 0:
             continue  # over before: not counted
         if said.startswith("pixcal: "):

@@ -1,12 +1,6 @@
 """What the shell starts: Ctrl-C ends it in one line, also while the libraries are still loading."""
 
-import os
-
-
-def _leave(*_: object) -> None:
-    # At once: nothing has begun, and an exception would pass through half-loaded libraries.
-    os.write(2, b"pixcal: interrupted; run the same command again to resume\n")
-    os._exit(1)
+from pixcal_cli.interrupted import leave
 
 
 def main() -> None:
@@ -16,13 +10,14 @@ def main() -> None:
 
         heard = signal.getsignal(signal.SIGINT)  # ignored, if a shell starts us in the background
         if heard is signal.default_int_handler:
-            signal.signal(signal.SIGINT, _leave)
+            # An exception would pass through half-loaded libraries.
+            signal.signal(signal.SIGINT, leave)
         from pixcal_cli.main import main as run
 
         signal.signal(signal.SIGINT, heard)
         run()
     except KeyboardInterrupt:
-        _leave()
+        leave()
 
 
 if __name__ == "__main__":

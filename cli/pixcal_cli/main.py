@@ -19,6 +19,7 @@ from pixcal_cli.blind import blind
 from pixcal_cli.budget import budget
 from pixcal_cli.click_options import examples
 from pixcal_cli.compare import compare
+from pixcal_cli.interrupted import leave
 
 LONG_WORD = 600
 """Characters of a word, such as a value that makes no sense, that are not shown in full."""
@@ -105,10 +106,14 @@ def one_line(message: str) -> str:
 
 
 _interrupted = threading.Event()
+PATIENCE_S = 30
+"""After Ctrl-C, for tasks that go on and for locks that Python leaves locked as it is raised."""
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
     _interrupted.set()
+    signal.signal(signal.SIGALRM, leave)
+    signal.alarm(PATIENCE_S)
     signal.default_int_handler(number, frame)
 
 
@@ -151,6 +156,7 @@ def main() -> None:
     code = invoke(sys.argv[1:])
     # Nothing is left to be interrupted, and the interpreter would complain as it goes.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGALRM, lambda *_: os._exit(code))
     try:
         sys.stdout.flush()
     except OSError:

@@ -244,6 +244,30 @@ def test_an_interruption_is_one_whatever_a_library_makes_of_it(
         assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("where", ["in the command", "as Python ends"])
+def test_a_lock_that_is_never_released_does_not_outlast_ctrl_c(where: str) -> None:
+    """A thread that waits for ever, and for which the command or the interpreter waits."""
+    code = f"""
+import os, signal, threading
+from pixcal_cli import main, steps
+main.PATIENCE_S = 1
+def wait(**_):
+    thread = threading.Thread(target=threading.Event().wait)
+    thread.start()
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+    finally:
+        {where == "in the command"} and thread.join()
+steps.allan.callback = wait
+signal.signal(signal.SIGINT, signal.default_int_handler)
+main.main()
+"""
+    line = [sys.executable, "-c", code, "allan", "RUN"]
+    ended = subprocess.run(line, capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert ended.stderr == "pixcal: interrupted; run the same command again to resume\n"
+
+
 @pytest.mark.parametrize("out", ["file", "file/run"])
 @pytest.mark.parametrize("command", ["run", "ingest"])
 def test_a_run_that_is_a_file_is_named(
