@@ -124,16 +124,19 @@ def test_noise_of_rows_is_found_beside_that_of_columns(row: float, column: float
         assert found[line][0] == pytest.approx(size**2, abs=4 * error)
 
 
-def test_noise_of_rows_is_whole_where_every_second_row_repeats_it() -> None:
+@pytest.mark.parametrize("repeated", [0.0, 0.6, 0.5**0.5])
+def test_noise_of_rows_is_whole_where_every_second_row_repeats_it(repeated: float) -> None:
     """The means of blocks then hold more of it than of rows that differ."""
-    rng, row, rows = np.random.default_rng(11), 5.0, 272
-    dark = READ * rng.standard_normal((DARKS, rows, 48))
-    white = rng.standard_normal((DARKS, rows + 2))
-    dark += row * (0.8 * white[:, 2:] + 0.6 * white[:, :-2])[..., None]
+    rng, row, rows, frames = np.random.default_rng(11), 5.0, 272, 160
+    dark = READ * rng.standard_normal((frames, rows, 48))
+    white = rng.standard_normal((frames, rows + 2))
+    drawn = (1 - repeated**2) ** 0.5 * white[:, 2:] + repeated * white[:, :-2]
+    dark += row * drawn[..., None]
     shared, error = shared_by_lines(dark_pair_sums(dark.astype(np.float32), READ, 0.0))["row"]
     # A row is as good as independent of two thirds of the others.
-    error = np.hypot(error, row**2 * np.sqrt(2 * 1.5 / (DARKS / 2 * rows)))
-    assert shared == pytest.approx(row**2, abs=3 * error)
+    error = np.hypot(error, row**2 * np.sqrt(2 * 1.5 / (frames / 2 * rows)))
+    assert error < 0.015 * row**2
+    assert shared == pytest.approx(row**2, abs=2 * error)
 
 
 @pytest.mark.parametrize("column", [0.0, 2.0])

@@ -25,6 +25,7 @@ _NEARLY = 5.0  # standard deviations below saturation from which a pixel's noise
 # Subtracting the median of n normal numbers lowers the variance of each, and the covariance of each
 # two, by this over n: twice the covariance with the median (1 / n), less its variance π / (2 n).
 _MEDIAN_TAKES = 2 - math.pi / 2
+_ROUNDS = 12  # each leaves less than a third of what block means are yet to give back
 _FAR = BLOCK // 2  # pixels over which no filter of a camera reaches
 _NO_BLOCKS = np.zeros((0, COLUMNS))
 
@@ -47,17 +48,22 @@ def shared_by_lines(dark: F64) -> dict[str, Measure]:
     of_rows = (near - rows) ** 2 + (columns - far) ** 2
     of_columns = (near - columns) ** 2 + (rows - far) ** 2
     smooth, other = (1, 0) if of_columns < of_rows else (0, 1)
-    # Subtracting block means removed part of it, more where every second row repeats it. Waves of
-    # any period have at least as much at one row as at two.
-    repeated = far - abs(columns if smooth else rows)
-    seen[smooth] += 2 * (BLOCK - 2) / (BLOCK**2 - 1) * max(repeated, 0.0)
     # What rows share, and what block means took off, drops out of the difference of pairs in one
     # column and in two, which is the noise of columns; or the other way round.
     name, shared = tuple(LINES)[other], np.empty(2)
     pairs = zip(LINES[name], _ASLANT[name], strict=True)
     apart = min(covariance[along] - covariance[aslant] for along, aslant in pairs)
     shared[other] = apart / (kept + taken)
-    shared[smooth] = (seen[smooth] + taken * shared[other]) / kept
+    # Subtracting block means took as much off the covariances of one line, and of lines one and two
+    # apart. It is more where every second line repeats the noise. Waves of any period have at least
+    # as much at one line as at two.
+    left = np.array([seen[smooth], columns if smooth else rows, far]) + taken * shared[other]
+    own, next_one, second = left * (1 - BLOCK**-2)
+    removed = 0.0
+    for _ in range(_ROUNDS):
+        repeated = max(second + removed - abs(next_one + removed), 0.0)
+        removed = (own + removed) / BLOCK + 2 * (BLOCK - 2) / BLOCK**2 * repeated
+    shared[smooth] = own + removed
     errors = np.where(np.arange(2) == other, math.sqrt(2), 1) * error
     return {
         name: (float(own) if own > _SHARED * error else 0.0, error)
