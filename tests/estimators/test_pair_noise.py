@@ -9,7 +9,9 @@ from pixcal.estimators.detector.pair_noise import (
     flat_pair_sums,
     shared_by_blocks,
     shared_by_lines,
+    without_bands,
 )
+from pixcal.kernels.photon_transfer import BLOCK, LAGS
 from pixcal.model.arrays import F32
 
 GAIN, READ, ROWS = 2.0, 6.0, 5.0
@@ -34,7 +36,7 @@ def test_flats_lose_the_scatter_of_lines_and_keep_their_noise(line: str) -> None
     charge = 400.0
     flats = frames(rng, FLATS, charge, line)
     levels = flats.mean(axis=(1, 2))
-    lit = flat_pair_sums(flats, levels, GAIN, READ, 0.0, noise).sum(axis=0)
+    lit = flat_pair_sums(flats, levels, GAIN, READ, 0.0, noise)[0].sum(axis=0)
     none = without.sum(axis=0)
     shot = (lit[2:] / lit[0] - none[2:] / none[0]) * GAIN**2 / charge
     # As precise as without any noise of lines: a row of few pairs alone has 20 % of scatter.
@@ -43,12 +45,42 @@ def test_flats_lose_the_scatter_of_lines_and_keep_their_noise(line: str) -> None
     np.testing.assert_allclose(shot[1:], 0, atol=4 * error)
 
 
+def test_bands_of_a_flickering_lamp_are_no_noise_of_light() -> None:
+    rng = np.random.default_rng(5)
+    charge, shape = 4000.0, (10, 128, 128)
+    phase = rng.uniform(0, 2 * np.pi, (shape[0], 1, 1))
+    bands = 1 + 0.02 * np.sin(np.arange(shape[1])[:, None] / 9 + phase)
+    flats = (rng.poisson(charge * bands, shape) / GAIN).astype(np.float32)
+    sums = flat_pair_sums(flats, flats.mean(axis=(1, 2)), GAIN, READ, 0.0, LineNoise())
+    assert without_bands(*sums) is not sums[0]
+    lit = without_bands(*sums).sum(axis=0)
+    shot = lit[2:] / lit[1] * GAIN
+    error = np.sqrt(2 / lit[0])
+    assert shot[0] == pytest.approx(1, abs=4 * error)
+    np.testing.assert_allclose(shot[1:], 0, atol=4 * error)
+
+
+@pytest.mark.parametrize("line", ["row", "column"])
+def test_subtracted_lines_leave_no_covariance_across_them(line: str) -> None:
+    rng = np.random.default_rng(6)
+    frames = rng.standard_normal((6000, 32, 32), dtype=np.float32)
+    whole, rest = (dark_pair_sums(frames, 1.0, 0.0, lines).sum(axis=0) for lines in ((), (line,)))
+    across = LAGS[:, 0 if line == "row" else 1] != 0
+    more = (rest[3:] / rest[2] - whole[3:] / whole[2])[across]
+    # Means of blocks take 1/256 less off each covariance where they vary less without the lines.
+    less = 1 / 32 / BLOCK
+    assert np.mean(more) == pytest.approx(0, abs=less / 3)
+
+
 def test_without_noise_of_lines_nothing_is_taken() -> None:
     rng = np.random.default_rng(4)
     dark = (READ * rng.standard_normal((20, *SHAPE))).astype(np.float32)
     noise, sums = LineNoise(), dark_pair_sums(dark, READ, 0.0)
     noise.add(dark, sums, READ, 0.0)
     assert not noise.lines
+    lit = rng.poisson(400.0, dark.shape).astype(np.float32)
+    flats = flat_pair_sums(lit, lit.mean(axis=(1, 2)), 1.0, READ, 0.0, noise)
+    assert np.array_equal(without_bands(*flats), flats[0])
     assert np.array_equal(noise.put_back(sums.copy()), sums)
 
 
@@ -104,7 +136,7 @@ def test_nearly_full_pixels_of_one_colour_do_not_lower_the_noise_of_the_others(k
     dark = (READ * rng.standard_normal((2, *SHAPE))).astype(np.float32)
     noise.add(dark, dark_pair_sums(dark, READ, 0.0), READ, 0.0)
     levels = np.ones(FLATS)
-    sums = flat_pair_sums(flats, levels, GAIN, READ, 0.0, noise, full if known else np.inf)
+    sums, _ = flat_pair_sums(flats, levels, GAIN, READ, 0.0, noise, full if known else np.inf)
     dof, level, square = sums.sum(axis=0)[:3]
     off = GAIN * (square - dof * READ**2) / level - 1
     error = np.sqrt(2 / dof) * (1 + GAIN * READ**2 * dof / level)

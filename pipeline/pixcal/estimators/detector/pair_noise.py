@@ -11,7 +11,7 @@ import numpy as np
 
 from pixcal.estimators.detector.emva import Measure
 from pixcal.kernels.photon_transfer import BLOCK, COLUMNS, LAGS, bin_pairs, pair_statistics
-from pixcal.kernels.robust import lit, median_and_deviation, median_and_sigma
+from pixcal.kernels.robust import SIGMA_OF_MAD, lit, median_and_deviation, median_and_sigma
 from pixcal.model.arrays import F32, F64
 
 LINES = {"row": ((0, 1), (0, 2)), "column": ((1, 0), (2, 0))}  # lags along a line
@@ -22,9 +22,6 @@ _SHARED = 5.0  # significance (errors) from which the noise shared by lines coun
 _OUT = 5.0  # standard deviations of outlying samples
 _PAIR_LAMP_CHANGE = 0.05
 _NEARLY = 5.0  # standard deviations below saturation from which a pixel's noise is clipped
-# Subtracting the median of n normal numbers lowers the variance of each, and the covariance of each
-# two, by this over n: twice the covariance with the median (1 / n), less its variance π / (2 n).
-_MEDIAN_TAKES = 2 - math.pi / 2
 _ROUNDS = 12  # each leaves less than a third of what block means are yet to give back
 _FAR = BLOCK // 2  # pixels over which no filter of a camera reaches
 _NO_BLOCKS = np.zeros((0, COLUMNS))
@@ -131,7 +128,9 @@ def flat_pair_sums(
     full: F32 | float = np.inf,
     dark: float = 0.0,
 ) -> F64:
-    """The same for flats, with the two frames of a pair scaled to equal level.
+    """The same for flats (2, N_BINS, COLUMNS): of the frames, and without what rows share.
+
+    The two frames of a pair are scaled to equal level. `without_bands` takes the result.
 
     frames : (t, y, x) ADU above bias and dark
     levels : (t,) their common levels, in any unit; pairs that differ too much are not used
@@ -140,7 +139,9 @@ def flat_pair_sums(
     full : (y, x) or scalar, where samples saturate, ADU above bias and dark
     dark : dark signal, ADU: it has shot noise too, and belongs to the level
     """
-    blocks = [_NO_BLOCKS]
+    lines = line_noise.lines or ()
+    also_rows = tuple(dict.fromkeys((*lines, "row")))
+    blocks: list[list[F64]] = [[_NO_BLOCKS], [_NO_BLOCKS]]
     for n in range(0, len(frames) - 1, 2):
         (a, b), (first, second) = levels[n : n + 2], frames[n : n + 2]
         if not np.isfinite(a + b) or abs(a - b) > _PAIR_LAMP_CHANGE * (a + b) / 2:
@@ -152,27 +153,47 @@ def flat_pair_sums(
         # Full pixels beside those of an overscan would pass for half-full ones without noise.
         first[~lit(level) | (level + _NEARLY * noise > full)] = np.nan
         guess = {"gain": gain, "read_noise": read_noise, "quantum": quantum}
-        blocks.append(_blocks(first, second, line_noise.lines or (), **guess))
-    every = np.concatenate(blocks)
-    every[:, 1] += dark * (every[:, 0] > 0)
-    return line_noise.put_back(bin_pairs(every))
+        for own, without in zip(blocks, (lines, also_rows), strict=True):
+            own.append(_blocks(first, second, without, **guess))
+    found = [np.concatenate(own) for own in blocks]
+    for every in found:
+        every[:, 1] += dark * (every[:, 0] > 0)
+    return np.stack([line_noise.put_back(bin_pairs(every)) for every in found])
+
+
+def without_bands(lit: F64, rest: F64) -> F64:
+    """Sums of flats: ``rest``, without what rows share, if that exceeds the error of their noise.
+
+    A lamp that flickers while rows are exposed one by one makes bands, which are no photon noise.
+    """
+    noise = lit[:, 2].sum()
+    shared = noise - rest[:, 2].sum()
+    return rest if shared > noise * math.sqrt(2 / max(lit[:, 0].sum(), 1)) else lit
 
 
 def _blocks(first: F32, second: F32, without: tuple[str, ...], **guess: float) -> F64:
     if not np.isfinite(first + second).any():
         return _NO_BLOCKS
+    others = []
     for name in without:
-        # Median of each line, to be broadcast; zero where a line has no sample.
-        difference = first - second
-        rows = np.ascontiguousarray(difference.T if name == "row" else difference)
-        median = np.nan_to_num(median_and_deviation(rows)[0])
-        second = second + (median[:, None] if name == "row" else median[None])
+        # One column for each line.
+        lines = np.ascontiguousarray((first - second).T if name == "row" else first - second)
+        middle, deviation = median_and_deviation(lines)
+        used = np.abs(lines - middle) <= _OUT * SIGMA_OF_MAD * deviation + guess["quantum"]
+        number = used.sum(axis=0)
+        # Medians of integers would be too coarse.
+        means = np.where(used, lines, 0).sum(axis=0) / np.maximum(number, 1)
+        second = second + (means[:, None] if name == "row" else means).astype(np.float32)
+        others.append(max(number[number > 0].mean() - 1, 1))
     blocks = pair_statistics(first, second, **guess)
-    for name in without:
+    for name, number in zip(without, others, strict=True):
         across = 0 if name == "row" else 1
-        taken = _MEDIAN_TAKES / first.shape[1 - across] * blocks[:, 2]
+        # Of each variance, and of each covariance along the line.
+        taken = blocks[:, 2] / number
         blocks[:, 2] += taken
         blocks[:, 3:] += np.outer(taken, LAGS[:, across] == 0)
+        # A block's mean varies less without lines, and took less off each of them.
+        blocks[:, 2:] -= taken[:, None] / min(BLOCK, first.shape[across])
     return blocks
 
 

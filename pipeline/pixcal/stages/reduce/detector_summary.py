@@ -8,6 +8,7 @@ import numpy as np
 
 from pixcal.estimators.detector.emva import Measure, full_level, saturation, transfer_points
 from pixcal.estimators.detector.missing_codes import missing_codes, step_noise
+from pixcal.estimators.detector.pair_noise import without_bands
 from pixcal.estimators.detector.straightness import Level, Straightness, straightness
 from pixcal.kernels.gain_fit import LADDER, GainFit, fit_gain
 from pixcal.kernels.photon_transfer import add_neighbours
@@ -108,9 +109,9 @@ def summarise(job: Measuring, folder: Place, source: Ingested) -> Summary:
     """Combine the statistics of all columns; InputError if the flats hold no light."""
     tables = ArrayReader(folder / "levels").read()
     levels, usable, nearly = _exposure_steps(tables, job)
-    sums = pair_sums(folder, job)
+    sums = dark, lit, _ = pair_sums(folder, job)
     # Full pixels saturate the flats even if the converter does not saturate.
-    points = transfer_points(add_neighbours(sums[1], sums[0])[0])
+    points = transfer_points(add_neighbours(lit, dark)[0])
     rate = read_noise.dark_rate(folder, job)
     times = np.array([group.exptime for group in job.flat])
     charged = levels + rate * times if job.flats_timed and job.flat else levels
@@ -136,7 +137,7 @@ def summarise(job: Measuring, folder: Place, source: Ingested) -> Summary:
     for _ in range(2 if charge else 1):
         shot = charge / (job.gain if gain is None else gain.gain)
         error = _GUESS_ERROR if gain is None else gain.error / gain.gain
-        noise, own = read_noise.read_noise(sums[0], lost, (shot, error * shot), folder, job)
+        noise, own = read_noise.read_noise(dark, lost, (shot, error * shot), folder, job)
         gain = _gain(sums, own, lost[0], wander, top, job)
     if gain is not None and (read_noise.is_cut_off(job) or _tells_noise(gain)):
         noise, own = read_noise.of_variance(gain.read_variance, job.quantum)
@@ -167,18 +168,25 @@ def _tells_noise(gain: GainFit) -> bool:
     return gain.without_dark and error < _KNOWN * variance
 
 
-def pair_sums(folder: Place, job: Measuring) -> F64:
-    """Sums (2, N_BINS, COLUMNS) over pairs of frames: without and with light."""
+def pair_sums(folder: Place, job: Measuring) -> tuple[F64, F64, bool]:
+    """Sums (N_BINS, COLUMNS) over pairs of frames without and with light; whether bands are out."""
     tables = ArrayReader(folder / "pairs")
     sums = np.zeros(tables.shape[2:])
     # Added in the order of the columns, so that the sums do not depend on the workers.
     for i, j in np.ndindex(grid(job.shape)):
         sums += tables.read((i, i + 1), (j, j + 1))[0, 0]
-    return sums
+    dark, lit, rest = sums
+    steady = without_bands(lit, rest)
+    return dark, steady, steady is rest
 
 
 def _gain(
-    sums: F64, known: Measure | None, lost: float, wander: float, top: float, job: Measuring
+    sums: tuple[F64, F64, bool],
+    known: Measure | None,
+    lost: float,
+    wander: float,
+    top: float,
+    job: Measuring,
 ) -> GainFit | None:
     """Photon transfer below the level ``top`` (ADU above bias) of saturation, neighbours added."""
     # ``lost``: variance without light that blocks remove (ADU²). ``wander``: of the bias (ADU).
@@ -187,7 +195,7 @@ def _gain(
         return None
     noise, error = known or (job.read_noise, _GUESS_ERROR * job.read_noise)
     # With light, noise is high enough for rounding to add exactly this.
-    dark, lit = sums
+    dark, lit, bands = sums
     steps, uneven = _steps(job)
     variance = noise**2 + steps - lost
     highest = _LINEAR_SHARE * top
@@ -214,7 +222,7 @@ def _gain(
         fitted,
         read_variance=(at_zero + lost, of_zero),
         neighbours={} if everywhere else lags,
-        uneven=everywhere,
+        uneven=everywhere or bands,
     )
 
 

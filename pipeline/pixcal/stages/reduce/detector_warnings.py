@@ -117,7 +117,7 @@ def _gain_warnings(fit: GainFit, summary: Summary, used: float, filtered: bool) 
     if fit.uneven:
         warnings.append(
             "parts of the flats vary in brightness from frame to frame, as rows of a rolling "
-            "shutter do under a flickering lamp (mains, dimmed LED). This biases gain and "
+            "shutter do under a flickering lamp (mains, dimmed LED). This can bias gain and "
             "diagnosis; take flats with a steady (DC) lamp, or expose for many flicker periods"
         )
     if fit.curved and not filtered:

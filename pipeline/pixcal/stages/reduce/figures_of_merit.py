@@ -51,7 +51,7 @@ def characterise(
     entry = facts["gain_e_per_adu"]
     measured = entry["measured"] is not None
     gain = (entry["measured"], entry["error"]) if measured else (entry["used"], None)
-    dark, _ = pair_sums(made.scratch / "statistics", job)
+    dark, *_ = pair_sums(made.scratch / "statistics", job)
     clipped = (source.detector.saturation_adu or source.saturation_found) is not None
     top, reached = _top(summary, job, clipped)
     top = top if job.dark else None  # levels above an unknown bias are meaningless

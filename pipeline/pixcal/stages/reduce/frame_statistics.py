@@ -94,7 +94,7 @@ def statistics_writers(folder: Place, shape: tuple[int, int], flats: int) -> dic
     made = {}
     for name, extents, chunks, dtype in (
         ("maps", (n, *shape), (n, *tiles.map_chunk(shape)), np.float32),
-        ("pairs", (*whole, 2, N_BINS, COLUMNS), (1, wide, 2, N_BINS, COLUMNS), np.float64),
+        ("pairs", (*whole, 3, N_BINS, COLUMNS), (1, wide, 3, N_BINS, COLUMNS), np.float64),
         ("levels", (*whole, steps, 4), (1, wide, steps, 4), np.float64),
     ):
         dims = [f"axis{axis}" for axis in range(len(extents))]
@@ -132,7 +132,7 @@ class _Column:
         shape = y1 - y0, x1 - x0
         maps = {name: np.zeros(shape) for name in STATISTICS}
         levels = np.zeros(job.writers["levels"].shape[2:])
-        pairs = np.zeros((2, N_BINS, COLUMNS))
+        pairs = np.zeros((3, N_BINS, COLUMNS))
         loud, full = np.zeros((2, *shape), np.bool_)
         return cls(index, maps, pairs, levels, np.zeros(shape), loud, full)
 
@@ -305,7 +305,7 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
                 of_samples = job.read_noise, job.quantum
                 if lamp:
                     full = job.saturation - (0.0 if pedestal is None else pedestal)
-                    column.pairs[1] += flat_pair_sums(
+                    column.pairs[1:] += flat_pair_sums(
                         frames, levels, job.gain, *of_samples, column.line_noise, full, charge
                     )
                 else:
