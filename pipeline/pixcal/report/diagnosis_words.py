@@ -125,6 +125,9 @@ class _Axis:
 
 _SIDES = ("x−1", "x+1", "y−1", "y+1")
 _ROWS_OF_FOUR = tuple(f"{step} r{row}" for step in ("y+1", "x+1") for row in range(4))
+_IN_PAIRS = tuple(
+    f"{of}, {how}" for of in ("rows", "columns") for how in ("in pairs", "alternating")
+)
 _LINES = tuple(f"{n} {of}{'s' * (n > 1)}" for of in ("row", "column") for n in range(1, 5))
 _BANDS = ("≥ 8 px", "4 to 8 px", "2.7 to 4 px", "2 to 2.7 px", "2 rows", "2 columns")
 _HALF_WAVES = ("1 to 3", "4 to 9", "10 on")
@@ -138,7 +141,7 @@ _AXES = {
     "far neighbour": _Axis("neighbour", "neighbour {}", _STEPS[4:]),
     "row of four, down then right": _Axis("neighbour, row modulo 4", "neighbour {}", _ROWS_OF_FOUR),
     "left, right, above, below": _Axis("neighbour", "neighbour {}", _SIDES),
-    "rows, columns": _Axis("", "{}", ("rows", "columns")),
+    "rows, columns: in pairs, alternating": _Axis("", "{}", _IN_PAIRS),
     "distance: rows, then columns": _Axis("lines apart", "{} apart", _LINES),
     "band, then two rows, two columns": _Axis("period", "periods of {}", _BANDS),
     "bin of frequency": _Axis(

@@ -29,6 +29,7 @@ MIN_DARKS = 5
 # level lies between two codes.
 COARSE = 0.65
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
+LINES = "rows, columns: in pairs, alternating"
 STILL = 1e-12  # ADU²: variance of pixels that do not change, whose square float32 still holds
 
 
@@ -107,22 +108,26 @@ def _mean_product(sums: F64, count: F64) -> F64:
     return np.asarray(sums.sum(axis=1) / np.maximum(count.sum(axis=1), 1))
 
 
-def _line_power(rest: F32, good: Mask) -> F64:
-    """Mean square (2,) of means of rows and columns over white noise's; bad pixels are zero."""
+def line_power(rest: F32, good: Mask) -> F64:
+    """Mean squares (4,) of means of lines over white noise's, rows before columns; bad pixels zero.
+
+    Of sums, then of differences of adjacent lines: noise that is white from line to line adds as
+    much to both, a pattern does not.
+    """
     squares = float(np.einsum("tyx,tyx->t", rest, rest).mean(dtype=float)) / good.sum()
     out = []
     for axis in (2, 1):
         count = np.maximum(good.sum(axis=axis - 1), 1)
         means = rest.sum(axis=axis) / np.sqrt(count)
         means -= means.mean(axis=1, keepdims=True)
-        out.append(float((means**2).mean()) / max(squares, 1e-30))
-    return np.array(out)
+        out += [means[:, 1:] + means[:, :-1], means[:, 1:] - means[:, :-1]]
+    return np.array([float((own**2).mean()) / (2 * max(squares, 1e-30)) for own in out])
 
 
-@of_noise_power("row and column noise", "noise / white noise", x="rows, columns")
+@of_noise_power("row and column noise", "noise / white noise", x=LINES)
 def lines(data: FringeSetData) -> Curve:
     """Of the fringe frames' residuals."""
-    return Curve.numbered(_line_power(data.residual, data.good))
+    return Curve.numbered(line_power(data.residual, data.good))
 
 
 def _calm(frames: F32, good: Mask) -> F32:
@@ -259,7 +264,7 @@ def hot_neighbours(evidence: Evidence) -> Curve | None:
     "noise",
     "row and column noise in {0} frames",
     "noise / white noise",
-    x="rows, columns",
+    x=LINES,
     power=True,
     sets=False,
 )
@@ -269,5 +274,5 @@ def lines_of_stacks(kind: str, evidence: Evidence) -> Curve | None:
     if not stacks or not evidence.dithered:
         return None
     rests = [_calm(stack.adu, evidence.good) for stack in stacks]
-    values = [_line_power(rest, evidence.good) for rest in rests]
+    values = [line_power(rest, evidence.good) for rest in rests]
     return Curve.numbered(np.average(values, axis=0, weights=list(map(len, rests))))

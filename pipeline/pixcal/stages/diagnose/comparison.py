@@ -1,6 +1,6 @@
 """Compare simulated benches with the held-out frames; how much of the gap effects close."""
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,6 @@ from pixcal.estimators.test_statistics.expectation import (
     Reference,
     expect_nominal,
     expect_with,
-    statistic_named,
 )
 from pixcal.estimators.test_statistics.gap import (
     FALSE_ALARM_RATE,
@@ -25,12 +24,15 @@ from pixcal.estimators.test_statistics.gap import (
     likelier,
     log_likelihood,
     remaining,
+    sigmas_of,
 )
 from pixcal.model.arrays import F64
-from pixcal.stages.diagnose.thresholds import LAW_ERROR, MAX_RESIDUAL_GAP, MIN_LOGLIK_GAIN, STAYS
+from pixcal.stages.diagnose.thresholds import LAW_ERROR, MAX_RESIDUAL_GAP, MIN_LOGLIK_GAIN
 from pixcal.stages.diagnose.trial import Curves, Effects
 
 DRAWS = 200
+# standard deviations by which a cause must change a statistic that tests it
+CHANGED = 3.0
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,10 @@ def differing(nominal: Trial, final: Trial, data: Mapping[Key, F64]) -> set[Key]
     return where or {max(gains, key=lambda key: gains[key])}
 
 
+def _squares(differences: Mapping[Key, Difference], where: set[Key]) -> float:
+    return sum(sigmas_of(differences[key].log_chance) ** 2 for key in where)
+
+
 class Comparison:
     """Likelihoods and residual gaps of simulated benches, on the scales of the nominal bench."""
 
@@ -149,10 +155,16 @@ class Comparison:
         """Whether any test statistic of the data differs significantly from a bench."""
         return bool(flagged(compare(self.data, trial.expected)))
 
-    def residual(self, trial: Trial, where: set[Key]) -> float:
-        """Residual fraction of the gap, in the test statistics ``where``, with a bench."""
-        before = compare(self.data, self.nominal.expected)
-        return remaining(before, compare(self.data, trial.expected), where).total
+    def residual(self, trial: Trial, where: set[Key], apart: Set[Key] = frozenset()) -> float:
+        """Residual fraction of the gap, in the test statistics ``where``, with a bench.
+
+        Those ``apart`` do not count.
+        """
+        before, after = (
+            {k: d for k, d in compare(self.data, bench.expected).items() if k not in apart}
+            for bench in (self.nominal, trial)
+        )
+        return remaining(before, after, where - apart).total
 
     def residual_size(self, trial: Trial, where: set[Key]) -> float:
         """The same by effect sizes, as in the reported gap, instead of significances."""
@@ -162,32 +174,23 @@ class Comparison:
         """Test statistics that make up the gap for any of these benches."""
         return set().union(*(differing(self.nominal, trial, self.data) for trial in trials))
 
-    def strongest_stays(self, trial: Trial) -> bool:
-        """Whether the largest difference from the nominal bench keeps over half of its size."""
-        before = compare(self.data, self.nominal.expected)
-        after = compare(self.data, trial.expected)
-        where = self.gap_of(trial) & after.keys()
-        sizes = {key: float(np.abs(before[key].sigmas).max()) for key in where}
-        top = max(sizes, key=lambda key: sizes[key], default=None)
-        if top is None:
-            return False
-        left = abs(float(after[top].sigmas[before[top].worst]))
-        return left > STAYS * sizes[top]
+    def settles(self, own: Key, fewer: Trial, trial: Trial) -> bool:
+        """Whether the data show all that a cause, added to ``fewer``, changes in simulations.
 
-    def settles(self, domains: Container[str], fewer: Trial, trial: Trial) -> bool:
-        """Whether a cause, added to ``fewer``, leaves almost nothing open in its own domains."""
+        Almost nothing of it stays open or opens anew. More than ``own``, its significance, was
+        open: fitted and held-out frames agree in that, whatever the true cause.
+        """
+        moved = compare(trial.expected.mean, fewer.expected)
+        changed = {key for key, one in moved.items() if abs(one.sigmas[one.worst]) > CHANGED}
         # Nor relative to the nominal bench: causes may only compensate each other.
         nominal, before, after = (
-            {
-                key: one
-                for key, one in compare(self.data, bench.expected).items()
-                if statistic_named(key[0]).domain in domains
-            }
+            {k: d for k, d in compare(self.data, bench.expected).items() if k in changed}
             for bench in (self.nominal, fewer, trial)
         )
+        left = _squares(after, flagged(after))
         return all(
-            (where := flagged(start)) and remaining(start, after, where).total <= MAX_RESIDUAL_GAP
-            for start in (nominal, before)
+            (where := flagged(old)) - {own} and left <= MAX_RESIDUAL_GAP * _squares(old, where)
+            for old in (nominal, before)
         )
 
     def replay_fits_better(self, replay: Trial, law: Trial) -> bool:

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
 
+from pixcal.estimators.test_statistics import Key
+from pixcal.estimators.test_statistics.expectation import signature_key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.candidates import Candidate
@@ -22,8 +24,6 @@ from pixcal.stages.diagnose.thresholds import (
     MIN_LOGLIK_GAIN_WEAK,
     MIN_SHARE_OF_RESIDUAL,
 )
-
-UNTRIED = ("not decided", "not tested", "cannot be simulated")  # how such reasons begin
 
 Rejection = tuple[str, str]  # name of a cause, and why it is rejected
 STRONGEST = 3  # candidates that are tried as replacements
@@ -86,9 +86,8 @@ def all_close_little(
 ) -> dict[str, float]:
     """Fraction of the gap that each candidate closes alone; empty unless all close little.
 
-    So it is if together they close less than `MIN_JOINT_GAP_CLOSED`, and each less than
-    `MIN_SHARE_OF_RESIDUAL` of what is left then. If the fractions add up, `doubtful` would reject
-    any set of these candidates.
+    So it is if together they close less than `MIN_JOINT_GAP_CLOSED`. If the fractions add up,
+    `doubtful` would reject any set of these candidates.
     ``alone``: names of candidates, and benches with this one only.
     """
     if not comparison.differs(comparison.nominal):
@@ -98,10 +97,7 @@ def all_close_little(
     closed: dict[str, float] = {}
     for name, trial in trials:
         closed[name] = max(1 - comparison.residual(trial, where), closed.get(name, 0.0))
-    little = all(
-        one < MIN_SHARE_OF_RESIDUAL * (1 - MIN_JOINT_GAP_CLOSED) for one in closed.values()
-    )
-    return closed if little and sum(closed.values()) < MIN_JOINT_GAP_CLOSED else {}
+    return closed if sum(closed.values()) < MIN_JOINT_GAP_CLOSED else {}
 
 
 def unhelpful(
@@ -129,15 +125,20 @@ def _imitated(candidate: Candidate) -> bool:
     return candidate.share < 1 - LAW_ERROR or candidate.significance < SIGNIFICANT
 
 
+def _own(candidate: Candidate) -> Key:
+    """Key of its significance."""
+    return signature_key(candidate.name, candidate.domains[0])
+
+
 def settled(comparison: Comparison, fewer: Trial, trial: Trial, candidate: Candidate) -> bool:
-    """Whether a candidate explains all of its own domains: what stays elsewhere has other causes.
+    """Whether the data agree with all that a candidate changes: the rest has other causes.
 
     ``fewer``, ``trial``: without and with it.
     """
     # Held-out frames cannot refute static maps, or what was measured frame by frame on them.
     fitted_there = candidate.in_maps_alone or candidate.replay in trial.effects
     return not (fitted_there or _imitated(candidate)) and comparison.settles(
-        candidate.domains, fewer, trial
+        _own(candidate), fewer, trial
     )
 
 
@@ -148,41 +149,34 @@ def doubtful(
     candidates: Mapping[str, Candidate],
 ) -> Rejection | None:
     """A cause that closes little of the gap and may be a proxy for another."""
-    # For an unknown cause: it closes little of a large gap, or the largest difference remains. For
-    # another law of other causes: these produce much of its significance, or it has none.
+    # For an unknown cause: more stays open of a large gap than it closes. For another law of other
+    # causes: these produce much of its significance, or it has none.
     where = comparison.gap_of(current)
     open_still = comparison.residual(current, where)
-    closed = {
-        name: comparison.residual(trial, where) - open_still
-        for name, trial in without.items()
-        if not settled(comparison, trial, current, candidates[name])
-    }
-    imitated = {name for name in closed if _imitated(candidates[name])}
-    needed = {
-        name: max(
-            MIN_SHARE_OF_RESIDUAL * open_still,
-            MIN_GAP_CLOSED if open_still > MAX_RESIDUAL_GAP or name in imitated else 0,
-        )
-        for name in closed
-    }
+    unknown = open_still > MAX_RESIDUAL_GAP
+    imitated = {name for name in without if _imitated(candidates[name])}
+    closed, left, needed = {}, {}, {}
+    for name, trial in without.items():
+        if settled(comparison, trial, current, candidates[name]):
+            continue
+        # Fitted and held-out frames agree in its significance, whatever the true cause.
+        apart = {_own(candidates[name])} if unknown else set()
+        left[name] = comparison.residual(current, where, apart)
+        closed[name] = comparison.residual(trial, where, apart) - left[name]
+        share = 1 if unknown else MIN_SHARE_OF_RESIDUAL
+        needed[name] = max(share * left[name], MIN_GAP_CLOSED * (name in imitated))
     among = [name for name in closed if closed[name] < needed[name]]
     alone = [candidates[name].alone for name in closed]
     # Causes that only compensate each other.
-    if open_still > MAX_RESIDUAL_GAP and all(
+    if unknown and all(
         one is not None and comparison.residual(one, where) > 1 - MIN_GAP_CLOSED for one in alone
     ):
         among = list(closed)
     least = min(among, key=lambda name: closed[name], default=None)
-    # A candidate that was not tried may cause the largest difference.
-    strong = [one for one in candidates.values() if one.significance >= SIGNIFICANT]
-    tried = not any(one.reason.startswith(UNTRIED) for one in strong)
-    if closed and least is None and tried and comparison.strongest_stays(current):
-        least = min(closed, key=lambda name: closed[name])
-        return least, "the largest difference remains; it may be a proxy for an unknown cause"
     if least is None:
         return None
-    if open_still > MAX_RESIDUAL_GAP or least not in imitated:
-        return least, possible_proxy(closed[least], open_still)
+    if unknown or least not in imitated:
+        return least, possible_proxy(closed[least], left[least])
     sigmas, mimicked = candidates[least].significance, 1 - candidates[least].share
     why = f"{100 * mimicked:.0f} % of its significance comes from the other causes"
     if sigmas < SIGNIFICANT:

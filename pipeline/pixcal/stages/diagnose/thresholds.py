@@ -12,12 +12,10 @@ MIN_LOGLIK_GAIN_WEAK = 12.0  # and for a candidate of low significance
 LAW_ERROR = 0.25
 MAX_RESIDUAL_GAP = 0.15  # residual gap above which an unknown cause is assumed
 MIN_GAP_CLOSED = 0.1  # fraction of the gap that a doubtful cause must close,
-MIN_SHARE_OF_RESIDUAL = 0.25  # and every cause, as a fraction of the residual gap
+# and every cause, as a fraction of the residual gap; where an unknown cause is assumed: all of it
+MIN_SHARE_OF_RESIDUAL = 0.25
 # fraction that all candidates must close for a search beyond the first round
 MIN_JOINT_GAP_CLOSED = 0.5
-# residual share of the largest difference above which it is not explained. The share was at most
-# 0.38 on 107 benches with one or two known effects, 0.5 to 1 on four with an unknown effect
-STAYS = 0.5
 EXPLAINED = 0.15  # largest residual gap that is called explained,
 MAX_RESIDUAL_SHARE = 0.25  # and largest residual share of any one statistic that deviates by more
 MAX_RESIDUAL_SIGMA = 6.0  # than these standard deviations: simulated effects may leave less
