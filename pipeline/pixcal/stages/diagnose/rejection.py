@@ -86,8 +86,9 @@ def all_close_little(
 ) -> dict[str, float]:
     """Fraction of the gap that each candidate closes alone; empty unless all close little.
 
-    So it is if together they close less than `MIN_JOINT_GAP_CLOSED`. If the fractions add up,
-    `doubtful` would reject any set of these candidates.
+    So it is if together they close less than `MIN_JOINT_GAP_CLOSED`, and each less than a quarter
+    of that: beside one that closes more, others may appear. If the fractions add up, `doubtful`
+    would reject any set of these candidates.
     ``alone``: names of candidates, and benches with this one only.
     """
     if not comparison.differs(comparison.nominal):
@@ -97,7 +98,8 @@ def all_close_little(
     closed: dict[str, float] = {}
     for name, trial in trials:
         closed[name] = max(1 - comparison.residual(trial, where), closed.get(name, 0.0))
-    return closed if sum(closed.values()) < MIN_JOINT_GAP_CLOSED else {}
+    little = max(closed.values(), default=0.0) < MIN_JOINT_GAP_CLOSED / 4
+    return closed if little and sum(closed.values()) < MIN_JOINT_GAP_CLOSED else {}
 
 
 def unhelpful(
