@@ -25,6 +25,8 @@ from pixcal.stages.diagnose.thresholds import (
     MIN_SHARE_OF_RESIDUAL,
 )
 
+UNTRIED = ("not decided", "not tested", "cannot be simulated")  # how such reasons begin
+
 Rejection = tuple[str, str]  # name of a cause, and why it is rejected
 STRONGEST = 3  # candidates that are tried as replacements
 
@@ -151,8 +153,11 @@ def doubtful(
     candidates: Mapping[str, Candidate],
 ) -> Rejection | None:
     """A cause that closes little of the gap and may be a proxy for another."""
-    # For an unknown cause: more stays open of a large gap than it closes. For another law of other
-    # causes: these produce much of its significance, or it has none.
+    # For an unknown cause: more stays open of a large gap than it closes, unless a candidate that
+    # was not tried may be its cause. For another law of other causes: these produce much of its
+    # significance, or it has none.
+    strong = [one for one in candidates.values() if one.significance >= SIGNIFICANT]
+    untried = any(one.reason.startswith(UNTRIED) for one in strong)
     where = comparison.gap_of(current)
     open_still = comparison.residual(current, where)
     unknown = open_still > MAX_RESIDUAL_GAP
@@ -165,7 +170,7 @@ def doubtful(
         apart = {_own(candidates[name])} if unknown else set()
         left[name] = comparison.residual(current, where, apart)
         closed[name] = comparison.residual(trial, where, apart) - left[name]
-        share = 1 if unknown else MIN_SHARE_OF_RESIDUAL
+        share = 1 if unknown and not untried else MIN_SHARE_OF_RESIDUAL
         needed[name] = max(share * left[name], MIN_GAP_CLOSED * (name in imitated))
     among = [name for name in closed if closed[name] < needed[name]]
     alone = [candidates[name].alone for name in closed]
