@@ -10,7 +10,7 @@ from dark_frames import in_the_dark
 from numpy.typing import NDArray
 
 from pixcal.effects.bias_drift import BiasDrift
-from pixcal.effects.row_noise import RowNoise, line_spectrum
+from pixcal.effects.row_noise import LineSpectrum, RowNoise, group_power, line_spectrum
 from pixcal.effects.telegraph_noise import TelegraphNoise
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.processes import flicker, flicker_power
@@ -73,7 +73,9 @@ def test_sizes_are_found(
     found = RowNoise.estimate(in_the_dark(acquired(), make_effect_bench(), RowNoise(*given)))
     assert found is not None
     assert found.significance > 5
-    for name, value, error in zip(NAMES, given, errors, strict=True):
+    # Groups of rows are only there where they are needed.
+    assert getattr(found.effect, NAMES[-1]) == 0
+    for name, value, error in zip(NAMES[:-1], given, errors, strict=True):
         assert found.errors[name] < error, name
         # Of variances the errors are alike on both sides; of their roots the longer side is given.
         size, longer = getattr(found.effect, name), found.errors[name]
@@ -152,3 +154,30 @@ def test_every_second_row_shares_half() -> None:
     rows = np.array([effect.offsets((64, 3), rng)[0] for _ in range(4000)])
     product = [float((rows[:, n:] * rows[:, : 64 - n]).mean()) / 9 for n in range(5)]
     np.testing.assert_allclose(product, [1, 0, 0.5, 0, 0], atol=0.02)
+
+
+@pytest.mark.parametrize("rows", [2, 4])
+def test_rows_read_together_share_an_offset_and_are_found(
+    rows: int, acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench]
+) -> None:
+    given = RowNoise(2.0, 0.0, 0.0, 0.0, 0.0, 4.0, rows)
+    alone = replace(given, row_rms=0.0).offsets((61, 3), np.random.default_rng(4))[0]
+    assert len(np.unique(alone)) == -(-61 // rows)
+    np.testing.assert_array_equal(alone, np.repeat(alone[::rows], rows)[:61])
+    found = RowNoise.estimate(in_the_dark(acquired(), make_effect_bench(), given))
+    assert found is not None
+    assert isinstance(found.effect, RowNoise)
+    assert found.effect.group_rows == rows
+    for name in ("row_rms", "group_rms"):
+        size, error = getattr(found.effect, name), found.errors[name]
+        assert error < 1.0
+        assert size == pytest.approx(getattr(given, name), abs=4 * error), name
+
+
+def test_groups_of_rows_have_the_power_that_is_foreseen() -> None:
+    rng = np.random.default_rng(5)
+    effect = RowNoise(0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 4)
+    rows = np.array([effect.offsets((64, 3), rng)[0] for _ in range(4000)])
+    power = (np.abs(np.fft.rfft(rows, norm="ortho")) ** 2).mean(axis=0)[1:]
+    spectrum = LineSpectrum(64, power, np.ones(32), 0.0, 0.0)
+    np.testing.assert_allclose(power, group_power(spectrum, 4), rtol=0.12, atol=1e-9)

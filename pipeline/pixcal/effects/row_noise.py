@@ -29,6 +29,8 @@ FEWEST_BLOCKS = 4
 FEWEST_FRAMES = 8
 FEWEST_LINES = 8
 _ROUNDS = 4
+GROUPS = range(2, 9)  # rows that may be read together
+_NEEDED = 12.0  # fall in -2 log likelihood required of groups: once in 300 of these sizes by chance
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,9 @@ class RowNoise(Effect):
     acts_at = Stage.READOUT
     order = 2
     domains = ("noise", "time")
-    strengths = ("row_rms", "flicker_rms", "interlace_rms", "column_rms", "alternate_rms")
+    strengths = tuple(
+        f"{kind}_rms" for kind in ("row", "flicker", "interlace", "column", "alternate", "group")
+    )
     left_because = "noise that is independent in each frame averages out"
     frames_needed = ("dark",)
     remedy = "in each frame, subtract the level of each line measured on dark or overscan pixels"
@@ -61,9 +65,13 @@ class RowNoise(Effect):
         0.0,
         doc="noise from row to row, rms; half of its variance is shared with the row after next",
     )
+    group_rms: float = _rms(0.0, doc="white noise that rows read together share, rms")
+    group_rows: int = quantity(
+        2, low=2, high=64, doc="rows read together, counted from the first of the window"
+    )
 
     def read_variance(self, detector: SimulatedDetector) -> float:
-        white = self.row_rms, self.interlace_rms, self.column_rms, self.alternate_rms
+        white = [getattr(self, n) for n in self.strengths if n != "flicker_rms"]
         rows = detector.shape[0]
         power = flicker_power(rows)
         # All modes but the first and, of an even number, the last stand for two.
@@ -89,6 +97,9 @@ class RowNoise(Effect):
         if self.alternate_rms:
             white = rng.standard_normal(ny + 2)
             rows += self.alternate_rms * np.sqrt(0.5) * (white[2:] + white[:-2])
+        if self.group_rms:
+            groups = rng.standard_normal(-(-ny // self.group_rows))
+            rows += self.group_rms * np.repeat(groups, self.group_rows)[:ny]
         return rows, columns
 
     @classmethod
@@ -104,17 +115,21 @@ class RowNoise(Effect):
         columns = [line_spectrum(_turned(r), good.T, n) for r, good, n in dark]
         rows += [_of_fringes(f, across=False) for f in fringes]
         columns += [_of_fringes(f, across=True) for f in fringes]
-        size, error, sigmas = np.zeros(5), np.full(5, np.nan), []
-        for part, spectra, own in (([0, 1, 2, 4], rows, _row_shapes), ([3], columns, _flat)):
-            there = [s for s in spectra if s is not None]
-            if there:
-                noise = fit_lines(there, [own(s) for s in there])
-                size[part], error[part] = noise.roots
-                sigmas += [float(z) for z in noise.sigmas]
+        size, error, sigmas = np.zeros(6), np.full(6, np.nan), []
+        together = 0
+        if of_rows := [s for s in rows if s is not None]:
+            noise, together = _fit_rows(of_rows)
+            part = [0, 1, 2, 4, 5][: len(noise.size)]
+            size[part], error[part] = noise.roots
+            sigmas += [float(z) for z in noise.sigmas]
+        if of_columns := [s for s in columns if s is not None]:
+            noise = fit_lines(of_columns, [np.ones((1, len(s.power))) for s in of_columns])
+            size[3:4], error[3:4] = noise.roots
+            sigmas += [float(z) for z in noise.sigmas]
         if not sigmas:
             return None
         return Estimate(
-            cls(*map(float, size)),
+            cls(*map(float, size), together or cls().group_rows),
             {n: float(e) for n, e in zip(cls.strengths, error, strict=True) if np.isfinite(e)},
             sigmas_of_best(*sigmas),
             f"covariance of distant pixels of a row or column in "
@@ -135,8 +150,23 @@ def _row_shapes(spectrum: "LineSpectrum") -> F64:
     return np.stack([np.ones(len(power)), power, alternate, shared])
 
 
-def _flat(spectrum: "LineSpectrum") -> F64:
-    return np.ones((1, len(spectrum.power)))
+def _fit_rows(spectra: Sequence["LineSpectrum"]) -> "tuple[LineVariances, int]":
+    """Kinds of noise of rows, and how many are read together; 0, and no such kind, if none."""
+    shapes = [_row_shapes(s) for s in spectra]
+    fits = {0: fit_lines(spectra, shapes)}
+    for rows in GROUPS:
+        powers = [group_power(s, rows) for s in spectra]
+        found = fit_lines(spectra, list(map(np.vstack, zip(shapes, powers, strict=True))))
+        if found.size[-1] > 0 and found.misfit < fits[0].misfit - _NEEDED:
+            fits[rows] = found
+    best = min(fits, key=lambda rows: fits[rows].misfit)
+    return fits[best], best
+
+
+def group_power(spectrum: "LineSpectrum", rows: int) -> F64:
+    """Power (n,) of white noise that groups of rows share."""
+    turns = 2j * np.pi * spectrum.modes / spectrum.lines
+    return np.asarray(np.abs(np.exp(turns * np.arange(rows)[:, None]).sum(axis=0)) ** 2 / rows)
 
 
 def _of_fringes(found: FringeEvidence, across: bool) -> "LineSpectrum | None":
@@ -223,6 +253,7 @@ class LineVariances:
     size: F64  # (m,) e-²; unbiased, so it may be negative
     covariance: F64  # (m, m)
     sigmas: F64  # (m,) significance of each if it is the only one
+    misfit: float  # -2 log likelihood, but for a constant
 
     @property
     def roots(self) -> tuple[F64, F64]:
@@ -247,7 +278,9 @@ def fit_lines(spectra: Sequence[LineSpectrum], shapes: Sequence[F64]) -> LineVar
         size = covariance @ (weighted @ power)
     chance, dof = variance(np.zeros(len(shape))), np.concatenate([s.dof for s in spectra])
     sigmas = [_alone(power, own, chance, dof) for own in shape]
-    return LineVariances(size, covariance, np.array(sigmas))
+    spread = variance(size)
+    misfit = float(((power - size @ shape) ** 2 / spread + np.log(spread)).sum())
+    return LineVariances(size, covariance, np.array(sigmas), misfit)
 
 
 def _alone(power: F64, shape: F64, variance: F64, dof: F64) -> float:
