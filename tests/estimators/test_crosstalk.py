@@ -215,7 +215,7 @@ def test_what_rises_with_the_charge_is_not_taken_for_a_share():
     """Brighter-fatter moves more of a brighter hot pixel: the share at small signals is none."""
     charge = np.linspace(8, 40, 12)
     for share in (0.0, 0.006):
-        normal, right = shown(hot(share + 5e-5 * charge, charge, 1e-4)).sums()
+        normal, right = shown(hot(share + 5e-5 * charge, charge, 1e-4)).sums(np.zeros((1, 2)), 0.0)
         found, error = right[0, 0] / normal[0, 0, 0], normal[0, 0, 0] ** -0.5
         assert abs(found - share) < 2.5e-4
         assert 1e-5 < error < 3e-4

@@ -75,7 +75,9 @@ class BrighterFatter(Effect):
     def charge(self, charge: F32, shot: Shot) -> F32:
         wide = shot.surrounded(charge, REACH)
         inside = slice(REACH, -REACH)
-        moved = moved_charge(wide, self._shifts, self.along_y)
+        # Dark current is generated inside pixels, that of hot ones at single defects.
+        dark = np.pad(shot.maps.dark_rate * np.float32(shot.recording.exptime_s), REACH, "edge")
+        moved = moved_charge(wide, self._shifts, self.along_y, wide - dark)
         return charge + moved[inside, inside]
 
     def undo_samples(self, charge: F32) -> F32:

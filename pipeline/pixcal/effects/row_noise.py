@@ -5,8 +5,9 @@ the rows.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -116,9 +117,10 @@ class RowNoise(Effect):
         rows += [_of_fringes(f, across=False) for f in fringes]
         columns += [_of_fringes(f, across=True) for f in fringes]
         size, error, sigmas = np.zeros(6), np.full(6, np.nan), []
-        together = 0
+        grouped: dict[str, Any] = {}
         if of_rows := [s for s in rows if s is not None]:
             noise, together = _fit_rows(of_rows)
+            grouped = {"group_rows": together} if together else {}
             part = [0, 1, 2, 4, 5][: len(noise.size)]
             size[part], error[part] = noise.roots
             sigmas += [float(z) for z in noise.sigmas]
@@ -129,7 +131,7 @@ class RowNoise(Effect):
         if not sigmas:
             return None
         return Estimate(
-            cls(*map(float, size), together or cls().group_rows),
+            replace(cls(), **dict(zip(cls.strengths, map(float, size), strict=True)) | grouped),
             {n: float(e) for n, e in zip(cls.strengths, error, strict=True) if np.isfinite(e)},
             sigmas_of_best(*sigmas),
             f"covariance of distant pixels of a row or column in "

@@ -59,7 +59,7 @@ def _push(charge: Any, shifts: Any, wide: Any, right: Any, below: Any) -> None:
                         out[x] += s * row[x]
 
 
-def moved_charge(charge: F32, shifts: F64, along_y: float = 1.0) -> F32:
+def moved_charge(charge: F32, shifts: F64, along_y: float = 1.0, light: F32 | None = None) -> F32:
     """Charge that each pixel of frames (y, x) or (t, y, x) gains, e-; its sum is zero.
 
     Within `REACH` of the first and last row it is right only if these are edges of the window.
@@ -68,15 +68,17 @@ def moved_charge(charge: F32, shifts: F64, along_y: float = 1.0) -> F32:
         at them; through the edges nothing moves.
     shifts : from `boundary_shifts`, times the shift by an electron (px)
     along_y : shift of the boundaries between rows over that of those between columns
+    light : part of the charge that falls on boundaries too; else all
     """
+    lit = charge if light is None else light
     charge = np.ascontiguousarray(charge, np.float32)
     out = np.zeros_like(charge)
     ny, nx = charge.shape[-2:]
     wide = np.empty((ny + 2 * REACH, nx + 2 * REACH), np.float32)
     right, below = np.empty((2, ny, nx), np.float32)
     half, factor = np.float32(0.5), np.float32(along_y)
-    for q, gain in zip(charge.reshape(-1, ny, nx), out.reshape(-1, ny, nx), strict=True):
-        _push(q, shifts, wide, right, below)
+    for pushing, q, gain in zip(*(a.reshape(-1, ny, nx) for a in (charge, lit, out)), strict=True):
+        _push(pushing, shifts, wide, right, below)
         flow = half * (q[:, :-1] + q[:, 1:]) * right[:, :-1]
         gain[:, 1:] -= flow
         gain[:, :-1] += flow

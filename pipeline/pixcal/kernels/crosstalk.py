@@ -49,7 +49,7 @@ class Coupling:
     every_columns: int = quantity(1, low=1, high=1024, doc="sources lie in every n-th column")
     column: int = quantity(0, low=0, high=1023, doc="the first of these columns")
     per_ke: float = quantity(
-        0.0, unit="1/ke-", low=-0.02, high=0.02,
+        0.0, unit="1/ke-", low=-0.02, high=1.0,
         doc="relative change of the share with the source's signal",
     )  # fmt: skip
 

@@ -105,31 +105,42 @@ def joined(found: Sequence[Products | None]) -> Products | None:
     return replace(some[0], **{n: np.sum([getattr(o, n) for o in some], axis=0) for n in names})
 
 
-def share_sums(right: F64, normal: F64, read: float) -> tuple[F64, F64]:
+def share_sums(right: F64, normal: F64, read: float, per_ke: float = 0.0) -> tuple[F64, F64]:
     """Least-squares sums (link, u, u), (link, u) of the shares, with the other terms free.
 
+    If shares rise with the signal (``per_ke``, 1/ke-), the last term is no longer free.
     ``right``, ``normal``: as in `Products`, over classes instead of pixels. Unknown ``2 c`` is the
     share that pixels of class c give over the link, ``2 c + 1`` the share that their partners give
     back.
     """
     every = np.moveaxis(symmetric(np.moveaxis(normal, 1, -1)), 1, -1)
+    prior = np.diag([read**-2, (BRIGHTER_FATTER * UNIT) ** -2])
+    if per_ke > 0:
+        terms = np.eye(3, 4)
+        terms[:2, 3] = 2 * per_ke * UNIT * 1e-3
+        every, right = np.einsum("it,ltuc,ju->lijc", terms, every, terms), terms @ right
+        prior = prior[:1, :1]
     links, _, _, count = every.shape
     own: F64 = np.zeros((links, count, 2, count, 2))
     at = np.arange(count)
     own[:, at, :, at] = np.moveaxis(every[:, :2, :2], -1, 0)
     cross = np.moveaxis(every[:, :2, 2:], -1, 1).reshape(links, 2 * count, -1)
-    nuisance = every[:, 2:, 2:].sum(-1) + np.diag([read**-2, (BRIGHTER_FATTER * UNIT) ** -2])
+    nuisance = every[:, 2:, 2:].sum(-1) + prior
     taken = cross @ np.linalg.inv(nuisance)
     shares = right[:, :2].swapaxes(1, 2).reshape(links, -1)
     rest = shares - np.einsum("lun,ln->lu", taken, right[:, 2:].sum(-1))
     return own.reshape(links, 2 * count, -1) - taken @ cross.swapaxes(1, 2), rest
 
 
-def square_terms(found: Products) -> tuple[F64, F64]:
-    """Covariance (link,) over the product of the charges, 1/(10⁴ e-), and its variance."""
+def share_and_square(found: Products) -> tuple[F64, F64]:
+    """Mean share of both pixels, and covariance over the product of the charges, 1/(10⁴ e-).
+
+    With their covariance: (link, 2), (link, 2, 2).
+    """
     right, normal = (part.sum((-2, -1), dtype=float) for part in (found.right, found.normal))
-    covariance = inverse_normal(symmetric(normal))
-    return np.einsum("lt,lt->l", covariance[:, -1], right), covariance[:, -1, -1]
+    mean = np.array([[0.5, 0.5, 0, 0], [0, 0, 0, 1]])
+    covariance = mean @ inverse_normal(symmetric(normal))
+    return np.einsum("lat,lt->la", covariance, right), covariance @ mean.T
 
 
 def _weights(part: Residuals) -> Frames:

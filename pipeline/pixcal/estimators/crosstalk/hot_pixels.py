@@ -78,17 +78,44 @@ class ClassShares:
     square: F64
     product: F64
 
-    def sums(self) -> tuple[F64, F64]:
-        """Least-squares sums (link, u, u), (link, u) of the shares at small signals."""
-        links = len(self.weight)
+    def sums(self, more: F64, per_ke: float) -> tuple[F64, F64]:
+        """Least-squares sums (link, u, u), (link, u) of the shares at small signals.
+
+        ``more``: rise (link, 2) of the shares that is added first; ``per_ke``: relative rise of
+        the rest, free if not positive; both 1/ke-.
+        """
+        links, more = len(self.weight), more[:, None]
         parts = (self.weight, self.value, self.charge)
         weight, value, charge = (part.reshape(links, -1) for part in parts)
+        value = value + (more * self.charge).reshape(links, -1)
+        product, square = (
+            part.reshape(links, -1) for part in (self.product + more * self.square, self.square)
+        )
+        if per_ke > 0:
+            here = 1 + per_ke * charge
+            normal = (weight * here**2 + square * per_ke**2)[:, :, None] * np.eye(weight.shape[1])
+            return normal, weight * here * value + per_ke * product
         cross = weight * charge
-        rise = (cross * charge).sum(1) + self.square.reshape(links, -1).sum(1) + RISE**-2
-        risen = (cross * value).sum(1) + self.product.reshape(links, -1).sum(1)
+        rise = (cross * charge).sum(1) + square.sum(1) + RISE**-2
+        risen = (cross * value).sum(1) + product.sum(1)
         normal = weight[:, :, None] * np.eye(weight.shape[1])
         normal -= cross[:, :, None] * cross[:, None, :] / rise[:, None, None]
         return normal, weight * value - cross * (risen / rise)[:, None]
+
+    def rises(self) -> tuple[F64, F64, F64]:
+        """Shares (link, 2) at small signals, their rises (1/ke-), covariance (link, 2, 2, 2).
+
+        Of the first class; the covariance is infinite where no rise can be measured.
+        """
+        weight, value, charge, square, product = (
+            part[:, 0] for part in (self.weight, self.value, self.charge, self.square, self.product)
+        )
+        variance = np.divide(1, square, out=np.full_like(square, np.inf), where=square > 0)
+        rise = product * np.where(square > 0, variance, 0)
+        of_mean = np.divide(1, weight, out=np.full_like(weight, np.inf), where=weight > 0)
+        mixed = -charge * variance
+        both = np.array([[of_mean - charge * mixed, mixed], [mixed, variance]])
+        return value - charge * rise, rise, np.moveaxis(both, (0, 1), (-2, -1))
 
 
 def hot_pixels(

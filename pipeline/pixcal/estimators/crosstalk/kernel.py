@@ -10,6 +10,7 @@ greatest evidence is taken.
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from math import lcm
 
 import numpy as np
@@ -35,6 +36,9 @@ START = (1e-2, 1e-3)  # start values of these sizes
 STEPS = 6  # most steps of least squares
 STILL = 0.3  # standard errors by which a step that is not the last moves
 CERTAIN = 5.0  # sigmas beyond which a level dependence is accepted
+# chi-square by which shifted boundaries describe noise better than shares that rise, if they are
+# the cause: they have a free parameter more
+BOUNDARIES = 4.0
 # sigmas beyond which a coupling is reported: with a hundred tested, one false in twenty kernels
 THERE = 3.5
 # most pixels of flats: their sums of pairs up to `links.REACH` apart fill 400 MB
@@ -86,10 +90,13 @@ def measure(evidence: Evidence) -> tuple[Kernel | None, float] | None:
     near, classes = within(sources.shape, there), best_period(sources.of(there))
     kernel = _kernel(sources.of(near), classes)
     del sources  # large
+    known = np.zeros(len(kernel.couplings), np.bool_)
     for _ in range(STEPS):
-        found = sources_of([evidence], lambda _: near, _there(kernel))
+        # A coupling stays: where shares rise steeply, those at small signals are uncertain.
+        known |= np.abs(kernel.shares) > THERE * kernel.errors
+        found = sources_of([evidence], lambda _: near, tuple(compress(kernel.couplings, known)))
         assert found is not None
-        before, kernel = kernel, _with_level(_kernel(found, classes, kernel.per_ke[0]), found)
+        before, kernel = kernel, _kernel(found, classes, *_level(found))
         change = kernel.per_ke[0] - before.per_ke[0]
         moved = np.abs(kernel.shares - before.shares) * largest_outflow(kernel.couplings)
         if abs(change) < STILL * kernel.per_ke[1] and (moved < STILL * kernel.errors).all():
@@ -166,12 +173,6 @@ def _examined(evidence: Evidence) -> tuple[Evidence, Sources | None]:
     return evidence, sources_of([evidence], lambda _: every) if every else None
 
 
-def _there(kernel: Kernel) -> tuple[Coupling, ...]:
-    """Couplings that are significant by themselves."""
-    there = np.abs(kernel.shares) > THERE * kernel.errors
-    return tuple(c for c, own in zip(kernel.couplings, there, strict=True) if own)
-
-
 def best_period(sources: Sources) -> PixelClasses:
     """The classes of the period of the greatest evidence."""
 
@@ -184,17 +185,17 @@ def best_period(sources: Sources) -> PixelClasses:
     return max(sources.every_period(), key=score)[0]
 
 
-def _with_level(kernel: Kernel, found: Sources) -> Kernel:
-    """The kernel with the relative fall (1/ke-) of shares with the signal."""
-    # Shares that rise may be due to brighter-fatter; those that fall are not.
-    more, error = found.level_dependence(_there(kernel))
-    now = kernel.per_ke[0] + more
-    now = now if now < -CERTAIN * error else 0.0
-    couplings = tuple(replace(c, per_ke=now) for c in kernel.couplings)
-    return replace(kernel, couplings=couplings, per_ke=(now, error))
+def _level(found: Sources) -> tuple[float, float]:
+    """Relative change (1/ke-) of all shares with the signal, zero if not certain; its error."""
+    # Boundaries that charge shifts make neighbours share noise that rises alike.
+    level = found.level_dependence()
+    taken = level.gain > CERTAIN**2 and (level.per_ke < 0 or level.boundaries < BOUNDARIES)
+    return level.per_ke if taken else 0.0, level.error
 
 
-def _kernel(sources: Sources, classes: PixelClasses, per_ke: float = 0.0) -> Kernel:
+def _kernel(
+    sources: Sources, classes: PixelClasses, per_ke: float = 0.0, error: float = np.inf
+) -> Kernel:
     """All couplings of the links for the classes of a period.
 
     With ``per_ke``, maps are not used, as they are of one level.
@@ -209,7 +210,7 @@ def _kernel(sources: Sources, classes: PixelClasses, per_ke: float = 0.0) -> Ker
             "not decided: a kernel of that period has more couplings than can be measured"
         )
     known = _shares_of(every, sources.known)
-    by_source = sources.of_period(classes)
+    by_source = sources.of_period(classes, per_ke)
     normal, right = total(by_source)
     whole, rights, free = block_diag(*normal), right.ravel(), 0
     if sources.maps is not None and not per_ke:
@@ -225,7 +226,7 @@ def _kernel(sources: Sources, classes: PixelClasses, per_ke: float = 0.0) -> Ker
         covariance,
         (*by_source, *["maps"] * bool(free)),
         log_evidence,
-        (per_ke, np.inf),
+        (per_ke, error),
     )
 
 

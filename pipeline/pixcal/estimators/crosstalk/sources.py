@@ -13,15 +13,21 @@ from pixcal.estimators.crosstalk.covariance import (
     Products,
     joined,
     products,
+    share_and_square,
     share_sums,
-    square_terms,
 )
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels, hot_pixels
 from pixcal.estimators.crosstalk.links import PixelClasses, Place, class_sums, sums_of
 from pixcal.estimators.crosstalk.maps import Maps
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.kernels.boundaries import REACH, boundary_shifts, shared_noise
 from pixcal.kernels.crosstalk import Coupling
+from pixcal.kernels.normal_matrix import symmetric
 from pixcal.model.arrays import F32, F64
+
+# range of the relative change of shares with the signal, and its steps, 1/ke-
+MOST_FALLING, STEEPEST, STEP = -0.02, 1.0, 1e-4
+FALLOFFS = (0.25, 0.5, 1.0)  # of boundary shifts with distance, px
 
 # Least-squares sums of the shares of each link, by source: normal (link, u, u), right (link, u)
 Information = dict[str, tuple[F64, F64]]
@@ -31,6 +37,16 @@ def total(information: Information) -> tuple[F64, F64]:
     """Sums over all sources."""
     normal, right = zip(*information.values(), strict=True)
     return np.sum(normal, axis=0), np.sum(right, axis=0)
+
+
+@dataclass(frozen=True)
+class Level:
+    """Relative change of all shares with the signal."""
+
+    per_ke: float  # per_ke, error: 1/ke-
+    error: float
+    gain: float  # fall in chi-square by the change
+    boundaries: float  # further fall if boundaries that charge shifts (brighter-fatter) act instead
 
 
 @dataclass(frozen=True)
@@ -58,32 +74,64 @@ class Sources:
         for (classes, right), (_, normal) in both:
             yield classes, *total(self._information(classes, right, normal, True))
 
-    def of_period(self, classes: PixelClasses) -> Information:
-        """All links, for one period."""
+    def of_period(self, classes: PixelClasses, per_ke: float) -> Information:
+        """All links, for one period, and for shares that change with the signal (1/ke-)."""
         right, normal = (sums_of(one, classes) for one in self._products)
-        return self._information(classes, right, normal, False)
+        return self._information(classes, right, normal, False, per_ke)
 
-    def level_dependence(self, couplings: Sequence[Coupling]) -> tuple[float, float]:
-        """Further relative change of all shares with the signal, 1/ke-, and its error."""
-        slope = np.zeros((len(self.links), 2))
+    def level_dependence(self) -> Level:
+        """Relative change of the known shares with the signal, the same for all."""
+        there = self._by_link(self.known) != 0
+        shares, rises, covariances, used = [], [], [], []  # of each measured value
+        doubt = as_boundaries = 0.0
+        if self.noise is not None:
+            shot, apart, error = self.noise.shot
+            doubt = error / 20
+            value, covariance = share_and_square(self.noise)
+            share, square = value.T / shot
+            # Both pixels of a pair give; 10⁴ e- are 10 ke-.
+            share = 40 * share + 20 * self._by_link(self.known).sum(axis=1)
+            square += 20 * self._by_link(self.known, True).sum(axis=1)
+            # A slope of the variance is no change of the shares.
+            shares, rises = [share], [square - apart / 20 * share]
+            covariances = [covariance * [[1600, 40], [40, 1]]]
+            used = [there.any(axis=1)]
+            as_boundaries = _left_by_boundaries(self.links, rises[0], covariance[:, 1, 1])
+        if self.hot is not None:
+            found = self.hot.by_class(PixelClasses(1, 1, self.first), self.links)
+            share, rise, covariance = found.rises()
+            seen = covariance[..., 1, 1] < np.inf
+            rise = rise + self._by_link(self.known, True)
+            as_boundaries += float((rise**2 / covariance[..., 1, 1])[seen].sum())
+            shares.append((share + self._by_link(self.known))[seen])
+            rises.append(rise[seen])
+            covariances.append(covariance[seen])
+            used.append(there[seen])
+        share, rise = np.concatenate(shares), np.concatenate(rises)
+        (own, mixed), (_, other) = np.moveaxis(np.concatenate(covariances), 0, -1)
+        trial = np.append(np.arange(MOST_FALLING, STEEPEST, STEP), 0.0)[:, None]
+        left = (rise - trial * share) ** 2 / (other - 2 * trial * mixed + trial**2 * own)
+        own_left = left[:, np.concatenate(used)].sum(axis=1)
+        best = int(own_left.argmin())
+        weight = share**2 / (other - 2 * trial[best] * mixed + trial[best] ** 2 * own)
+        weight = float(weight[np.concatenate(used)].sum())
+        gain = float(own_left[-1] - own_left[best]) / (1 + weight * doubt**2)
+        return Level(
+            float(trial[best, 0]),
+            float(np.hypot(max(weight, 1e-30) ** -0.5, doubt)),
+            gain,
+            float(left[best].sum()) - as_boundaries,
+        )
+
+    def _by_link(self, couplings: Sequence[Coupling], changes: bool = False) -> F64:
+        """Shares (link, 2) there and back, mean of all pixels, or their changes with the signal."""
+        sums = np.zeros((len(self.links), 2))
         for c in couplings:
             back = (c.dy, c.dx) not in self.links
             link = self.links.index((-c.dy, -c.dx) if back else (c.dy, c.dx))
-            slope[link, int(back)] += c.share / (c.every_rows * c.every_columns)
-        right = weight = doubt = 0.0
-        if self.noise is not None:
-            value, variance = square_terms(self.noise)
-            # 10⁴ e- are 10 ke-; a slope of the variance is no change of the shares.
-            rise = 20 * slope.sum(axis=1)
-            shot, apart, error = self.noise.shot
-            right += float(rise / variance @ (value / shot - apart / 20 * rise))
-            weight += float(rise / variance @ rise)
-            doubt = error / 20
-        if self.hot is not None:
-            found = self.hot.by_class(PixelClasses(1, 1, self.first), self.links)
-            right += float((slope * found.product[:, 0]).sum())
-            weight += float((slope**2 * found.square[:, 0]).sum())
-        return (right / weight, float(np.hypot(weight**-0.5, doubt))) if weight else (0.0, np.inf)
+            share = c.share * c.per_ke if changes else c.share
+            sums[link, int(back)] += share / (c.every_rows * c.every_columns)
+        return sums
 
     @property
     def _products(self) -> tuple[F32, F32]:
@@ -93,14 +141,38 @@ class Sources:
         return self.noise.right, self.noise.normal
 
     def _information(
-        self, classes: PixelClasses, right: F64, normal: F64, doubted: bool
+        self, classes: PixelClasses, right: F64, normal: F64, doubted: bool, per_ke: float = 0.0
     ) -> Information:
         found = {}
+        # What the frames would be less of, did the known shares change by this.
+        more = self._by_link(self.known, True) - per_ke * self._by_link(self.known)
         if self.noise is not None:
-            found["covariance"] = share_sums(right / self.noise.shot[0], normal, self.noise.read)
+            squares = symmetric(np.moveaxis(normal, 1, -1))[..., -1]
+            right = right / self.noise.shot[0] + np.moveaxis(
+                squares * (20 * more.sum(axis=1))[:, None, None], -1, 1
+            )
+            found["covariance"] = share_sums(right, normal, self.noise.read, per_ke)
         if self.hot is not None:
-            found["hot pixels"] = self.hot.by_class(classes, self.links, doubted).sums()
+            hot = self.hot.by_class(classes, self.links, doubted)
+            found["hot pixels"] = hot.sums(more, per_ke)
         return found
+
+
+def _left_by_boundaries(links: Sequence[Place], value: F64, variance: F64) -> float:
+    """Chi-square of `square_terms` that boundaries shifted by charge (brighter-fatter) leave."""
+    weighted, left = value / np.sqrt(variance), []
+    even = np.ones((1, 2 * (REACH + 3) + 1, 2 * (REACH + 3) + 1), np.float32)
+    still = np.zeros_like(even), np.zeros_like(even)
+    middle = 0, REACH + 2, REACH + 2
+    for falloff in FALLOFFS:
+        shifts = boundary_shifts(falloff)
+        shared = [
+            [shared_noise(even, still, shifts, step, axes)[middle] for step in links]
+            for axes in ((1.0, 0.0), (0.0, 1.0))
+        ]
+        pattern = np.array(shared).T / np.sqrt(variance)[:, None]
+        left.append(float(np.sum((weighted - pattern @ np.linalg.pinv(pattern) @ weighted) ** 2)))
+    return min(left)
 
 
 def sources_of(
