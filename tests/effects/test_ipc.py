@@ -365,14 +365,15 @@ def test_detector_frames_alone_are_enough(acquired: Acquired) -> None:
 
 
 @pytest.mark.long
-def test_a_share_that_falls_with_the_signal_is_noticed(acquired: Acquired) -> None:
-    couplings = tuple(dataclasses.replace(c, per_ke=-0.008) for c in Ipc.nearest(0.03).couplings)
+@pytest.mark.parametrize("true", [-0.008, 0.01])
+def test_a_share_that_changes_with_the_signal_is_noticed(acquired: Acquired, true: float) -> None:
+    couplings = tuple(dataclasses.replace(c, per_ke=true) for c in Ipc.nearest(0.03).couplings)
     changes = {"detector.hot_fraction": 0.01, "detector.hot_rate_e_s": 3.5e4}
     found = Ipc.estimate(acquired(changes, {"ipc": to_plain(Ipc(couplings))}))
     assert found is not None
     assert isinstance(found.effect, Ipc)
     (per_ke,) = {c.per_ke for c in found.effect.couplings}
-    assert abs(per_ke + 0.008) < 4 * found.errors["couplings[0].per_ke"] < 0.008
+    assert abs(per_ke - true) < 4 * found.errors["couplings[0].per_ke"] < abs(true)
     assert np.abs(pulls(found, Ipc(couplings))).max() < 5
 
 
@@ -413,6 +414,9 @@ def test_it_is_measured_among_other_effects(acquired: Acquired) -> None:
     others = {"brighter_fatter": {}, "row_noise": {}, "intensity_noise": {}}
     found = Ipc.estimate(acquired(None, {"ipc": to_plain(Ipc())} | others))
     assert found is not None
+    assert isinstance(found.effect, Ipc)
+    # Boundaries that charge shifts are no share that rises.
+    assert {c.per_ke for c in found.effect.couplings} == {0.0}
     assert np.abs(pulls(found, Ipc())).max() < 4.5
 
 

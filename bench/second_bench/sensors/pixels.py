@@ -65,12 +65,14 @@ def curved(sensor: Sensor) -> Drawn:
     return {"size": size, "shape": shape}
 
 
-def _to_neighbours(sensor: Sensor, along_x: float, along_y: float, rising: bool) -> None:
+def _to_neighbours(
+    sensor: Sensor, along_x: float, along_y: float, steady: float = 1.0, rising: float = 0.0
+) -> None:
     top = sensor.top_e
 
     def shares(e: F64, _: int) -> F64:
         out = e.copy()
-        moved = e * (e / top) if rising else e
+        moved = e * (steady + rising * e / top)
         for axis, share in ((1, along_x), (0, along_y)):
             for by in (-1, 1):
                 out += share * (np.roll(moved, by, axis) - moved)
@@ -83,7 +85,7 @@ def _to_neighbours(sensor: Sensor, along_x: float, along_y: float, rising: bool)
 def ipc(sensor: Sensor) -> Drawn:
     """A part of the signal shows in the neighbours."""
     x, y = sensor.rng.uniform(0.004, 0.02, 2)
-    _to_neighbours(sensor, float(x), float(y), rising=False)
+    _to_neighbours(sensor, float(x), float(y))
     return {"x": float(x), "y": float(y)}
 
 
@@ -91,8 +93,16 @@ def ipc(sensor: Sensor) -> Drawn:
 def coupling(sensor: Sensor) -> Drawn:
     """A part of the signal that rises with it shows in the neighbours of the row."""
     x = float(sensor.rng.uniform(0.004, 0.02))
-    _to_neighbours(sensor, x, 0.0, rising=True)
+    _to_neighbours(sensor, x, 0.0, 0.0, 1.0)
     return {"x": x}
+
+
+@kind("ipc")
+def growing(sensor: Sensor) -> Drawn:
+    """The share that shows in the neighbours grows to two to four times that of small signals."""
+    (x, y), rise = sensor.rng.uniform(0.004, 0.012, 2), float(sensor.rng.uniform(1, 3))
+    _to_neighbours(sensor, float(x), float(y), 1.0, rise)
+    return {"x": float(x), "y": float(y), "rise": rise, "per_ke": 1e3 * rise / sensor.top_e}
 
 
 @kind("lag")

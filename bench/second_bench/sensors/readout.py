@@ -33,6 +33,16 @@ def row_pairs(sensor: Sensor) -> Drawn:
     return {"row_e": size}
 
 
+@kind("row_noise")
+def row_groups(sensor: Sensor) -> Drawn:
+    """Two or four rows are read together, and share an offset in every frame."""
+    rng, ny = sensor.rng, sensor.shape[0]
+    size, rows = float(rng.uniform(0.2, 1.0) * sensor.read_noise_e.mean()), int(rng.choice([2, 4]))
+    of = np.arange(ny) // rows
+    sensor.amplified.append(lambda e, _: e + size * rng.standard_normal(ny)[of][:, None])
+    return {"row_e": size, "rows": rows}
+
+
 @kind()
 def amplifiers(sensor: Sensor) -> Drawn:
     """Two halves with amplifiers of their own, and converters of their own for columns."""

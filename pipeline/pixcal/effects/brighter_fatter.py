@@ -106,6 +106,7 @@ class BrighterFatter(Effect):
         along_y = 1.0
         if not evidence.fringes:
             size, variance, along_y, significance = _by_axis(noise)
+            why += ", as crosstalk would cause whose share grows from zero"
         else:
             shift, of_shift, _ = boundaries_beside(evidence, falloff)
             if _agree(noise, shift, of_shift):

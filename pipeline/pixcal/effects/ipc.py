@@ -136,12 +136,15 @@ class Ipc(Effect):
         errors = {f"couplings[{n}].share": float(s) for n, s in enumerate(sigma)}
         if kernel.per_ke[0]:
             errors |= {f"couplings[{n}].per_ke": kernel.per_ke[1] for n in range(len(sigma))}
+        law = f"a kernel of {len(couplings)} couplings, all significant"
+        if kernel.per_ke[0]:
+            law += f", whose shares change by {100 * kernel.per_ke[0]:+.2g} % per ke-"
         return Estimate(
             cls(couplings),
             errors,
             sigmas,
             _why(couplings, kernel),
-            law=f"a kernel of {len(couplings)} couplings, all significant",
+            law=law,
             size=_size(couplings, sigma),
             in_full=cls(_worth_it(kernel.couplings)) if couplings else None,
         )

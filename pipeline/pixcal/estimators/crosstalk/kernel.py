@@ -35,10 +35,6 @@ USUAL, PATTERN = 4e-4, 1e-4
 START = (1e-2, 1e-3)  # start values of these sizes
 STEPS = 6  # most steps of least squares
 STILL = 0.3  # standard errors by which a step that is not the last moves
-CERTAIN = 5.0  # sigmas beyond which a level dependence is accepted
-# chi-square by which shifted boundaries describe noise better than shares that rise, if they are
-# the cause: they have a free parameter more
-BOUNDARIES = 4.0
 # sigmas beyond which a coupling is reported: with a hundred tested, one false in twenty kernels
 THERE = 3.5
 # most pixels of flats: their sums of pairs up to `links.REACH` apart fill 400 MB
@@ -96,7 +92,7 @@ def measure(evidence: Evidence) -> tuple[Kernel | None, float] | None:
         known |= np.abs(kernel.shares) > THERE * kernel.errors
         found = sources_of([evidence], lambda _: near, tuple(compress(kernel.couplings, known)))
         assert found is not None
-        before, kernel = kernel, _kernel(found, classes, *_level(found))
+        before, kernel = kernel, _kernel(found, classes, *found.level_dependence())
         change = kernel.per_ke[0] - before.per_ke[0]
         moved = np.abs(kernel.shares - before.shares) * largest_outflow(kernel.couplings)
         if abs(change) < STILL * kernel.per_ke[1] and (moved < STILL * kernel.errors).all():
@@ -183,14 +179,6 @@ def best_period(sources: Sources) -> PixelClasses:
         return own[-1] + (pattern - WORTH * (classes.count - 1)) / 2
 
     return max(sources.every_period(), key=score)[0]
-
-
-def _level(found: Sources) -> tuple[float, float]:
-    """Relative change (1/ke-) of all shares with the signal, zero if not certain; its error."""
-    # Boundaries that charge shifts make neighbours share noise that rises alike.
-    level = found.level_dependence()
-    taken = level.gain > CERTAIN**2 and (level.per_ke < 0 or level.boundaries < BOUNDARIES)
-    return level.per_ke if taken else 0.0, level.error
 
 
 def _kernel(

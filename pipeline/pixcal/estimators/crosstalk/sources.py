@@ -25,8 +25,9 @@ from pixcal.kernels.crosstalk import Coupling
 from pixcal.kernels.normal_matrix import symmetric
 from pixcal.model.arrays import F32, F64
 
-# range of the relative change of shares with the signal, and its steps, 1/ke-
-MOST_FALLING, STEEPEST, STEP = -0.02, 1.0, 1e-4
+CHANGES = np.arange(-0.02, 1.0, 1e-4)  # relative, of shares with the signal, 1/ke-
+CERTAIN = 5.0  # sigmas beyond which such a change is accepted
+MORE = 4.0  # fall in chi-square required of boundaries, which have a free parameter more
 FALLOFFS = (0.25, 0.5, 1.0)  # of boundary shifts with distance, px
 
 # Least-squares sums of the shares of each link, by source: normal (link, u, u), right (link, u)
@@ -37,16 +38,6 @@ def total(information: Information) -> tuple[F64, F64]:
     """Sums over all sources."""
     normal, right = zip(*information.values(), strict=True)
     return np.sum(normal, axis=0), np.sum(right, axis=0)
-
-
-@dataclass(frozen=True)
-class Level:
-    """Relative change of all shares with the signal."""
-
-    per_ke: float  # per_ke, error: 1/ke-
-    error: float
-    gain: float  # fall in chi-square by the change
-    boundaries: float  # further fall if boundaries that charge shifts (brighter-fatter) act instead
 
 
 @dataclass(frozen=True)
@@ -79,11 +70,15 @@ class Sources:
         right, normal = (sums_of(one, classes) for one in self._products)
         return self._information(classes, right, normal, False, per_ke)
 
-    def level_dependence(self) -> Level:
-        """Relative change of the known shares with the signal, the same for all."""
+    def level_dependence(self) -> tuple[float, float]:
+        """Relative change of the known shares with the signal, zero if not certain; its error.
+
+        Both in 1/ke-. All shares change alike; of rises, boundaries that charge shifts
+        (brighter-fatter) are the cause where these describe the noise better.
+        """
         there = self._by_link(self.known) != 0
         shares, rises, covariances, used = [], [], [], []  # of each measured value
-        doubt = as_boundaries = 0.0
+        doubt = by_boundaries = 0.0
         if self.noise is not None:
             shot, apart, error = self.noise.shot
             doubt = error / 20
@@ -96,32 +91,29 @@ class Sources:
             shares, rises = [share], [square - apart / 20 * share]
             covariances = [covariance * [[1600, 40], [40, 1]]]
             used = [there.any(axis=1)]
-            as_boundaries = _left_by_boundaries(self.links, rises[0], covariance[:, 1, 1])
+            by_boundaries = _left_by_boundaries(self.links, rises[0], covariance[:, 1, 1])
         if self.hot is not None:
             found = self.hot.by_class(PixelClasses(1, 1, self.first), self.links)
             share, rise, covariance = found.rises()
             seen = covariance[..., 1, 1] < np.inf
             rise = rise + self._by_link(self.known, True)
-            as_boundaries += float((rise**2 / covariance[..., 1, 1])[seen].sum())
+            by_boundaries += float((rise**2 / covariance[..., 1, 1])[seen].sum())
             shares.append((share + self._by_link(self.known))[seen])
             rises.append(rise[seen])
             covariances.append(covariance[seen])
             used.append(there[seen])
         share, rise = np.concatenate(shares), np.concatenate(rises)
         (own, mixed), (_, other) = np.moveaxis(np.concatenate(covariances), 0, -1)
-        trial = np.append(np.arange(MOST_FALLING, STEEPEST, STEP), 0.0)[:, None]
+        trial = np.append(CHANGES, 0.0)[:, None]
         left = (rise - trial * share) ** 2 / (other - 2 * trial * mixed + trial**2 * own)
         own_left = left[:, np.concatenate(used)].sum(axis=1)
-        best = int(own_left.argmin())
+        best = own_left.argmin()
         weight = share**2 / (other - 2 * trial[best] * mixed + trial[best] ** 2 * own)
         weight = float(weight[np.concatenate(used)].sum())
-        gain = float(own_left[-1] - own_left[best]) / (1 + weight * doubt**2)
-        return Level(
-            float(trial[best, 0]),
-            float(np.hypot(max(weight, 1e-30) ** -0.5, doubt)),
-            gain,
-            float(left[best].sum()) - as_boundaries,
-        )
+        gain = (own_left[-1] - own_left[best]) / (1 + weight * doubt**2)
+        own_cause = trial[best] < 0 or left[best].sum() < by_boundaries + MORE
+        per_ke = float(trial[best, 0]) if gain > CERTAIN**2 and own_cause else 0.0
+        return per_ke, float(np.hypot(max(weight, 1e-30) ** -0.5, doubt))
 
     def _by_link(self, couplings: Sequence[Coupling], changes: bool = False) -> F64:
         """Shares (link, 2) there and back, mean of all pixels, or their changes with the signal."""
@@ -159,11 +151,11 @@ class Sources:
 
 
 def _left_by_boundaries(links: Sequence[Place], value: F64, variance: F64) -> float:
-    """Chi-square of `square_terms` that boundaries shifted by charge (brighter-fatter) leave."""
+    """Chi-square of quadratic terms that boundaries shifted by charge (brighter-fatter) leave."""
     weighted, left = value / np.sqrt(variance), []
-    even = np.ones((1, 2 * (REACH + 3) + 1, 2 * (REACH + 3) + 1), np.float32)
+    even = np.ones((1, 4 * REACH + 1, 4 * REACH + 1), np.float32)
     still = np.zeros_like(even), np.zeros_like(even)
-    middle = 0, REACH + 2, REACH + 2
+    middle = 0, 2 * REACH, 2 * REACH
     for falloff in FALLOFFS:
         shifts = boundary_shifts(falloff)
         shared = [
