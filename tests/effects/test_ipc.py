@@ -397,6 +397,17 @@ def test_noise_of_neighbours_tells_shares_that_fall_from_a_bent_response(
     assert {c.per_ke for c in found.effect.couplings} == {0.0}
 
 
+@pytest.mark.long
+def test_noise_alone_tells_a_rise_and_names_what_else_may_cause_it(acquired: Acquired) -> None:
+    rising = tuple(dataclasses.replace(c, per_ke=0.02) for c in Ipc.nearest(0.015).couplings)
+    found = Ipc.estimate(acquired(NO_DARKS, {"ipc": to_plain(Ipc(rising))}))
+    assert found is not None
+    assert isinstance(found.effect, Ipc)
+    (per_ke,) = {c.per_ke for c in found.effect.couplings}
+    assert abs(per_ke - 0.02) < 4 * found.errors["couplings[0].per_ke"] < 0.02
+    assert found.law.endswith("or else are steady beside brighter_fatter")
+
+
 LOOK_ALIKES = ("row_noise", "brighter_fatter", "nonlinearity", "lag", "rolling_shutter")
 
 

@@ -138,7 +138,8 @@ class Ipc(Effect):
             errors |= {f"couplings[{n}].per_ke": kernel.per_ke[1] for n in range(len(sigma))}
         law = f"a kernel of {len(couplings)} couplings, all significant"
         if kernel.per_ke[0]:
-            law += f", whose shares change by {100 * kernel.per_ke[0]:+.2g} % per ke-"
+            law += f", whose shares change by {100 * kernel.per_ke[0]:+.3g} % per ke-"
+            law += ", or else are steady beside brighter_fatter" * kernel.either
         return Estimate(
             cls(couplings),
             errors,

@@ -53,6 +53,7 @@ class Kernel:
     log_evidence: float
     # relative change of the shares with the source's signal, 1/ke-, and its error
     per_ke: tuple[float, float] = (0.0, np.inf)
+    either: bool = False  # a rise may as well be that of noise shared by shifted boundaries
 
     @property
     def shares(self) -> F64:
@@ -182,7 +183,11 @@ def best_period(sources: Sources) -> PixelClasses:
 
 
 def _kernel(
-    sources: Sources, classes: PixelClasses, per_ke: float = 0.0, error: float = np.inf
+    sources: Sources,
+    classes: PixelClasses,
+    per_ke: float = 0.0,
+    error: float = np.inf,
+    either: bool = False,
 ) -> Kernel:
     """All couplings of the links for the classes of a period.
 
@@ -215,6 +220,7 @@ def _kernel(
         (*by_source, *["maps"] * bool(free)),
         log_evidence,
         (per_ke, error),
+        either,
     )
 
 

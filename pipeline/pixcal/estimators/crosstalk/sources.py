@@ -27,7 +27,7 @@ from pixcal.model.arrays import F32, F64
 
 CHANGES = np.arange(-0.02, 1.0, 1e-4)  # relative, of shares with the signal, 1/ke-
 CERTAIN = 5.0  # sigmas beyond which such a change is accepted
-MORE = 4.0  # fall in chi-square required of boundaries, which have a free parameter more
+MORE = 10.0  # fall in chi-square that boundaries, as a further cause, must bring; as in a search
 FALLOFFS = (0.25, 0.5, 1.0)  # of boundary shifts with distance, px
 
 # Least-squares sums of the shares of each link, by source: normal (link, u, u), right (link, u)
@@ -70,11 +70,12 @@ class Sources:
         right, normal = (sums_of(one, classes) for one in self._products)
         return self._information(classes, right, normal, False, per_ke)
 
-    def level_dependence(self) -> tuple[float, float]:
+    def level_dependence(self) -> tuple[float, float, bool]:
         """Relative change of the known shares with the signal, zero if not certain; its error.
 
         Both in 1/ke-. All shares change alike; of rises, boundaries that charge shifts
-        (brighter-fatter) are the cause where these describe the noise better.
+        (brighter-fatter) are the cause where these describe the noise much better. Last, whether
+        either may be.
         """
         there = self._by_link(self.known) != 0
         shares, rises, covariances, used = [], [], [], []  # of each measured value
@@ -111,9 +112,10 @@ class Sources:
         weight = share**2 / (other - 2 * trial[best] * mixed + trial[best] ** 2 * own)
         weight = float(weight[np.concatenate(used)].sum())
         gain = (own_left[-1] - own_left[best]) / (1 + weight * doubt**2)
-        own_cause = trial[best] < 0 or left[best].sum() < by_boundaries + MORE
-        per_ke = float(trial[best, 0]) if gain > CERTAIN**2 and own_cause else 0.0
-        return per_ke, float(np.hypot(max(weight, 1e-30) ** -0.5, doubt))
+        rises, better = trial[best, 0] > 0, float(left[best].sum()) - by_boundaries
+        taken = gain > CERTAIN**2 and not (rises and better > MORE)
+        error = float(np.hypot(max(weight, 1e-30) ** -0.5, doubt))
+        return float(trial[best, 0]) if taken else 0.0, error, bool(rises and abs(better) < MORE)
 
     def _by_link(self, couplings: Sequence[Coupling], changes: bool = False) -> F64:
         """Shares (link, 2) there and back, mean of all pixels, or their changes with the signal."""
