@@ -4,10 +4,11 @@ The rules compare a pixel with others, and require a difference larger than the 
 can cause: on a perfect detector fewer than one pixel in 10⁵ is flagged.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import chdtri, polygamma
+from scipy.special import chdtri
 
 from pixcal.estimators.detector.calibration import MIN_STEPS, ExposureLevel
 from pixcal.kernels.robust import lit, median_and_sigma
@@ -33,7 +34,8 @@ _RARE = 0.1  # share of samples above which departures are not those of pixels o
 _CLIPPINGS = 4
 _CLIP = 4.0
 _POPULATION = 4.0  # standard deviations of log noise up to which pixels are of one population
-_SPREAD_DOF = 8
+_SPREAD_DOF, _QUANTILES = 8, 1000
+_COARSE = 3.0  # root of a sum of squares (steps) below which it has few values
 _HALF_A_STEP = 1 / 4 + 1 / 12  # variance of noise of half a step, which hardly depends on the level
 _QUARTILE = 0.6745  # of a normal distribution, in standard deviations
 _FEWEST = 64
@@ -171,9 +173,16 @@ def noisy_factor(least: float, variance: F64, dof: int, quantum: float) -> float
     spread = median_and_sigma(np.log(known))[1]
     reach = _POPULATION * spread
     if dof < _SPREAD_DOF:  # that scatter dominates, and is far from log-normal
-        own = max(spread**2 - float(polygamma(1, dof / 2)), 0.0) ** 0.5
-        reach = float(np.hypot(_POPULATION * own, np.log(certainly_noisy(dof))))
-    return max(least, float(np.exp(reach / 2)))
+        coarse = dof * np.median(known) < (_COARSE * quantum) ** 2
+        alike = chdtri(dof, (np.arange(_QUANTILES) + 0.5) / _QUANTILES)
+        own = 0.0 if coarse else spread**2 - median_and_sigma(np.log(alike))[1] ** 2
+        reach = math.hypot(_POPULATION * max(own, 0.0) ** 0.5, np.log(certainly_noisy(dof)))
+    return max(least, math.exp(reach / 2))
+
+
+def noisy_beyond(least: float, spread: float) -> float:
+    """The same where the scatter of the logarithm of noise over pixels is known."""
+    return max(least, math.exp(_POPULATION * spread))
 
 
 def nonlinear(steps: Sequence[ExposureLevel], levels: F64, limit: float) -> Mask:

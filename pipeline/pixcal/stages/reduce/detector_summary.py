@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from pixcal.estimators.detector.bad_pixels import noisy_beyond
 from pixcal.estimators.detector.emva import Measure, full_level, saturation, transfer_points
 from pixcal.estimators.detector.missing_codes import missing_codes, step_noise
 from pixcal.estimators.detector.pair_noise import without_bands
@@ -137,8 +138,10 @@ def summarise(job: Measuring, folder: Place, source: Ingested) -> Summary:
     for _ in range(2 if charge else 1):
         shot = charge / (job.gain if gain is None else gain.gain)
         error = _GUESS_ERROR if gain is None else gain.error / gain.gain
-        noise, own = read_noise.read_noise(dark, lost, (shot, error * shot), folder, job)
+        noise, own, spread = read_noise.read_noise(dark, lost, (shot, error * shot), job)
         gain = _gain(sums, own, lost[0], wander, top, job)
+    if spread is not None:
+        medians = replace(medians, noisy=noisy_beyond(medians.noisy, spread))
     if gain is not None and (read_noise.is_cut_off(job) or _tells_noise(gain)):
         noise, own = read_noise.of_variance(gain.read_variance, job.quantum)
     elif gain is not None and gain.without_dark:

@@ -217,12 +217,12 @@ def code_step(arrays: Sequence[Reader]) -> int:
     return math.gcd(*codes) if len(codes) >= NEIGHBOURS else 1
 
 
-def middle_rows(frames: Reader, begin: int, end: int) -> NDArray[Any]:
-    """Samples (t, y, x) of the middle `ROWS` rows of a range of frames."""
+def middle_rows(frames: Reader, begin: int, end: int, rows: int = ROWS) -> NDArray[Any]:
+    """Samples (t, y, x) of the middle ``rows`` of a range of frames."""
     count, ny, nx = frames.shape
-    first = max((ny - ROWS) // 2, 0)
+    first = max((ny - rows) // 2, 0)
     read: NDArray[Any] = frames.read(
-        (begin, min(end, count)), (first, min(first + ROWS, ny)), (0, nx)
+        (begin, min(end, count)), (first, min(first + rows, ny)), (0, nx)
     )
     return read
 

@@ -11,8 +11,9 @@ from pixcal.estimators.detector.code_density import step_of
 from pixcal.estimators.detector.emva import Measure
 from pixcal.estimators.detector.missing_codes import missing_codes, noise_before_missing_codes
 from pixcal.estimators.detector.pair_noise import LINES, along_lines, shared_by_blocks
+from pixcal.estimators.detector.rounded_noise import BELOW, FRAMES, noise_of_codes
 from pixcal.kernels.photon_transfer import BLOCK
-from pixcal.kernels.rounding import SHEPPARD, noise_before_rounding
+from pixcal.kernels.rounding import SHEPPARD
 from pixcal.model.arrays import F32, F64
 from pixcal.stages.reduce.calibration import on_grid
 from pixcal.stages.reduce.exposures import Group
@@ -27,6 +28,7 @@ _CUT_OFF, _COARSE_CUT_OFF = 0.006, 0.004
 _LEAST = 0.05  # smallest measurable noise, in steps
 _FILTERED = 0.1  # least correlation of neighbours in filtered samples
 _LINE_ERRORS = 3.0  # errors by which noise common to lines may be larger than it appears
+_CODES = 1 << 17  # pixels whose codes tell noise below a step
 _PAIRS, _SAMPLES = 16, 1 << 20  # pairs, and samples of each frame, that measure block noise
 
 
@@ -94,25 +96,29 @@ def dark_rate(folder: Place, job: Measuring) -> float:
 
 
 def read_noise(
-    dark: F64, lost: Measure, shot: Measure, folder: Place, job: Measuring
-) -> tuple[Measure | None, Measure | None]:
+    dark: F64, lost: Measure, shot: Measure, job: Measuring
+) -> tuple[Measure | None, Measure | None, float | None]:
     """Noise without light (ADU), less the variance of the dark signal, with and without rounding.
 
-    ``lost``: see `lost_in_blocks`. ``shot``: the shot variance of the dark signal (ADU²).
+    Also the scatter of its logarithm over pixels where it is below a step. ``lost``: see
+    `lost_in_blocks`. ``shot``: the shot variance of the dark signal (ADU²).
     """
     dof, _, square = dark[:, :3].sum(axis=0)
     if not dof > 0:
-        return None, None
+        return None, None, None
     whole = square / dof + lost[0]
     error = math.hypot(square / dof * math.sqrt(2 / dof), lost[1], shot[1])
     variance = max(whole - shot[0], SHEPPARD * job.quantum**2), error
     if is_cut_off(job):
         own = max(variance[0] - SHEPPARD * job.quantum**2, (_LEAST * job.quantum) ** 2)
         off = _CUT_OFF + _COARSE_CUT_OFF * (job.quantum / math.sqrt(own)) ** 3
-        return of_variance((variance[0], math.hypot(variance[1], 2 * off * own)), job.quantum)
+        less_sure = variance[0], math.hypot(variance[1], 2 * off * own)
+        return *of_variance(less_sure, job.quantum), None
     noise = math.sqrt(variance[0])
     measured = noise, variance[1] / (2 * noise) if noise else 0.0
-    return measured, _before_rounding(variance, folder, job) if job.quantum else measured
+    if not job.quantum:
+        return measured, measured, None
+    return measured, *_before_rounding(variance, shot[0], job)
 
 
 def is_cut_off(job: Measuring) -> bool:
@@ -130,36 +136,37 @@ def of_variance(variance: Measure, step: float) -> tuple[Measure, Measure]:
 
 
 def _before_rounding(
-    variance: tuple[float, float], folder: Place, job: Measuring
-) -> tuple[float, float] | None:
-    """Noise of the amplifier and its error (ADU), from positions of the levels between codes."""
+    variance: Measure, shot: float, job: Measuring
+) -> tuple[Measure | None, float | None]:
+    """Noise of the amplifier and its error (ADU), from the codes that pixels have.
+
+    Also the scatter of its logarithm over pixels, where the codes tell it. ``variance``: without
+    ``shot``, that of the dark signal (ADU²).
+    """
     assert job.read_series is not None
-    bias, rate = on_grid(folder, job.shape, ("bias", "dark_rate"))
-    means = bias + rate * job.read_series.exptime
-    step, alike = job.quantum, _frames_alike(job, job.read_series.exptime)
+    step, series = job.quantum, job.read_series
     in_steps = variance[0] / step**2, variance[1] / step**2
-    levels, counts = means[np.isfinite(means)] / step, code_counts([job.read_series], job)
-    reader = job.frames[job.read_series.array]
-    if not len(missing_codes(counts)):
-        found = noise_before_rounding(*in_steps, levels, alike)
-    else:
+    reader, counts = job.frames[series.array], code_counts([series], job)
+    found, spread = None, None
+    if len(missing_codes(counts)):
         # A few frames without light cannot show a pattern of missing codes.
-        multiple = step_of(code_counts([job.read_series, *job.flat], job))[0]
+        multiple = step_of(code_counts([series, *job.flat], job))[0]
         # With missing codes, means of darks are not linear in exposure time.
-        own = np.mean([middle_rows(reader, n, n + 1) for n in job.read_series.frames], axis=0)
-        levels = own.ravel() / step
+        own = np.mean([middle_rows(reader, n, n + 1) for n in series.frames], axis=0)
         found = noise_before_missing_codes(
-            *in_steps, levels, len(job.read_series.frames), counts, multiple
+            *in_steps, own.ravel() / step, len(series.frames), counts, multiple
         )
-    return found and (step * found[0], step * found[1])
-
-
-def _frames_alike(job: Measuring, exptime: float) -> float:
-    """Frames of an exposure time (s) whose mean is as certain as the line through all darks."""
-    times = np.repeat([g.exptime for g in job.dark], [len(g.frames) for g in job.dark])
-    off = times - times.mean()
-    per_rate = 1 / (off @ off) if times.max() > times.min() else 0.0
-    return float(1 / (1 / len(times) + per_rate * (exptime - times.mean()) ** 2))
+    elif in_steps[0] > BELOW**2 + SHEPPARD:
+        noise = math.sqrt(in_steps[0] - SHEPPARD)
+        found = noise, in_steps[1] / (2 * noise)
+    else:
+        rows = max(_CODES // job.shape[1], 1)
+        frames = [middle_rows(reader, n, n + 1, rows).ravel() for n in series.frames[:FRAMES]]
+        samples = np.array(frames, float)
+        samples = samples[:, np.isfinite(samples).all(axis=0)]
+        codes = np.rint(samples / step).astype(np.int64)
+        found, spread = noise_of_codes(codes, shot / step**2)
+    return found and (step * found[0], step * found[1]), spread
 
 
 def code_counts(groups: Sequence[Group], job: Measuring) -> F64:
