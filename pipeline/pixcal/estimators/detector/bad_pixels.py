@@ -35,7 +35,9 @@ _CLIPPINGS = 4
 _CLIP = 4.0
 _POPULATION = 4.0  # standard deviations of log noise up to which pixels are of one population
 _SPREAD_DOF, _QUANTILES = 8, 1000
-_COARSE = 3.0  # root of a sum of squares (steps) below which it has few values
+# variance of few samples (square steps), times its squared freedom, below which it has few values
+_COARSE = 12.0
+_UNKNOWN_SPREAD = 0.7  # of the logarithm of variance over pixels, where codes do not tell it
 _HALF_A_STEP = 1 / 4 + 1 / 12  # variance of noise of half a step, which hardly depends on the level
 _QUARTILE = 0.6745  # of a normal distribution, in standard deviations
 _FEWEST = 64
@@ -173,11 +175,22 @@ def noisy_factor(least: float, variance: F64, dof: int, quantum: float) -> float
     spread = median_and_sigma(np.log(known))[1]
     reach = _POPULATION * spread
     if dof < _SPREAD_DOF:  # that scatter dominates, and is far from log-normal
-        coarse = dof * np.median(known) < (_COARSE * quantum) ** 2
+        coarse = dof**2 * np.median(known) < _COARSE * quantum**2
         alike = chdtri(dof, (np.arange(_QUANTILES) + 0.5) / _QUANTILES)
         own = 0.0 if coarse else spread**2 - median_and_sigma(np.log(alike))[1] ** 2
         reach = math.hypot(_POPULATION * max(own, 0.0) ** 0.5, np.log(certainly_noisy(dof)))
     return max(least, math.exp(reach / 2))
+
+
+def noisy_unless_unlike(variance: float, dof: int, quantum: float) -> float:
+    """Factor above which pixels are noisy even if they differ in noise as those of sCMOS do.
+
+    One where there are codes and frames enough to tell the difference.
+    """
+    if variance > quantum**2 and dof**2 * variance > _COARSE * quantum**2:
+        return 1.0
+    reach = math.hypot(_POPULATION * _UNKNOWN_SPREAD, math.log(certainly_noisy(dof)))
+    return math.exp(reach / 2)
 
 
 def noisy_beyond(least: float, spread: float) -> float:
