@@ -5,7 +5,7 @@ import pytest
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from pixcal.kernels.gain_fit import GainFit, fit_gain
+from pixcal.kernels.gain_fit import LADDER, GainFit, fit_gain
 from pixcal.kernels.photon_transfer import (
     BLOCK,
     LAGS,
@@ -35,7 +35,8 @@ def measure(rng: np.random.Generator, scenes: list[F64]) -> GainFit:
     dof, _, square, *_ = bin_pairs(pair(rng, np.zeros_like(scenes[0]))).sum(axis=0)
     sums = sum(bin_pairs(pair(rng, scene)) for scene in scenes)
     variance = square / dof
-    fitted = fit_gain(np.asarray(sums), (variance, variance * np.sqrt(2 / dof)), np.inf)
+    read = variance, variance * np.sqrt(2 / dof)
+    fitted = fit_gain(np.asarray(sums), read, np.inf, straight=len(scenes) < LADDER)
     assert fitted is not None
     return fitted
 
@@ -321,6 +322,22 @@ def test_a_response_that_bends_leaves_the_gain_at_level_zero(size: float, power:
     assert np.mean(curved) < -size
     assert np.mean(gains) == pytest.approx(GAIN, rel=0.005)
     assert np.sqrt(np.mean(np.square(pulls))) < 1.5
+
+
+def test_bright_flats_alone_bend_as_well_between_them_and_the_dark() -> None:
+    """The noise without light is on their curve, although levels differ by less than twofold."""
+    rng = np.random.default_rng(19)
+    electrons = np.linspace(2.2e4, 4e4, 6)
+    share = 0.12 * electrons / 4e4
+    bent, slope = electrons * (1 - share) / GAIN, 1 - 2 * share
+    variance = electrons * slope**2 / GAIN**2 + READ_ADU**2
+    dof = np.full(6, 65_000.0)
+    for _ in range(10):
+        seen = variance * (1 + rng.standard_normal(6) * np.sqrt(2 / dof))
+        fitted = fit_gain(np.stack([dof, dof * bent, dof * seen], 1), (READ_ADU**2, 0.02), np.inf)
+        assert fitted is not None
+        assert not fitted.without_dark
+        assert fitted.gain == pytest.approx(GAIN, abs=3.5 * fitted.error)
 
 
 @pytest.mark.parametrize("count", [5, 6])

@@ -33,8 +33,8 @@ _STRAIGHT = 1e-6  # size of terms that is effectively zero
 _SIZES = np.concatenate([[_STRAIGHT], np.geomspace(1e-3, 1.0, 13)])
 _CHANCES = np.concatenate([[0.5], np.full(13, 0.5 / 13)])
 _CURVED = 0.05  # probability of a straight line below which the curve is curved
-# points beyond the terms, and range of levels, that separate a curve from points off a line
-_SPARE, _RANGE = 3, 3.0
+# points beyond the terms, which separate a curve from points off a line
+_SPARE = 3
 _ITERATIONS = 5
 _OFF_CURVE = 1e-6  # chance of a misfit beyond which a curve may have a step
 _FEWEST = 2  # points below a step: with the noise without light, they check each other
@@ -143,8 +143,7 @@ def _fit_range(
     if not used.any() or not (dof * shot).sum() > 0:
         return None
     top = float(level.max())
-    bends = not straight and top >= _RANGE * level.min()
-    terms = min(_TERMS, max(len(level) - _SPARE, 0)) if bends else 0
+    terms = 0 if straight else min(_TERMS, max(len(level) - _SPARE, 0))
     sizes = _SIZES if terms else _SIZES[:1]
     several = not straight and len(level) >= 2 * _SPARE
     apart = _CHANCE_APART * several if without_dark is None else float(without_dark)
