@@ -162,35 +162,32 @@ def variance_nearby(variance: F64, dof: F64, usual: float) -> F64:
     return np.asarray(np.fmax(nearby, usual))
 
 
-def noisy_factor(least: float, variance: F64, dof: int, quantum: float) -> float:
+def noisy_factor(
+    least: float, variance: F64, dof: int, quantum: float, *, unlike: bool = False
+) -> float:
     """Factor (at least ``least``) over the usual standard deviation above which pixels are noisy.
 
     Pixels of a log-normal population (sCMOS) are no defects. ``variance``: of pixels without light
-    (ADU²), with ``dof``. ``quantum``: step of the samples (ADU).
+    (ADU²), with ``dof``. ``quantum``: step of the samples (ADU). ``unlike``: allow for such a
+    population also if noise is too far below a step to show it.
     """
     known = variance[variance > 0]
-    if dof < 1 or not known.size or np.median(known) < _HALF_A_STEP * quantum**2:
+    if dof < 1 or not known.size:
         return least
+    usual = float(np.median(known))
     # Includes the sampling scatter of the variances, which moves pixels as far.
     spread = median_and_sigma(np.log(known))[1]
     reach = _POPULATION * spread
-    if dof < _SPREAD_DOF:  # that scatter dominates, and is far from log-normal
-        coarse = dof**2 * np.median(known) < _COARSE * quantum**2
+    below = usual < _HALF_A_STEP * quantum**2
+    if below and not unlike:
+        return least
+    if below or dof < _SPREAD_DOF:  # that scatter dominates, and is far from log-normal
         alike = chdtri(dof, (np.arange(_QUANTILES) + 0.5) / _QUANTILES)
-        own = 0.0 if coarse else spread**2 - median_and_sigma(np.log(alike))[1] ** 2
-        reach = math.hypot(_POPULATION * max(own, 0.0) ** 0.5, np.log(certainly_noisy(dof)))
+        own = max(spread**2 - median_and_sigma(np.log(alike))[1] ** 2, 0.0) ** 0.5
+        if below or dof**2 * usual < _COARSE * quantum**2:
+            own = _UNKNOWN_SPREAD
+        reach = math.hypot(_POPULATION * own, np.log(certainly_noisy(dof)))
     return max(least, math.exp(reach / 2))
-
-
-def noisy_unless_unlike(variance: float, dof: int, quantum: float) -> float:
-    """Factor above which pixels are noisy even if they differ in noise as those of sCMOS do.
-
-    One where there are codes and frames enough to tell the difference.
-    """
-    if variance > quantum**2 and dof**2 * variance > _COARSE * quantum**2:
-        return 1.0
-    reach = math.hypot(_POPULATION * _UNKNOWN_SPREAD, math.log(certainly_noisy(dof)))
-    return math.exp(reach / 2)
 
 
 def noisy_beyond(least: float, spread: float) -> float:

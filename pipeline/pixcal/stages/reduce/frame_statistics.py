@@ -19,7 +19,6 @@ from pixcal.estimators.detector.bad_pixels import (
     certainly_noisy,
     noisy,
     noisy_factor,
-    noisy_unless_unlike,
     nonlinear,
     variance_nearby,
 )
@@ -329,9 +328,9 @@ def _loud(job: Measuring, frames: F32) -> Mask:
         return np.zeros(variance.shape, np.bool_)
     unknown = np.full(variance.shape, np.nan)
     # Read noise allows for unlike pixels, and photon transfer is to be of the same ones.
-    unlike = noisy_unless_unlike(usual, len(frames) - 1, job.quantum)
-    least = max(job.options.noisy_factor, unlike)
-    factor = noisy_factor(least, variance, len(frames) - 1, job.quantum)
+    factor = noisy_factor(
+        job.options.noisy_factor, variance, len(frames) - 1, job.quantum, unlike=True
+    )
     nearby = variance_nearby(variance, dof, usual)
     return noisy(variance, dof, nearby, unknown, 0 * dof, factor)
 
