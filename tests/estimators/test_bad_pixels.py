@@ -212,6 +212,20 @@ def test_noise_below_a_step_has_a_population_too() -> None:
     assert found.mean() < 1e-3
 
 
+@pytest.mark.parametrize(("noise", "frames"), [(0.3, 8), (0.7, 4), (1.2, 4), (2.0, 2)])
+def test_few_codes_take_no_population_for_noisy_pixels(noise: float, frames: int) -> None:
+    rng = np.random.default_rng(9)
+    each = noise * rng.lognormal(0, 0.35, (200, 300))
+    levels = 40.3 + rng.standard_normal(each.shape)
+    variance = np.rint(levels + each * rng.standard_normal((frames, *each.shape))).var(0, ddof=1)
+    same, dof = np.ones_like(variance), frames - 1
+    factor = noisy_factor(1.5, variance, dof, 1.0, unlike=True)
+    expected = max(usual_variance(variance, dof), 0.25) * same
+    found = noisy(variance, dof * same, expected, np.nan * same, 0 * same, factor)
+    assert found.mean() < 1e-3
+    assert variance[~found].mean() > 0.99 * variance.mean()
+
+
 @pytest.mark.parametrize("dof", [2, 4, 7])
 @pytest.mark.parametrize("spread", [0.0, 0.3])
 def test_few_frames_take_no_population_for_noisy_pixels(spread: float, dof: int) -> None:
