@@ -44,7 +44,8 @@ def test_any_ladder_tells_the_gain(steps: list[tuple[float, float]], tmp_path: P
     _, report = reduced(Detector(**CAMERA, flats=ladder(steps)), 1, tmp_path)
     gain = report["gain_e_per_adu"]
     assert gain["measured"] == pytest.approx(2.3, abs=4 * gain["error"])
-    assert gain["error"] < 0.025
+    # Without dim levels the curve from the dark to the flats may bend.
+    assert gain["error"] < (0.03 if steps is BOTH else 0.025)
     assert gain["chi2_reduced"] < 2
     assert report["read_noise_e"]["measured"] == pytest.approx(8.0, rel=0.01)
     assert report["flags"]["good"] >= 96 * 96 - 2
@@ -253,7 +254,8 @@ def test_rounding_leaves_the_spread_of_the_bias(
     camera = Detector(**CAMERA | offset, flats=ladder([(t, 1) for t in LEVELS]))
     _, report = reduced(camera, 3, tmp_path)
     found = report["figures_of_merit"]
-    assert ("read_noise" in found) == (noise > 0.35)
+    told = found["read_noise"]
+    assert abs(told["value"] - 2.3 * noise) < 3 * told["error"] < 0.1 * told["value"]
     value, error = (found["dsnu"][key] for key in ("value", "error"))
     assert abs(value - 2.3 * 0.15) < 3 * error
     assert error < (0.02 if noise > 0.35 else 0.6) * value

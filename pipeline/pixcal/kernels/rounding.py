@@ -13,7 +13,7 @@ from scipy.special import ndtr
 from pixcal.model.arrays import F64
 
 SHEPPARD = 1 / 12  # variance that rounding adds to noise of a step or more
-UNDETERMINED_BELOW = 0.35  # noise below which equal levels do not determine it
+UNDETERMINED_BELOW = 0.35  # noise below which means of few samples do not determine levels
 SMOOTH = 1.0  # noise above which mean and variance do not depend on the level, to 1e-7
 _FRACTIONS = 256
 _REACH = 9.0

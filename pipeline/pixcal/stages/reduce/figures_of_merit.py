@@ -14,7 +14,7 @@ from pixcal.estimators.detector import emva
 from pixcal.estimators.detector.amplifiers import Outputs, differing_outputs
 from pixcal.estimators.detector.emva import Measure, Nonuniformity
 from pixcal.estimators.detector.pair_noise import shared_by_lines
-from pixcal.kernels.rounding import level_before_rounding
+from pixcal.kernels.rounding import UNDETERMINED_BELOW, level_before_rounding
 from pixcal.model.arrays import F64, Mask
 from pixcal.report.text import with_error
 from pixcal.stages.reduce.dark_current import dark_current
@@ -234,7 +234,7 @@ def _dsnu(
     step = quantum or 1e-9
     sigma = summary.noise_before_rounding_e(gain) / gain / step
     own = gain * step * level_before_rounding(halves.dark / step, sigma)
-    if summary.before_rounding is not None:
+    if summary.before_rounding is not None and sigma > UNDETERMINED_BELOW:
         return _spread(found, curves, "dsnu", "e-", own, halves.good)
     other: Json = {}
     _spread(other, {}, "dsnu", "e-", own, halves.good)
