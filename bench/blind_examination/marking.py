@@ -103,7 +103,7 @@ def _marked(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -
     if len(manifest.cases) != len(opened.examination.truths):
         raise InputError(
             f"{folder / FILE}: lists {len(manifest.cases)} cases, --sealed {sealed} of "
-            f"{len(opened.examination.truths)}; one of them is damaged"
+            f"{len(opened.examination.truths)}; one of the two files is damaged"
         )
     # Diagnosed, or failed.
     done = [

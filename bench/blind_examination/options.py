@@ -56,5 +56,5 @@ class ScoreConfig:
     also: tuple[tuple[Path, Path], ...] = quantity(
         (),
         metavar="DIR FILE",
-        doc="Score another examination as well: its directory and file of the truth; repeatable.",
+        doc="Another examination to score: its directory and its file of the truth; repeatable.",
     )

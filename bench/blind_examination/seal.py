@@ -50,8 +50,8 @@ def read_seal(path: Path, commitment: str) -> Sealed:
         raise InputError(f"--sealed {path}: not a sealed file of 'pixcal blind make'; give another")
     if _commitment(plain) != commitment:
         raise InputError(
-            f"--sealed {path}: not the truth that these cases were made with, or changed "
-            "since; give the file that was written with them"
+            f"--sealed {path}: not the truth of these cases, or altered since; give the file that "
+            "was written with them"
         )
     return parse(Sealed, plain, str(path))
 

@@ -57,7 +57,10 @@ def _about(score: Plain) -> str:
         text += f" — **diagnosed by {len(runs['codes'])} versions of the program**"
     seconds = runs["median_seconds"]
     if seconds["diagnosis"] is not None:
-        text += f". A case took {seconds['diagnosis']:.0f} s, its maps {seconds['maps']:.1f} s more"
+        text += (
+            f". Median time of a case: {seconds['diagnosis']:.0f} s, and "
+            f"{seconds['maps']:.1f} s for its maps"
+        )
     if runs["without_maps"]:
         text += f"; {runs['without_maps']} have no maps: the fit failed"
     return text + "."

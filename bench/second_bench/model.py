@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 WARM_UP = 3
-"""Frames of each run that are exposed before the first that is recorded."""
+"""Frames exposed before the first recorded frame of each run."""
 EXPTIME_S = 0.02
 """Of fringes and flats."""
 TOP_ADU = 65535
 MARGIN = 4
-"""Pixels that are simulated on every side of those that are written: the sensor goes on there."""
+"""Pixels simulated beyond each side of the written window, where the sensor continues."""
 
 
 def stream(seed: int, *names: str | int) -> np.random.Generator:

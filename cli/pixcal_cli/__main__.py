@@ -1,4 +1,4 @@
-"""What the shell starts: Ctrl-C ends it in one line, also while the libraries are still loading."""
+"""What the shell starts. Ctrl-C ends it with one line, even while libraries are loading."""
 
 from pixcal_cli.interrupted import leave
 

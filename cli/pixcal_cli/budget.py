@@ -92,7 +92,7 @@ GIVEN: Columns = {
 def _show_bound(
     plan: Mapping[str, Any], option: str, title: str, key: str, columns: Columns
 ) -> None:
-    """What each set gives alone and, for more than one, each axis with all of them."""
+    """Precision of each set alone and, for several sets, of each axis from all of them."""
     if plan[option] is None:
         return
     click.echo(title.format(plan[option]))
@@ -118,7 +118,7 @@ def _show_shares(plan: Mapping[str, Any]) -> None:
 
 def _show_calibration(plan: Mapping[str, Any]) -> None:
     click.echo(
-        "\ncalibration frames for which their noise costs less than 0.1 % more fringe frames"
+        "\ncalibration frames, enough that their noise costs less than 0.1 % more fringe frames"
     )
     columns: Columns = {
         "bias": lambda c: f"{c['bias_frames_needed']} of {c['bias_frames']} planned",

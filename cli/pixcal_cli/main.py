@@ -22,7 +22,7 @@ from pixcal_cli.compare import compare
 from pixcal_cli.interrupted import leave
 
 LONG_WORD = 600
-"""Characters of a word, such as a value that makes no sense, that are not shown in full."""
+"""A longer word of a message, such as a senseless value, is shortened (characters)."""
 
 
 class InOrder(click.Group):
@@ -107,7 +107,7 @@ def one_line(message: str) -> str:
 
 _interrupted = threading.Event()
 PATIENCE_S = 30
-"""After Ctrl-C, for tasks that go on and for locks that Python leaves locked as it is raised."""
+"""Wait after Ctrl-C for running tasks, and for locks that the interrupt leaves locked."""
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

@@ -32,7 +32,7 @@ def show_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
 
 
 def show_records(first: str, records: Mapping[str, Any], columns: Columns) -> None:
-    """Print a row for each record: its name, then what each column makes of it."""
+    """Print a row for each record: its name, then a cell for each column."""
     rows = [(name, *(cell(facts) for cell in columns.values())) for name, facts in records.items()]
     show_table((first, *columns), rows)
 

@@ -306,12 +306,12 @@ def show_astrometry(run: Path) -> None:
 
 
 def show_report(run: Path) -> None:
-    """Print where the page is."""
+    """Print the path of the page."""
     click.echo(f"  {run / 'products' / 'report.html'}")
 
 
 def show_advice(run: Path) -> None:
-    """Print which map to use, what limits it, and what each cause does to it."""
+    """Print which map to use, what limits it, and how each cause affects it."""
     from pixcal.stages.advice import advice  # here: for a fast `pixcal --help`
 
     summary = advice(run)

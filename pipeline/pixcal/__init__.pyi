@@ -167,7 +167,7 @@ def budget(
     Returns
     -------
     dict
-        Contents of ``budget.json``; with ``out`` it goes there, with ``budget.png``.
+        Contents of ``budget.json``, which is also written to ``out`` with ``budget.png``.
 
     Raises
     ------
@@ -440,7 +440,7 @@ def run(
     Returns
     -------
     Run
-        Without fringes in the acquisition it holds only what was measured of the detector.
+        Without fringes in the acquisition, it holds only the measurements of the detector.
 
     Raises
     ------
@@ -482,7 +482,7 @@ def simulate(
     Raises
     ------
     InputError
-        If the bench is wrong, or a directory holds what simulate did not put there.
+        If the bench is wrong, or a directory holds files that simulate did not write.
     """
 
 def write_report(

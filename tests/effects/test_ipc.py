@@ -405,7 +405,7 @@ def test_noise_alone_tells_a_rise_and_names_what_else_may_cause_it(acquired: Acq
     assert isinstance(found.effect, Ipc)
     (per_ke,) = {c.per_ke for c in found.effect.couplings}
     assert abs(per_ke - 0.02) < 4 * found.errors["couplings[0].per_ke"] < 0.02
-    assert found.law.endswith("or else are steady beside brighter_fatter")
+    assert found.law.endswith("or are constant if brighter_fatter acts too")
 
 
 LOOK_ALIKES = ("row_noise", "brighter_fatter", "nonlinearity", "lag", "rolling_shutter")

@@ -237,7 +237,7 @@ def test_a_lamp_that_is_set_anew_does_not_drift(gap: float) -> None:
     ("found", "said"),
     [
         ({"rounded": 0.01}, "of up to 2.6 %, are within half a step (0.005 s) of the exposure"),
-        ({"scatter": 0.01}, "exposure times that are rounded, a lamp that is set anew for each"),
+        ({"scatter": 0.01}, "possible causes: rounded exposure times, a lamp reset for each"),
         ({"drift": 0.026}, "the light of the flats changes by up to 2.6 %, as the frames of each"),
     ],
 )

@@ -696,7 +696,7 @@ def test_bad_files_are_named_first(acquisition: Path, tmp_path: Path) -> None:
     other = acquisition / "v/f8.fits"
     other.write_text("not an image")
     message = refused(acquisition, tmp_path / "run")
-    assert "(1 more files are bad)" in message
+    assert "(1 more bad files)" in message
 
 
 @pytest.mark.usefixtures("nothing_is_read")

@@ -115,7 +115,7 @@ def test_stamped_cube_of_unknown_rhythm_is_numbered() -> None:
     assert found["file"] == ["b", "b", "a", "a"]
     assert found["time_s"] == [0, 1, 2, 3]
     assert found["mjd"] == [60000.0, None, 60001.0, None]
-    assert "frames have numbers in place of times" in " ".join(warnings)
+    assert "frames are numbered, without times" in " ".join(warnings)
     # The pace of bias frames is nothing that their owner need give.
     _, warnings = table([frame_file("a", 60000.0, 2), frame_file("b", 60001.0, 2)], array="bias")
     assert warnings == []

@@ -177,7 +177,7 @@ def test_a_file_cut_short_is_refused_by_name(tmp_path: Path, name: str, share: f
         ("file,EXPTIME\nc.tif,1\n", "line 2: 'c.tif' matches no frame"),
         ("file,EXPTIME\nb.tif,one\n", "line 2: EXPTIME 'one' is not a valid number"),
         ("file,EXPTIME\nb.tif,-1\n", "line 2: EXPTIME '-1' is not a valid number"),
-        ("file,EXPTIME\nb.tif,1\nb*,2\n", "line 3: b.tif has a header already"),
+        ("file,EXPTIME\nb.tif,1\nb*,2\n", "line 3: b.tif is matched by two lines"),
         ("", "the columns are missing"),
     ],
 )

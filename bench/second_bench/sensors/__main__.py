@@ -17,9 +17,18 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--truth", type=Path)
     parser.add_argument("--size", type=int, nargs=2, default=(257, 383))
-    parser.add_argument("--ladder", choices=LADDERS, help="else by the seed")
-    parser.add_argument("--bias", type=int, default=0, help="frames; 0: by the seed")
-    parser.add_argument("--flats", type=int, default=0, help="of one level beside the ladder")
+    parser.add_argument(
+        "--ladder",
+        choices=LADDERS,
+        help="exposure-time steps of the flats; default: drawn from the seed",
+    )
+    parser.add_argument("--bias", type=int, default=0, help="bias frames; 0: drawn from the seed")
+    parser.add_argument(
+        "--flats",
+        type=int,
+        default=0,
+        help="flats of one level, in addition to the exposure-time steps",
+    )
     parser.add_argument("--list", action="store_true", help="list the kinds")
     asked = parser.parse_args(arguments)
     if asked.list:

@@ -86,8 +86,7 @@ def calibrate(
 
     Raises
     ------
-    InputError
-        If arrays do not go together, a value is out of range, ``out`` is not empty, or the frames
+    InputError If arrays do not match, a value is out of range, ``out`` is not empty, or the frames
         hold no fringes that can be fitted.
     """
     stacks = _stacks(frames, bias, darks or {}, flats or {}, exptime_s)
@@ -145,7 +144,7 @@ def _stacks(
         if array.shape[1:] != window:
             raise InputError(
                 f"{name}: frames of {array.shape[1:]} pixels (y, x), where the first array has "
-                f"{window}; all frames have one size"
+                f"{window}; all frames must have the same size"
             )
         found[file] = array, seconds
     return found
@@ -172,12 +171,12 @@ def _describe(
     detector: dict[str, Any],
     optics: dict[str, Any],
 ) -> Acquisition:
-    """What a bench writes into ``acquisition.yaml``."""
+    """Contents of ``acquisition.yaml``."""
     names = [file.removeprefix("fringes/") for file in stacks if file.startswith("fringes/")]
     if unequal := set(names) ^ set(baselines_mm):
         raise InputError(
-            f"baselines_mm: {', '.join(sorted(unequal))}: each set of frames needs its baseline, "
-            "by the same name"
+            f"baselines_mm: {', '.join(sorted(unequal))}: each set of frames needs a baseline of "
+            "the same name"
         )
     kinds = {
         kind: [f"{kind}/*.fits"]

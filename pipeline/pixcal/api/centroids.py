@@ -29,18 +29,17 @@ def correct_centroids(
         Full width at half maximum of the stars.
     electrons : float, optional
         Of a star, if the centroids were fitted with weights of its photon noise; by default all
-        pixels of the fit count alike.
+        pixels of the fit have equal weights.
 
     Returns
     -------
-    x, y, error_x, error_y : (n,) float64
-        Corrected places, and what the errors of the maps leave in them, px, 1 sigma; NaN off the
-        detector, and where masked pixels carry more than 10 % of the position information.
+    x, y, error_x, error_y : (n,) float64 Corrected positions, and their errors from those of the
+        maps, px, 1 sigma; NaN off the detector, and where masked pixels carry more than 10 % of the
+        position information.
 
     Raises
     ------
-    InputError
-        If the run has no maps, the width is out of range, or x and y do not go together.
+    InputError If the run has no maps, the width is out of range, or x and y have different lengths.
     """
     from pixcal.stages import centroids as stage  # here, as in `pixcal.api.commands`
 

@@ -2,7 +2,7 @@
 
 The keywords of a function are the fields of the dataclass of its command's options.
 
-Stages are imported when they are called, as the shell commands do: to open a run is quick.
+Stages are imported when they are called, so that opening a run is quick.
 """
 
 import functools
@@ -86,8 +86,8 @@ def function_of(
 ) -> Callable[..., T]:
     """The function of a command, which takes the fields of its options as keywords.
 
-    What is given is checked as a file's keys are. Signature and docstring list every option;
-    type checkers find them in ``pixcal/__init__.pyi``, which ``make doc-pages`` writes.
+    Arguments are checked like the keys of a file. Signature and docstring list every option; type
+    checkers find them in ``pixcal/__init__.pyi``, which ``make doc-pages`` writes.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ run = function_of(
     of.Run,
     _all_steps,
     "a file, key or option is wrong. A diagnosis or correction that is not possible is a warning",
-    "Run\n    Without fringes in the acquisition it holds only what was measured of the detector.",
+    "Run\n    Without fringes in the acquisition, it holds only the measurements of the detector.",
 )
 ingest = function_of(of.Ingest, _ingest, "a file, key or option is wrong")
 reduce = function_of(
@@ -217,11 +217,11 @@ budget = function_of(
     of.Budget,
     _budget,
     "the bench cannot be read, or its frames determine nothing",
-    "dict\n    Contents of ``budget.json``; with ``out`` it goes there, with ``budget.png``.",
+    "dict\n    Contents of ``budget.json``, which is also written to ``out`` with ``budget.png``.",
 )
 simulate = function_of(
     of.Simulate,
     _simulate,
-    "the bench is wrong, or a directory holds what simulate did not put there",
+    "the bench is wrong, or a directory holds files that simulate did not write",
     "Path\n    The acquisition.",
 )

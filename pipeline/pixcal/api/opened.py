@@ -54,7 +54,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class OffsetMap:
-    """A map of offsets, as the product of the same name holds it.
+    """A map of offsets: the contents of the product of the same name.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class Contents(cached_property[dict[str, Any]]):
 class Run:
     """A run directory, opened. Arrays and tables are read on first use and kept.
 
-    It can stand wherever a path of a run is asked for.
+    It is accepted wherever the path of a run is.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class Run:
 
     @cached_property
     def acquisition(self) -> Acquisition:
-        """The contents of ``acquisition.yaml`` as they were understood."""
+        """The contents of ``acquisition.yaml`` as understood, defaults included."""
         require(self.path, "ingest")
         return read_acquisition(self.path)
 
@@ -227,7 +227,7 @@ class Run:
 
 
 class Stored(cached_property[T]):
-    """An array of a `FringeSet`, of its own name: read on first use and kept."""
+    """An array of a `FringeSet`, by its attribute name: read on first use and kept."""
 
     def __init__(self) -> None:
         super().__init__(lambda fringes: fringes._array(self.attrname))

@@ -12,7 +12,7 @@ PLACES = (PACKAGE / "samples", PACKAGE.parents[1] / "data_samples")
 def sample_acquisition() -> Path:
     """Folder of the sample acquisition: 96 x 80 pixels, 240 frames of each of two fringe sets.
 
-    It is simulated, from ``configs/demo.yaml`` of the sources; the truth lies beside it, in
+    It is simulated, from ``configs/demo.yaml`` of the sources; the truth is beside it, in
     ``demo-truth``.
 
     Returns
@@ -22,8 +22,7 @@ def sample_acquisition() -> Path:
 
     Raises
     ------
-    InputError
-        If this installation has left it out.
+    InputError If this installation lacks it.
     """
     for place in PLACES:
         if (place / "demo" / "acquisition.yaml").is_file():

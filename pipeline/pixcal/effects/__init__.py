@@ -2,7 +2,7 @@
 
 A new one is a file here with one subclass of `pixcal.simulation.effect.Effect`, and its test. One
 that is not part of pixcal is such a file anywhere (`pixcal.simulation.own_effect`). The pages in
-docs/reference/effects/ tell what each effect is, and how it is measured and corrected.
+docs/reference/effects/ describe each effect, and how it is measured and corrected.
 """
 
 import difflib
@@ -31,7 +31,7 @@ def effects() -> dict[str, type[Effect]]:
 
 
 def known_effects(own: Iterable[Path] = ()) -> dict[str, type[Effect]]:
-    """All effects by name, also of own files; InputError if the name of one is taken."""
+    """All effects by name, those of own files included; InputError if a name is taken twice."""
     known = dict(effects())
     for file in own:
         effect = effect_of_file(file)

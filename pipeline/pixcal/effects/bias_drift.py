@@ -1,4 +1,4 @@
-"""Offset of the whole frame: it jumps from frame to frame, wanders, and settles as things warm."""
+"""Offset of the whole frame: it varies from frame to frame, drifts, and settles during warm-up."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -133,7 +133,7 @@ class BiasDrift(Effect):
         return self.run_ramp_e_h * time_s / HOUR_S + self.run_walk_e_h * walk
 
     def replayed(self, evidence: Evidence) -> Self | None:
-        """As in `Effect.replayed`: slow offsets and jitter of fringes; all of dark frames."""
+        """As in `Effect.replayed`: slow offsets and jitter of fringes; all offsets of darks."""
         light = light_of(evidence)
         lit, jitter = ([], self.jitter_rms) if light is None else fringe_courses(light)
         tracks = [_with_level(Track.of(name, time, e), evidence) for name, time, e in lit]
@@ -153,7 +153,7 @@ class BiasDrift(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Levels of frames without light against time; of fringes, what moves B and not A."""
+        """Levels of frames without light against time; in fringe frames, changes of B without A."""
         through, in_runs = cls._through(evidence), cls._in_runs(evidence)
         found = [e for e in (through, in_runs) if e is not None]
         return max(found, key=lambda e: e.significance, default=None)

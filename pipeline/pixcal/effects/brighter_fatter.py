@@ -1,4 +1,4 @@
-"""Bright pixels shrink: charge that was collected turns away what comes after it."""
+"""Bright pixels shrink, because collected charge deflects the charge that follows."""
 
 from dataclasses import dataclass
 
@@ -106,7 +106,7 @@ class BrighterFatter(Effect):
         along_y = 1.0
         if not evidence.fringes:
             size, variance, along_y, significance = _by_axis(noise)
-            why += ", as crosstalk would cause whose share grows from zero"
+            why += ", which crosstalk with a share that grows from zero would cause as well"
         else:
             shift, of_shift, _ = boundaries_beside(evidence, falloff)
             if _agree(noise, shift, of_shift):

@@ -1,4 +1,4 @@
-"""Charge that traps of a CCD hold back while it is transferred to the output."""
+"""Charge that traps in a CCD hold back during its transfer to the output."""
 
 import math
 from dataclasses import dataclass
@@ -36,7 +36,10 @@ class ChargeTransfer(Effect):
     )
 
     rows: float = quantity(
-        3e-5, low=0, high=0.01, doc="share of level_e that a transfer from row to row leaves behind"
+        3e-5,
+        low=0,
+        high=0.01,
+        doc="share of the charge level_e that each transfer from row to row leaves behind",
     )
     columns: float = quantity(0.0, low=0, high=0.01, doc="the same from column to column")
     row_release_px: float = quantity(
@@ -52,10 +55,13 @@ class ChargeTransfer(Effect):
     output_row: int = quantity(0, unit="px", doc="row next to the output, on the chip")
     output_column: int = quantity(0, unit="px", doc="column next to the output, on the chip")
     power: float = quantity(
-        0.6, low=0, high=1.5, doc="power of the charge that the charge left behind goes with"
+        0.6,
+        low=0,
+        high=1.5,
+        doc="exponent: the charge left behind is proportional to this power of the charge",
     )
     level_e: float = quantity(
-        10_000.0, unit="e-", above=0, high=1e7, doc="charge that rows and columns refer to"
+        10_000.0, unit="e-", above=0, high=1e7, doc="charge for which rows and columns are given"
     )
 
     @property
@@ -113,8 +119,7 @@ class ChargeTransfer(Effect):
             made,
             errors,
             trailing(evidence),
-            "charge trails hot pixels in one direction, the farther they are from the output the "
-            "more",
+            "hot pixels have trails in one direction, which grow with the distance from the output",
             size=size | {"of": f"of {best.level_e:.0f} e- per transfer of {of}"},
         )
 

@@ -12,17 +12,17 @@ from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 
-WHY = "visibility that scatters alike in all sets, as charge without light makes it"
+WHY = "pixel-to-pixel scatter of the visibility, the same in all sets, as dark charge causes"
 SIZE = "scatter of the dark current between pixels"
 _MIN_PIXELS = 200
 
 
 @dataclass(frozen=True)
 class DarkSignal(Effect):
-    """Dark charge that no dark frames tell from light.
+    """Dark charge that cannot be distinguished from light without dark frames.
 
-    Its mean acts like light that does not interfere. What differs from pixel to pixel changes the
-    visibility in all fringe sets alike, in inverse proportion to their light.
+    Its mean acts like light that does not interfere. Its variation over pixels changes the
+    visibility in all fringe sets, in inverse proportion to their light.
     """
 
     name = "dark_signal"
@@ -31,9 +31,7 @@ class DarkSignal(Effect):
     order = 0
     domains = ("space",)
     strengths = ("scatter",)
-    absorbed_because = (
-        "it changes the visibility of a pixel and leaves the phase; record dark frames"
-    )
+    absorbed_because = "it changes the visibility of a pixel but not the phase; record dark frames"
     frames_needed = ("dark",)
     sources = (
         "EMVA Standard 1288, release 4.0 (2021): the dark signal grows with the exposure time",
@@ -56,7 +54,7 @@ class DarkSignal(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """What the visibilities of fringe sets share, as charge in the time of an exposure."""
+        """Common variation of the visibilities of all fringe sets, as charge per exposure time."""
         if not evidence.fringes:
             return None
         if evidence.of_kind("dark"):

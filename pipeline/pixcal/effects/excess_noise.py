@@ -53,7 +53,7 @@ class ExcessNoise(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Photon transfer of flats, where the third moment of their noise shows a register."""
+        """From photon transfer of flats, if the third moment of their noise shows a register."""
         found = shot_share_of_flats(evidence)
         if found is None:
             return None

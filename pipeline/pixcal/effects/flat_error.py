@@ -1,4 +1,4 @@
-"""A flat that is not the pixels' response to the light of the fringes.
+"""A flat that differs from the response of the pixels to the light of the fringes.
 
 Its smooth part is fitted as waves of one length (`ring_power`). A pattern of another form, such as
 interference in the window of the sensor, is measured as the Fourier modes in which both maps stand
@@ -45,7 +45,7 @@ _WAVES = ("wave_x_rad_px", "wave_y_rad_px", "wave_cos", "wave_sin")  # numbers o
 class FlatError(Effect):
     """The response in the fringe frames differs from that in the flats.
 
-    The pattern belongs to the chip, so maps do not hold what `predict` would need.
+    The pattern belongs to the chip, so the maps lack what `predict` would need.
     """
 
     name = "flat_error"
@@ -54,7 +54,9 @@ class FlatError(Effect):
     order = 2
     domains = ("space",)
     strengths = ("pixel_rms", "smooth_rms", "wave_cos", "wave_sin")
-    absorbed_because = "it scales level and fringes of a pixel equally and leaves the phase"
+    absorbed_because = (
+        "it scales level and fringes of a pixel equally and does not change the phase"
+    )
     frames_needed = ("flat", "axis")
     sources = (
         "EMVA Standard 1288, release 4.0 (2021): nonuniformity is stated with the wavelength and "
@@ -81,7 +83,9 @@ class FlatError(Effect):
 
     def __post_init__(self) -> None:
         if len({len(getattr(self, name)) for name in _WAVES}) > 1:
-            raise InputError(f"{', '.join(_WAVES)}: give as many numbers of each, one for a wave")
+            raise InputError(
+                f"{', '.join(_WAVES)}: give the same number of values for each, one per wave"
+            )
 
     def ratio(self, detector: SimulatedDetector, rows: Rows) -> F32:
         """Response to the fringes over the flat (y, x), on rows of the window."""
@@ -120,7 +124,7 @@ class FlatError(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """What iota and alpha share, divided by flats, beyond their light's shape."""
+        """Structure common to iota and alpha, over the flats and less the shape of the light."""
         flats = _two_flats(evidence)
         sets = [f for f in evidence.fringes.values() if len(f.g) >= _MIN_FRAMES]
         good = evidence.good & np.all([f.good for f in sets], axis=0)

@@ -1,4 +1,4 @@
-"""Fringes of a parasitic reflection: light that comes a second time, by way of a glass plate."""
+"""Fringes of a parasitic reflection: light that arrives again after reflection in a glass plate."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

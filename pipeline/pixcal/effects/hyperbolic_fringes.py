@@ -18,7 +18,7 @@ from pixcal.simulation.recording import Recording
 
 @dataclass(frozen=True)
 class FibrePair:
-    """Where the fibre pair of one fringe set stands."""
+    """Position of the fibre pair of one fringe set."""
 
     set: str = quantity(doc="name of the fringe set")
     foot_mm: tuple[float, float] = quantity(
@@ -44,7 +44,7 @@ class HyperbolicFringes(Effect):
     frames_needed = ("axis",)
     sources = (
         "Rousset et al., section 5.2 and figures 5, 14 and 15: fibres at 40 cm, (18 mm, 18 mm) "
-        "from the middle of the window",
+        "from the centre of the window",
         "Born & Wolf, Principles of Optics, section 7.3: fringes of two point sources",
     )
 

@@ -20,7 +20,7 @@ from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
 
 REPEAT = 0.002  # assumed relative agreement of the visibilities of two fibre pairs
-_ALIKE = "the visibility scatters alike in sets of crossed fringes"
+_ALIKE = "the visibility scatters equally in sets of crossed fringes"
 SHARED = f"{_ALIKE}, which pixel widths do not cause"
 UNTESTED = f"{_ALIKE}; a second fringe period along an axis shows whether pixel widths cause it"
 _MIN_PIXELS = 200
@@ -33,7 +33,7 @@ _SQUARE = 1e-4  # the same of its square, px²
 class IntraPixelResponse(Effect):
     """Each pixel responds uniformly over a width along x and y, which differs from pixel to pixel.
 
-    Lithography varies both widths by themselves, charge diffusion both alike.
+    Lithography varies the two widths independently, charge diffusion equally.
 
     `predict` and `undo` take the mean width.
     """

@@ -139,7 +139,7 @@ class Ipc(Effect):
         law = f"a kernel of {len(couplings)} couplings, all significant"
         if kernel.per_ke[0]:
             law += f", whose shares change by {100 * kernel.per_ke[0]:+.3g} % per ke-"
-            law += ", or else are steady beside brighter_fatter" * kernel.either
+            law += ", or are constant if brighter_fatter acts too" * kernel.either
         return Estimate(
             cls(couplings),
             errors,
@@ -179,7 +179,7 @@ class Ipc(Effect):
         )
 
     def measured_again(self, parts: Iterable[Evidence]) -> Estimate | None:
-        """All couplings within two pixels, and those found beyond, with the period found before."""
+        """All couplings within two pixels and those detected beyond, with the known period."""
         # Shares that are not significant are shrunk by their errors.
         if not self.couplings or any(c.per_ke for c in self.couplings):
             return None
@@ -195,7 +195,7 @@ class Ipc(Effect):
         )
 
     def phase_slopes(self, maps: FringeMaps) -> F64:
-        """As in `Effect.phase_slopes`: a receiver loses a share of its source's fringe."""
+        """As in `Effect.phase_slopes`: a receiver's fringe contains a share of its source's."""
         flat = 1.0 if maps.flat is None else maps.flat
         z = (maps.theta[2] + 1j * maps.theta[1]) * flat
         found = np.zeros((len(self.couplings), *z.shape))

@@ -38,10 +38,10 @@ class Lag(Effect):
     """Part of the charge of a frame appears in later frames.
 
     Before the first frame of a recording the pixels were empty, or held what earlier recordings
-    left (`carried`). A barrier may hold back another share of each band of the
-    level; traps take charge as long as they have room (`capacity_e`). Maps show nothing of it: the
-    frame before is a sum of the same maps. `lost` takes the release by frames (`decay_frames`,
-    `later`), not by `decay_s`.
+    left (`carried`). The share may depend on the level (bands), as behind a barrier; traps take
+    charge until they are full (`capacity_e`). Maps do not show it, because the previous frame is a
+    sum of the same maps. `lost` takes the release by frames (`decay_frames`, `later`), not by
+    `decay_s`.
     """
 
     name = "lag"
@@ -51,7 +51,8 @@ class Lag(Effect):
     domains = ("time", "intensity")
     strengths = ("share",)
     absorbed_because = (
-        "the fit absorbs a uniform lag; its variation moves phases by hundredths of the bound"
+        "the fit absorbs a uniform lag; its variation shifts phases by hundredths of the "
+        "Cramér-Rao bound"
     )
     optional_parameters = ("decay_frames", "spread", "quiet", "carried", "decay_s", "slow_part")
     frames_needed = ("random",)
@@ -254,11 +255,12 @@ class Lag(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Contrast of a frame by the step of the phase since the one before; pixels that differ.
+        """From the contrast of frames against the phase step, and from pixels that differ.
 
-        What stays lowers the contrast by ``share (1 - cos step)``. Pixels with another share than
-        the rest leave the frame before in their residuals; the frame after is the control. Without
-        fringes the level of darks after light tells, or else the first flat of each level.
+        Charge left behind lowers the contrast by ``share (1 - cos step)``. Pixels with a share
+        unlike the rest have the previous frame in their residuals; the next frame is the control.
+        Without fringes, the level of darks after light or else the first flat of each level is
+        used.
         """
         if not evidence.fringes:
             return cls._without_fringes(evidence)
@@ -320,7 +322,7 @@ class Lag(Effect):
         before = "charge of the frame before"
         if not carried:
             pairs = all(len(s.adu) < _TELL_LAMP for s in evidence.ladder)
-            before = "a clear; a shutter or lamp that gives the first frame less light looks "
+            before = "clearing; a shutter or lamp that gives the first frame less light looks "
             before += "the same: take darks at once after flats"
             before += ", and three flats per level" if pairs else ""
         return _estimate(
@@ -332,7 +334,7 @@ class Lag(Effect):
 
 
 def _estimate(lag: Lag, errors: dict[str, float], sigmas: float, why: str) -> Estimate:
-    """An estimate whose size tells the share, and the decay where it is known."""
+    """An estimate whose size states the share and, where known, the decay."""
     of, decays = "of the signal", {"decay_s": (lag.decay_s, "s")}
     if not lag.later:
         decays["decay_frames"] = lag.decay_frames, "frames"

@@ -1,4 +1,4 @@
-"""Response of the pixel and its amplifier that is not a straight line."""
+"""Nonlinear response of the pixel and its amplifier."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

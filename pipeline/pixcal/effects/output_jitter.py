@@ -1,4 +1,4 @@
-"""Levels of the outputs that read parts of the detector: each varies from frame to frame."""
+"""Levels of the outputs of the detector: each varies separately from frame to frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ _LEAST = 1e-9  # least noise of a level, e-², as frames may be equal
 
 @dataclass(frozen=True)
 class OutputJitter(Effect):
-    """Each of several outputs, which read rectangles of pixels, has a level that varies alone."""
+    """Each output reads a rectangle of pixels; its level varies independently of the others."""
 
     name = "output_jitter"
     title = "output offsets that vary from frame to frame"
@@ -47,8 +47,8 @@ class OutputJitter(Effect):
     frames_needed = ("dark",)
     remedy = "in each frame, subtract the level of each output measured on dark or overscan pixels"
     sources = (
-        "Rauscher 2015, PASP 127, 1144: the outputs of an infrared array have noise of their own "
-        "beside what they share",
+        "Rauscher 2015, PASP 127, 1144: each output of an infrared array has noise of its own in "
+        "addition to common noise",
     )
 
     output_rms: float = quantity(
@@ -96,7 +96,7 @@ class OutputJitter(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Edges at which the means of lines part anew in each frame, and levels between them."""
+        """From edges where means of lines differ anew in each frame, and levels between them."""
         stacks = [s for s in unlit_stacks(evidence, "bias", "dark") if len(s.adu) >= MIN_FRAMES]
         gain = np.float32(evidence.gain)
         rests = [(s.adu - s.adu.mean(axis=0)) * gain for s in stacks]

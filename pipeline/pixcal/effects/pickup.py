@@ -1,7 +1,7 @@
-"""Tones that the electronics pick up while a frame is read, of another phase in each frame.
+"""Tones that the electronics pick up while a frame is read; their phase differs in each frame.
 
-The strongest are taken off the differences of frames, and the rest is searched again (CLEAN:
-Högbom 1974, A&AS 15, 417).
+The strongest tones are subtracted from the differences of frames, and the rest is searched again
+(CLEAN: Högbom 1974, A&AS 15, 417).
 """
 
 from dataclasses import dataclass
@@ -243,7 +243,7 @@ def _refined(frames: F32, tone: F64) -> F64:
 
 
 def _apart(tone: F64, others: F64, shape: tuple[int, ...]) -> bool:
-    """Whether a tone is so far from others, and from the same waves in reverse, as to differ."""
+    """Whether a tone is resolved from others and from their mirror images."""
     same = np.concatenate([others, -others, [0, 1] - others])
     away = np.hypot(*((same - tone) * shape[1:]).T)
     return bool((away > _DISTINCT).all())

@@ -1,4 +1,4 @@
-"""The converter: steps that are coarser than the file's, and codes that are not equally wide."""
+"""The converter: steps coarser than those of the file, and codes of unequal width."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -47,7 +47,7 @@ class Quantisation(Effect):
     order = 2
     domains = ("noise", "intensity")
     strengths = ("coarse_adu", "dnl_rms", "ripple", "bits", "widths")
-    left_because = "rounding adds noise of some hundredths of the bound"
+    left_because = "rounding adds noise of a few hundredths of the Cramér-Rao bound"
     frames_needed = ("ladder",)
     remedy = (
         "fix on the bench: raise the analogue gain until the noise exceeds a step between codes"
@@ -57,7 +57,7 @@ class Quantisation(Effect):
         "Widrow and Kollar 2008, Quantization Noise, Cambridge University Press: when round-off is "
         "noise that does not depend on the signal",
         "cameras of 14 bits that write 16 shift their codes by 2: steps of 4 ADU; differential "
-        "nonlinearity of 0.3 to 0.5 codes is what data sheets of converters promise",
+        "nonlinearity of 0.3 to 0.5 codes is typical of data sheets",
     )
 
     coarse_adu: float = quantity(
@@ -94,13 +94,13 @@ class Quantisation(Effect):
         0.0,
         low=0,
         high=1,
-        doc="share of a threshold that the level of the code below sets; 0: a bit is taken if it "
-        "fits; 0.5: the nearest level is taken",
+        doc="how a bit is decided; 0: it is kept if its level does not exceed the signal; 0.5: "
+        "the nearest level is chosen",
     )
     any_code: bool = quantity(
         False,
-        doc="whether that is the code of the next lower level, where levels of wrong bits overlap; "
-        "else it is the code before",
+        doc="whether any code may be chosen where wrong bits make levels overlap; otherwise only "
+        "a neighbouring code",
     )
     widths: tuple[float, ...] = quantity(
         (),
@@ -180,7 +180,7 @@ class Quantisation(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Step by the codes that never come, widths by how often the others do.
+        """Step from the codes that never occur, widths from the counts of the others.
 
         None where samples are no whole numbers, or too few.
         """

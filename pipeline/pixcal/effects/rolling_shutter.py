@@ -64,7 +64,7 @@ class RollingShutter(Effect):
         low=-1,
         high=1,
         doc="phase error as a share of the phase step, at equally spaced "
-        "rows from the first to the last of the window (none, or four and more)",
+        "rows from the first to the last of the window (none, or at least four)",
     )
     of_step: str = quantity(
         "last",
@@ -150,7 +150,7 @@ class RollingShutter(Effect):
         return found[1] - found[0]
 
     def undo(self, maps: FringeMaps) -> FringeMaps | None:
-        """Maps corrected for the rows' other phases; None if frames are unknown."""
+        """Maps corrected for the phase errors of the rows; None if frames are unknown."""
         if maps.frames is None:
             return None
         flat = 1.0 if maps.flat is None else maps.flat
@@ -229,7 +229,7 @@ class RollingShutter(Effect):
 
     @classmethod
     def _mixed(cls, sets: list[RowSums]) -> Estimate:
-        """Estimate of light of two frames in the exposure of a row."""
+        """From light of two frames in the exposure of a row."""
         sums = [RowRamp.of(sets, way) for way in (1, -1)]
         following, last = (s.slope / s.error for s in sums)
         ramp, found = sums[int(last > max(following, 4.0))], sets[0].found

@@ -52,8 +52,8 @@ class RowNoise(Effect):
     sources = (
         "Rauscher 2015, PASP 127, 1144: infrared arrays of 5 e- read noise have 3 e- of correlated "
         "flicker noise, and 0.5 e- of noise of alternate columns",
-        "EMVA 1288 release 4.0 (2021): row and column parts are measured apart from the pixels'; "
-        "taken here as a tenth of a read noise of 16 e-",
+        "EMVA 1288 release 4.0 (2021): row and column parts are measured separately from that of "
+        "the pixels; assumed here: a tenth of a read noise of 16 e-",
     )
 
     row_rms: float = _rms(1.6, doc="white noise from row to row, rms")

@@ -1,4 +1,4 @@
-"""Light that does not interfere: laser light scattered in the bench, of a smooth pattern."""
+"""Light that does not interfere: laser light scattered in the bench, with a smooth pattern."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -69,7 +69,8 @@ class Straylight(Effect):
     sources = (
         "Rousset et al., eq. 3: straylight is a part of the mean term B iota",
         "Harvey et al. 2012, Opt. Eng. 51, 013402: a clean surface of 2 nm rms scatters "
-        "(4 pi 2 / 633)^2 = 0.16 %; black walls reflect some per cent of what misses the detector",
+        "(4 pi 2 / 633)^2 = 0.16 %; black walls reflect a few per cent of the light "
+        "that misses the detector",
     )
 
     share: float = quantity(

@@ -26,7 +26,7 @@ _ENOUGH = 20
 _HOT = 4.0
 _WIDE = 16
 _FRAMES_AT_ONCE = 256
-_LAW = "amplitudes of a gamma distribution, all pixels as often in the upper level"
+_LAW = "amplitudes of a gamma distribution, all pixels equally often in the upper level"
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class TelegraphNoise(Effect):
     order = 1
     domains = ("noise",)
     strengths = ("amplitude_e",)
-    left_because = "such pixels have larger errors, and SIGMA shows them"
+    left_because = "such pixels have larger errors, which SIGMA includes"
     frames_needed = ("dark",)
     remedy = "exclude the pixels flagged noisy, and take medians over frames"
     quick = False
@@ -134,7 +134,7 @@ class TelegraphNoise(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Pixels noisier than the rest whose noise is telegraph noise by its shape."""
+        """From pixels noisier than the rest, if the shape of their noise is telegraph noise."""
         series = _series(evidence)
         if not series:
             return None

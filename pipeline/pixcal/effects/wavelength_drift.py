@@ -85,7 +85,7 @@ class WavelengthDrift(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Ramp and walk as of `Effect`, and the number of significant mode hops."""
+        """Ramp and walk as by `Effect`, and the significant mode hops."""
         motion, slow = motion_of(evidence), fit_frames(cls, evidence, leave=("hop",))
         if motion is None or slow is None:
             return None

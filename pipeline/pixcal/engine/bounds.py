@@ -28,7 +28,7 @@ class _Compiling(event.Listener):  # type: ignore[misc]
         self._began: dict[int, list[float]] = {}  # kernels may be compiled within others
 
     def on_start(self, event: event.Event) -> None:
-        """Note the start of a compilation."""
+        """Record the start of a compilation."""
         self._began.setdefault(threading.get_ident(), []).append(time.thread_time())
 
     def on_end(self, event: event.Event) -> None:

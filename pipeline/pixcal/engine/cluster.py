@@ -56,7 +56,7 @@ def run_on_cluster(
     """Run tasks on a cluster; ``ended`` gets the number and result of each.
 
     InputError: no scheduler, or workers lack files or versions; ClusterError: the scheduler is
-    lost, or a task kills workers again and again.
+    lost, or a task kills workers repeatedly.
     """
     if not items:
         return

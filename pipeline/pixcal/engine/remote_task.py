@@ -178,5 +178,5 @@ def _compare(wanted: dict[str, str]) -> None:
         if name not in free and there[name] != here:
             raise InputError(
                 f"the worker on {there[MACHINE]} has {name} {there[name]}, this process {here}; "
-                "install the same there and start it again"
+                "install the same version there and restart the worker"
             )

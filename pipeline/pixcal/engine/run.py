@@ -46,8 +46,8 @@ class Runtime(Running):
     cluster : str
         ``threads``, ``processes``, ``sync``, or the address ``tcp://…`` of a Dask scheduler.
     workers : int
-        Local threads or processes; 0 means as many as there are cores. On a Dask cluster, tasks
-        that each of its workers does at the same time; 0 means as many as it has threads.
+        Local threads or processes; 0 means as many as there are cores. On a Dask cluster,
+        simultaneous tasks of each worker; 0 means as many as it has threads.
     memory : int
         Bytes that the whole stage may use on this machine. Dask workers have their own limits.
     quiet : bool
@@ -99,7 +99,7 @@ def one_blas_thread() -> AbstractContextManager[Any]:
 
 @lru_cache(maxsize=1)
 def _libraries(modules: int) -> ThreadpoolController:
-    """Libraries with threads, cached by the number of imported modules: the search is slow."""
+    """Libraries that use threads; the slow search is repeated only after further imports."""
     return ThreadpoolController()
 
 
@@ -157,7 +157,7 @@ def run_in_threads(
 def run_in_processes(
     function: Callable[[Any], Any], items: Sequence[Any], workers: int, ended: Ended
 ) -> None:
-    """Do the tasks in processes, again if one is killed; ClusterError if that goes on and on."""
+    """Do the tasks in processes, again if one is killed; ClusterError if that recurs."""
     packed = pack(function)
     job = Job(packed.data, packed.paths)
     left = dict(enumerate(items))
@@ -184,7 +184,7 @@ def run_in_processes(
             deaths += 1
             if deaths > DEATHS:
                 raise ClusterError(
-                    "--cluster processes: worker processes were killed again and again (out of "
+                    "--cluster processes: worker processes were killed repeatedly (out of "
                     "memory?); give fewer --workers"
                 ) from error
         except BaseException:

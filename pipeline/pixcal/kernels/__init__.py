@@ -14,7 +14,7 @@ import numba
 
 
 def _probe() -> None:
-    """Never called: only the place of its cache matters."""
+    """Never called; it shows where the cache of compiled kernels can be written."""
 
 
 try:

@@ -64,8 +64,8 @@ def moved_charge(charge: F32, shifts: F64, along_y: float = 1.0, light: F32 | No
 
     Within `REACH` of the first and last row it is right only if these are edges of the window.
 
-    charge : (y, x) or (t, y, x) e-, as if boundaries stayed. Beyond the edges it goes on as it is
-        at them; through the edges nothing moves.
+    charge : (y, x) or (t, y, x) e-, as if boundaries stayed. Beyond the edges it continues
+    unchanged; nothing moves through the edges.
     shifts : from `boundary_shifts`, times the shift by an electron (px)
     along_y : shift of the boundaries between rows over that of those between columns
     light : part of the charge that falls on boundaries too; else all

@@ -1,11 +1,11 @@
-"""Coupling between pixels: a pixel loses what it gives to another, so the total is conserved.
+"""Coupling between pixels: a pixel loses what another receives, so the total is conserved.
 
 Couplings are directed and sparse: the pixels of every n-th row and every m-th column give a share
 of their signal to the pixel at a fixed step. Nothing crosses the edge of the window: a pixel whose
-partner lies beyond keeps its own (as at the edge of the chip).
+partner is outside keeps its signal (as at the edge of the chip).
 
-A uniform light stays uniform only where every pixel gets what it gives; a kernel that differs from
-row to row leaves rows in a flat.
+Uniform light gives a uniform signal only if every pixel gains as much as it loses; a kernel that
+differs from row to row leaves rows in a flat.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,7 +36,7 @@ FILL_REACH = 16  # and how far it goes
 class Coupling:
     """A share of the signal of a class of pixels that is read at others.
 
-    Rows and columns are counted from the window's first. The source loses what it gives.
+    Rows and columns are counted from the window's first. The source loses this share.
     """
 
     dy: int = quantity(unit="px", low=-1024, high=1024, doc="rows from source to receiver")
@@ -44,9 +44,11 @@ class Coupling:
     share: float = quantity(
         low=-0.2, high=0.2, doc="share of the signal of the source, at small signals"
     )
-    every_rows: int = quantity(1, low=1, high=1024, doc="sources lie in every n-th row")
+    every_rows: int = quantity(1, low=1, high=1024, doc="period of the rows with sources")
     row: int = quantity(0, low=0, high=1023, doc="the first of these rows")
-    every_columns: int = quantity(1, low=1, high=1024, doc="sources lie in every n-th column")
+    every_columns: int = quantity(
+        1, low=1, high=1024, doc="period of the columns that hold sources"
+    )
     column: int = quantity(0, low=0, high=1023, doc="the first of these columns")
     per_ke: float = quantity(
         0.0, unit="1/ke-", low=-0.02, high=1.0,
@@ -155,9 +157,9 @@ def couple_fringes(
 ) -> F64:
     """Maps theta (3, y, x), e-, of a fit after the couplings (physics note, section 5).
 
-    They are as collected: not divided by a flat. A share that changes with the signal is taken at
-    frames of intensity and amplitude 1: the mean takes the mean of the squared signal, ``iota² +
-    alpha² / 2``, the fringe its slope, ``2 iota alpha``; the second harmonic is not in the maps.
+    They are as collected: not divided by a flat. A share that changes with the signal is evaluated
+    for frames of intensity and amplitude 1: the mean takes the mean of the squared signal, ``iota²
+    + alpha² / 2``, the fringe its slope, ``2 iota alpha``; the second harmonic is not in the maps.
     """
     out = theta.copy()
     for step in _steps(tuple(couplings), theta.shape[1:], first, theta.dtype):

@@ -35,7 +35,7 @@ def since_gap(numbers: Indices, steps: int) -> Mask:
 
 
 def slow_courses(frame: Indices) -> F32:
-    """Orthonormal courses (t, k) of light that drifts slowly, a constant first, by frame number."""
+    """Orthonormal functions (t, k) of the frame number for drifting light, a constant first."""
     past = (frame - frame[0]) / max(int(frame[-1] - frame[0]), 1)
     courses = legvander(2 * past - 1, min(3, (len(frame) - 1) // 8))
     return np.linalg.qr(courses)[0].astype(np.float32)

@@ -8,11 +8,11 @@ sizes, each with the weight of its evidence (MacKay 1992, *Neural Computation* 4
 remaining uncertainty of the curve is in its error.
 
 A camera that reads bright pixels with another amplifier (dual gain) has a step in the curve, which
-no such term describes. Points that leave the curve by far more than their noise are therefore
-fitted up to lower levels too, and the gain is that of the best-determined range.
+no such term describes. If points deviate from the curve by far more than their noise, lower ranges
+are fitted too, and the gain is that of the best-determined range.
 
 Frames without light may differ in noise from flats: a camera clips black, or reads dark pixels with
-another amplifier. The curves without them are part of the average, with a small chance before.
+another amplifier. The average includes curves without them, with a small prior probability.
 """
 
 import math
@@ -188,9 +188,9 @@ def _fit_range(
 
 
 def _offsets(narrow: float, highest: float, apart: float) -> tuple[F64, F64]:
-    """Errors of the variance at level zero, as of frames without light or not, and their chances.
+    """Errors of the variance at level zero, with frames without light or not; their priors.
 
-    Of frames that are read in another way nothing is known but that noise grows with light.
+    For frames read in another way, it is only known that noise grows with light.
     """
     wide = np.geomspace(narrow, max(highest, 2 * narrow), _WIDTHS + 1)
     chances = np.append(1 - apart, np.full(_WIDTHS, apart / _WIDTHS))

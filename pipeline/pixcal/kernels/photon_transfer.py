@@ -1,10 +1,11 @@
 """Photon transfer: noise against level, from pairs of frames. `gain_fit` fits the gain to it.
 
-The difference of two frames of the same scene holds no scene and no response map, only noise. Half
-its variance, in ADU, is ``level / gain + read_variance``. It is measured in blocks of pixels, whose
-level may differ within the block: both sides of that equation are means over the same pixels, and a
-pixel's mean and difference are uncorrelated for Poisson light (given the sum of two Poisson counts,
-the expected square of their difference is that sum), so structured light does not bias the slope.
+The difference of two frames of the same scene contains neither scene nor response map, only noise.
+Half its variance, in ADU, is ``level / gain + read_variance``. It is measured in blocks of pixels,
+whose level may differ within the block: both sides of that equation are means over the same pixels,
+and a pixel's mean and difference are uncorrelated for Poisson light (given the sum of two Poisson
+counts, the expected square of their difference is that sum), so structured light does not bias the
+slope.
 
 Charge that neighbours share lowers the variance of single pixels and raises the measured gain: in
 proportion to the signal with crosstalk (Moore, Ninkov & Forrest 2006), with a curved relation for
@@ -150,7 +151,7 @@ _POWERS = (2.0, 3.0, 6.0)  # of charge that pushes (2, 3), of capacitance
 
 
 def _shared_noise(shares: F64, error: float) -> tuple[F64, float]:
-    """Weight of each of the shares in the noise that all share, and its variance."""
+    """Weight of each share in the common noise, and its variance."""
     # ``shares``: covariances (12,) at `LAGS` over the shot noise, each with this error. The average
     # over sizes and powers, each with the weight of its evidence, as of the gain (`gain_fit`).
     count = len(LAGS)

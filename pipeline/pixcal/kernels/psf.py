@@ -44,7 +44,7 @@ class Psf:
 
     @property
     def peak(self) -> float:
-        """Share of a pixel whose centre is at the star."""
+        """Share of the light received by a pixel centred on the star."""
         return float(self.at(0.0, 0.0)[0])
 
     def at(self, x: ArrayLike, y: ArrayLike) -> F64:

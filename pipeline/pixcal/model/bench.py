@@ -114,7 +114,7 @@ class SimulatedDetector:
         if self.bias_adu >= self.top_adu:
             raise InputError(f"bias_adu: {self.bias_adu:g} ADU leaves no room below saturation")
         if self.hot_fraction + self.dead_fraction > 0.5:
-            raise InputError("hot_fraction: above 0.5 together with dead_fraction; give less")
+            raise InputError("hot_fraction: its sum with dead_fraction exceeds 0.5; give less")
 
     @property
     def chip_shape(self) -> tuple[int, int]:
@@ -289,7 +289,7 @@ class SimulatedFrames:
         counts += [(step.count, step.exptime_s) for step in (*self.darks, *self.flats)]
         seconds = sum(count * max(self.period_s, exptime) for count, exptime in counts)
         if seconds > MAX_DURATION_S or not 1858 < moment.year < 2200:
-            raise InputError(f"start: {self.start!r:.80} and {seconds:g} s from there: not a date")
+            raise InputError(f"start: {self.start!r:.80} and {seconds:g} s later: not a date")
 
     @property
     def start_time(self) -> datetime:

@@ -32,7 +32,7 @@ _MEANINGS = {
     1: "dark signal far above that of the other pixels",
     2: "response far below (or above) that of the neighbours",
     4: "noise in bias or dark frames far above the read noise; telegraph noise included",
-    8: "more than two samples, and more than one in a thousand, are saturated; or flats are",
+    8: "more than two samples, and more than one in a thousand, are saturated, or the flats are",
     16: "deviates from a straight line over the exposure-time steps",
     32: "samples are missing or not finite",
     64: "the fringe model does not describe the pixel (chi-square, or no contrast)",

@@ -138,7 +138,7 @@ def histogram(maps: Sequence[MapContents]) -> Figure:
 def _histogram(
     axes: Axes, offset: MapContents, unit: Unit, colour: str, part: tuple[float, float]
 ) -> None:
-    """A histogram; the band of the noise takes a ``part`` of the height, lest it hide another."""
+    """A histogram; the band of the noise covers a ``part`` of the height, to hide no other."""
     delta, symbol = offset.delta, SYMBOLS[offset.name]
     values = delta.sample.astype(float) * unit.factor
     spread, middle = delta.robust_std * unit.factor, delta.median * unit.factor

@@ -86,7 +86,7 @@ def _count(pixels: int, summary: FlagSummary) -> str:
 
 
 def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
-    """Gain and read noise side by side, the steps of the flats, then what each set was made of."""
+    """Gain and read noise side by side, the steps of the flats, then the input of each set."""
     rows = []
     for key, label in (("gain_e_per_adu", "gain (e⁻/ADU)"), ("read_noise_e", "read noise (e⁻)")):
         entry = facts.get(key)

@@ -41,7 +41,7 @@ EVEN = 0.1
 
 @dataclass(frozen=True)
 class Response:
-    """How a model shows."""
+    """How the effect of a model appears in the deviations."""
 
     random: bool  # its change depends on the random numbers, and is zero on average
     mixes: bool  # it correlates the noise of samples
@@ -57,7 +57,7 @@ class Template:
 
     @classmethod
     def of(cls, one: Draw, other: Draw) -> "Template":
-        """From two draws; identical values are not random."""
+        """From two draws; values identical in both are not random."""
         drawn = [k for k in one if one[k] is not other[k]]
         mean = {k: (one[k] + other[k]) / 2 if k in drawn else one[k] for k in one}
         return cls(mean, {k: (one[k] - other[k]) / 2 for k in drawn})
@@ -128,7 +128,7 @@ class Changes:
         )
 
     def response(self, model: ForwardModel) -> Response:
-        """How a model shows."""
+        """How the effect of a model appears in the deviations."""
         every = [(of, name) for of in self._looks for name in LINEAR]
         draws = [self._linear(model, seed, every) for seed in SEEDS]
         keys = [key for key in every if self._is_sound(key, draws[0])]
@@ -145,7 +145,7 @@ class Changes:
         return Response(random, mixes, tuple(dict.fromkeys([*keys, *(pairs if mixes else ())])))
 
     def _is_sound(self, key: Key, draw: Draw) -> bool:
-        """Whether a change of a deviation is no common change of another origin."""
+        """Whether a change of a deviation is more than a common change of other origin."""
         # Offsets scatter from pixel to pixel in maps. Levels of frames without light drift; they
         # count for a model of whole frames alone.
         of, name = key

@@ -26,13 +26,13 @@ from pixcal.simulation.score import score, score_again
 
 __all__ = ["DOMAINS", "SETS_DISAGREE", "Effect", "Estimate", "FringeMaps", "LightStart", "Stage"]
 
-SETS_DISAGREE = "fringe sets disagree: an effect of the detector acts on all of them alike"
+SETS_DISAGREE = "fringe sets disagree: an effect of the detector acts equally on all of them"
 NONZERO = 3.0  # sigma above which a strength of an effect counts as different from zero
 
 
 @dataclass(frozen=True)
 class FittedFrames:
-    """The frames that maps were fitted to, for effects that depend on their order."""
+    """Frames to which maps were fitted, for effects that depend on their order."""
 
     g: F64  # (t, 3) intensity, and amplitude times cosine and sine of the phase
     # first and number of the rows over which effects along rows extend: those of the window or, if
@@ -209,7 +209,7 @@ class Effect(ForwardModel):
         return None if found is None else found.significance
 
     def read_variance(self, detector: SimulatedDetector) -> float:
-        """Variance (e-²) of samples about the frame's mean that it adds to the read noise."""
+        """Variance (e-²) that it adds to the samples, about the mean of the frame."""
         return 0.0
 
     def noisy_pixels(self, detector: SimulatedDetector) -> Mask:

@@ -73,7 +73,7 @@ class AffectedSeries:
 
 @dataclass(frozen=True)
 class Strength:
-    """One number of a model's strengths, and how it shows."""
+    """One number of a model's strengths, and how it changes the series."""
 
     model: ForwardModel  # of this strength alone
     key: str  # as errors name it

@@ -1,4 +1,4 @@
-"""What an effect carries from frame to frame, wherever a simulation begins."""
+"""State that an effect carries from frame to frame, wherever a simulation begins."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -201,7 +201,7 @@ class _Fit:
         least, whole = TELLING * sum(sizes.values()), self.changes.product(every, mean, mean)
 
         def lost(key: Key) -> float:
-            """Information lost without it: a map without the effect still shows common noise."""
+            """Information lost without a map: even a map without the effect shows common noise."""
             return whole - self.changes.product([k for k in every if k != key], mean, mean)
 
         keys = tuple(k for k in every if max(sizes[k], lost(k)) >= least)

@@ -35,7 +35,7 @@ class Advice:
 
 
 def advice(run_dir: Path) -> Advice:
-    """What fit, diagnosis and correction of a run say together, as far as they were made."""
+    """What fit, diagnosis and correction of a run say together, as far as they exist."""
     fit, correction = _artefact(run_dir, "fit", "fit.json"), _correction(run_dir)
     diagnosis = _artefact(run_dir, "diagnose", "diagnosis.json")
     sigma, causes = _sigma(fit, correction), diagnosis["causes"]
@@ -204,7 +204,7 @@ def _to_distinguish(cause: Json) -> str:
 
 
 def unexplained(diagnosis: Json) -> tuple[tuple[str, ...], ...]:
-    """A row on the largest departure that no cause explains, where there is one."""
+    """A row on the largest departure that no cause explains, if there is one."""
     if diagnosis["verdict"] not in WITH_GAP or not diagnosis["gap"]["where"]:
         return ()
     ranked = sorted(diagnosis["gap"]["where"], key=lambda e: -abs(e["z_after"]))

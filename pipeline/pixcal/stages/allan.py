@@ -212,7 +212,7 @@ def _measure_region(
     if curve.knee is not None and curve.knee > batches.n / 2:
         at = f"{curve.knee * batches.frames:.0f} frames"
         warnings = [
-            f"weak evidence of drift: fitted knee at {at}, more than half the run, not reported"
+            f"weak evidence of drift: fitted knee at {at}, is beyond half the run and not reported"
         ]
         curve = replace(curve, knee=None)
     expected = float(np.median(noise)) / np.sqrt(chosen)

@@ -1,8 +1,8 @@
 """Correction of centroids by the maps of a run: tables, and a WCS distortion.
 
-Offsets are a distortion that FITS readers know: lookup tables before all other transformations,
-``D2IMDIS1`` and ``D2IMDIS2`` of the headers, with their tables in ``D2IMARR`` (Calabretta et al.
-2004, "Representations of distortions in FITS world coordinate systems"; as astropy reads them).
+FITS readers know offsets as a distortion: lookup tables, applied before all other transformations.
+The headers name them by ``D2IMDIS1`` and ``D2IMDIS2``; the tables are in ``D2IMARR`` (Calabretta et
+al. 2004, "Representations of distortions in FITS world coordinate systems"; as astropy reads them).
 """
 
 from pathlib import Path
@@ -33,7 +33,7 @@ from pixcal.storage.stage import read_acquisition
 def read_offsets(run_dir: Path) -> tuple[F32, F32]:
     """Offsets along x and y, corrected ones if any, and errors, (2, y, x), px; NaN if unknown.
 
-    With a single fringe axis, those across it are taken as zero.
+    With a single fringe axis, those across it are assumed to be zero.
     """
     maps = {name: read_map(path)[:2] for name, path in maps_to_use(run_dir).items()}
     if not maps:

@@ -24,9 +24,9 @@ def run(
     step: Step = lambda _name, _folder: nullcontext(),
     note: Callable[[str], object] = lambda _text: None,
 ) -> tuple[bool, bool]:
-    """Run all steps, each in the context that ``step`` gives; whether it was fitted and diagnosed.
+    """Run all steps, each in the context ``step``; return whether the run was fitted and diagnosed.
 
-    ``note`` is told which diagnosis or correction was not possible; that is no error.
+    ``note`` receives the reason if diagnosis or correction is not possible, which is no error.
     """
     of_fit = fit.Config(model=config.model)
     with flushed_last(out):

@@ -113,7 +113,10 @@ def _fringes(
     if step != 1:
         raise ValueError("consecutive frames are needed")
     if (last - first) * (y[1] - y[0]) * (x[1] - x[0]) > MAX_SAMPLES:
-        raise InputError(f"fringe set {name!r}: more than {MAX_SAMPLES} samples; take a part")
+        raise InputError(
+            f"fringe set {name!r}: more than {MAX_SAMPLES} samples; use fewer "
+            "frames or a smaller window"
+        )
     codes = source.signal.read((first, last), y, x).astype(np.uint16, copy=False)
     coding = source.coding
     electrons = coding.electrons(codes)

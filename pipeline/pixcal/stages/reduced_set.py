@@ -1,4 +1,4 @@
-"""One fringe set of ``RUN/reduce`` as the estimators want it."""
+"""One fringe set of ``RUN/reduce``, as input of the estimators."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class ReducedSet:
 
     @property
     def more_bytes(self) -> int:
-        """For each pixel, beyond its codes, while `codes` and `blocks` read a block of frames."""
+        """Bytes per pixel, besides its codes, while `codes` and `blocks` read a block of frames."""
         return 0
 
     @cached_property
@@ -38,7 +38,7 @@ class ReducedSet:
 
     @cached_property
     def _maps(self) -> dict[str, ArrayReader]:
-        """Readers of the maps (y, x), opened once: at a URL that takes its time."""
+        """Readers of the maps (y, x), opened once, because opening is slow at a URL."""
         names = ("read_variance", "shot_factor", "mask")
         return {name: ArrayReader(self.place / name) for name in names}
 

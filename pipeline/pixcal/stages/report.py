@@ -50,7 +50,7 @@ FIGURE_BYTES = 192 << 20  # Matplotlib, one figure and the page
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Write ``RUN/report/report.html`` and ``RUN/products/report.html``.
 
-    Only ``RUN/reduce`` must be there; what the later stages would add is marked as not measured.
+    Only ``RUN/reduce`` is required; missing results of later stages are marked as not measured.
     """
     with working(run_dir, "reduce"):
         manifests = {
@@ -107,7 +107,7 @@ Jobs = dict[tuple[str, str], partial[Any]]  # by kind and name
 
 
 def _jobs(run_dir: Path, fit: Mapping[str, Any] | None, with_allan: bool) -> Jobs:
-    """What is to be read of the maps that the page shows."""
+    """The parts to read of the maps that the page shows."""
     calibration, group = run_dir / "reduce" / "calibration.zarr", run_dir / "fit" / "fit.zarr"
     masks = {"detector": calibration / "mask"}
     jobs: Jobs = {}
@@ -187,7 +187,7 @@ def _optional_json(path: Path) -> dict[str, Any]:
 
 
 def _warnings(manifests: Mapping[str, Manifest], facts: Mapping[str, Any]) -> tuple[str, ...]:
-    """Sentences of the stages, and stages that were made from what is no longer there."""
+    """Warnings of the stages, and stages made from artefacts that have changed since."""
     sentences = []
     for stage, manifest in manifests.items():
         for made_from, key in manifest.inputs.items():

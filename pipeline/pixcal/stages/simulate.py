@@ -299,7 +299,7 @@ class Target:
             folder.parent.mkdir(parents=True, exist_ok=True)
         except (OSError, RuntimeError) as error:  # the latter for circular links
             raise InputError(
-                f"{option} {folder}: cannot be made ({error}); choose another"
+                f"{option} {folder}: cannot be created ({error}); choose another"
             ) from error
         return cls(folder, option, stage)
 

@@ -1,4 +1,4 @@
-"""Work in steps, of which those that an interrupted build has noted are not done again."""
+"""Work in steps; steps already noted by an interrupted build are skipped."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar

@@ -61,7 +61,7 @@ class Treatments:
     every: tuple[Treatment, ...]  # in the order of the diagnosis
 
     def _those(self, how: str) -> tuple[Treatment, ...]:
-        """To correct in one way, the last that acted first."""
+        """Effects corrected in one way; the last to act comes first."""
         matching = [t for t in self.every if t.how == how]
         return tuple(sorted(matching, key=lambda t: t.effect.sort_key, reverse=True))
 
@@ -77,7 +77,7 @@ class Treatments:
 
     @property
     def curved(self) -> bool:
-        """Whether hyperbolic fringes are to be fitted where the fit took straight ones."""
+        """Whether hyperbolic fringes must be fitted where the fit used straight ones."""
         return any(t.how == IN_CORRECTED for t in self.every)
 
     @property

@@ -2,11 +2,11 @@
 
 An artefact, a directory ``RUN/<stage>`` with a ``manifest.json``, is built in
 ``RUN/.partial/<stage>-<key>`` and renamed when complete. The key is a digest of all that the result
-depends on: options, inputs, format, and the version of pixcal. A killed build with the same key,
-begun by the same code to the letter, is resumed; others are removed when one completes.
+depends on: options, inputs, format, and the version of pixcal. A killed build is resumed if key and
+code are the same; other builds are removed when one completes.
 
-An artefact may be complete before it is flushed to disk (`unflushed`). Until then it holds a mark
-with the boot of the machine, and counts as damaged after another boot. Damage is noted in the
+An artefact may be complete before it is flushed to disk (`unflushed`). Until then a file in it
+holds the boot ID of the machine, and it counts as damaged after a reboot. Damage is noted in the
 artefact (`pixcal.storage.manifest`), and its stage makes it again.
 """
 

@@ -1,9 +1,9 @@
 """Cubes (time, y, x) on disk: Zarr 3 arrays in whole, checksummed chunks, one writer per chunk.
 
-zarr-python makes the metadata. Chunks in the same format are read and written here, because its own
-pipeline does not scale with threads. Cubes are in local folders or at URLs. Every chunk contains a
-crc32c; an index beside the array holds its size and crc, and ends with a crc of itself and of the
-metadata. A missing, cut or exchanged chunk is refused.
+zarr-python makes the metadata. Chunks in the same format are read and written here, because the
+pipeline of zarr-python does not scale with threads. Cubes are in local folders or at URLs. Every
+chunk contains a crc32c; an index beside the array holds its size and crc, and ends with a crc of
+itself and of the metadata. A missing, cut or exchanged chunk is refused.
 """
 
 import errno

@@ -82,7 +82,7 @@ def tabulate(
         if array.startswith("fringes"):
             warnings.append(
                 "a cube has no EXPTIME, or zero, and optics.frame_period_s is not given: its "
-                "frames have numbers in place of times"
+                "frames are numbered, without times"
             )
     if stamped:
         frames = _stamped_frames(ordered, steps, frame_period_s)
@@ -144,8 +144,8 @@ def _order(files: Sequence[FrameFile]) -> tuple[list[FrameFile], bool, list[str]
     if twins:
         a, b = (file.source.name for file in twins[0])
         warnings.append(
-            f"{len(twins)} time stamps are the same as the one before ({a} and {b}); "
-            "ordered by file name among themselves"
+            f"{len(twins)} time stamps are the same as the one before ({a} and {b}); these frames "
+            "are ordered by file name"
         )
     return ordered, True, warnings
 

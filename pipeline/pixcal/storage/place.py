@@ -104,7 +104,7 @@ def parse_place(text: str) -> Place:
             raise InputError(f"--cubes {text}: not absolute; write {scheme}:///folder")
         return Path(os.path.abspath(rest))  # noqa: PTH100
     if not re.fullmatch(r"[a-z][a-z0-9+._-]*", scheme):
-        raise InputError(f"--cubes {text}: {scheme!r} is no protocol; write s3://bucket/prefix")
+        raise InputError(f"--cubes {text}: {scheme!r} is not a protocol; write s3://bucket/prefix")
     if not rest.strip("/") or re.search(r"[\s*?\[\]#]", rest):
         raise InputError(
             f"--cubes {text}: no bucket or folder, or one with spaces, '*', '?', '#', '[' or ']'; "

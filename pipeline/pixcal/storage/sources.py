@@ -54,7 +54,7 @@ def read_headers(folder: Path, names: Iterable[str]) -> dict[str, Header]:
                     raise InputError(f"{place}: {row['file']!r:.80} matches no frame; correct it")
                 for name in matched:
                     if name in found:
-                        raise InputError(f"{place}: {name} has a header already; list it once")
+                        raise InputError(f"{place}: {name} is matched by two lines; list it once")
                     found[name] = header
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(

@@ -6,8 +6,8 @@ partner's),
     cov(p, p') = k D + k' D' + constant + b (D² + D'²) / 2
 
 The constant is noise that neighbours share without light (of a row, a column, the whole frame);
-bias frames measure it. The squares are those of boundaries that charge shifts (brighter-fatter),
-and of shares that change with the level. Flats give k + k' only; in fringes D and D' differ, which
+bias frames measure it. The quadratic term describes boundaries shifted by charge (brighter-fatter),
+and shares that change with the level. Flats give k + k' only; in fringes D and D' differ, which
 separates the two.
 
 The products of residuals are summed pixel by pixel, so that they can be combined into classes of
@@ -79,7 +79,7 @@ def products(
 ) -> Products | None:
     """Sum the products of neighbours over all frames; None where no frames have light.
 
-    ``known``: couplings that the frames are freed of first.
+    ``known``: couplings for which the frames are corrected first.
     """
     shape = evidence.good.shape
     right = np.zeros((len(links), len(TERMS), *shape), np.float32)
@@ -144,7 +144,7 @@ def share_and_square(found: Products) -> tuple[F64, F64]:
 
 
 def _weights(part: Residuals) -> Frames:
-    """Few frames that stand for all (one where all are alike), as weights have no noise."""
+    """Few frames that represent all (one if all are equal), because weights have no noise."""
     every = slice(0, part.count, part.count if part.steady else -(-part.count // _ENOUGH))
     weight, charge = part.weight[every], part.charge[every]
     return weight * np.float32((part.count / len(weight)) ** 0.5), charge, part.good

@@ -2,7 +2,7 @@
 
 A hot pixel has dark signal without light, and its neighbours have little of their own: their signal
 is a share of it. Each direction is measured separately, so this method separates a coupling from
-its opposite. A neighbour may itself be warm; so a share counts only where several hot pixels of a
+its opposite. A neighbour may itself be warm, so a share counts only if several hot pixels of a
 class agree.
 """
 
@@ -123,7 +123,7 @@ def hot_pixels(
 ) -> HotPixels | None:
     """Find hot pixels and shares in their neighbours; None where no dark signal was measured.
 
-    ``known``: couplings that the dark signal is freed of first; shares are what is left.
+    ``known``: couplings for which the dark signal is corrected first; shares are the remainder.
     """
     exposures = [s.exptime_s for s in evidence.of_kind("dark") if np.isfinite(s.exptime_s)]
     if not exposures or not np.any(evidence.dark_rate):
@@ -139,7 +139,7 @@ def hot_pixels(
 def hot_pixels_of(
     signal: F64, usable: Mask, links: Sequence[Place], overlap: float = OVERLAP
 ) -> HotPixels | None:
-    """The same of the mean signal (y, x) of darks, e-, of pixels that do not saturate."""
+    """As `hot_shares`, from the mean signal (y, x) of darks, e-, of pixels that do not saturate."""
     rest = signal - median_filter(signal, 2 * REACH + 5, mode="reflect")
     _, noise = median_and_sigma(rest)
     if not noise > 0:

@@ -1,11 +1,11 @@
 """A whole kernel: every coupling within two pixels, shrunk by its error instead of dropped.
 
-All is linear in what remains of the shares once frames, dark signal and maps are freed of the
-couplings known so far (`sources`); a few steps of least squares give the kernel. A share is a sum
-of a part common to all classes and both directions, a part common to all classes in one direction,
-and its own part. The sizes of these parts are learnt from all couplings of a kind (empirical Bayes,
-by expectation and maximisation), which makes undetected parts small. Of all periods, the one of the
-greatest evidence is taken.
+Frames, dark signal and maps are corrected for the couplings known so far (`sources`). All
+measurements are linear in the remaining shares; a few steps of least squares give the kernel. A
+share is a sum of a part common to all classes and both directions, a part common to all classes in
+one direction, and its own part. The sizes of these parts are learnt from all couplings of a kind
+(empirical Bayes, by expectation and maximisation), which makes undetected parts small. The period
+with the greatest evidence is chosen.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -119,7 +119,7 @@ def within(shape: tuple[int, ...], far: Collection[Place] = ()) -> tuple[Place, 
 
 
 def significant(kernel: Kernel) -> tuple[tuple[Coupling, ...], F64]:
-    """The significant couplings, those alike in all classes as one, and their covariance."""
+    """The significant couplings, as one if equal in all classes, and their covariance."""
     each = np.eye(len(kernel.couplings))
     steps: dict[Place, list[int]] = {}
     for n, c in enumerate(kernel.couplings):
@@ -158,11 +158,11 @@ def _sigmas(kernel: Kernel, column: F64) -> float:
 
 
 def _examined(evidence: Evidence) -> tuple[Evidence, Sources | None]:
-    """The pixels examined, and what frames tell of all their links."""
+    """The pixels examined, and what the frames measure of all their links."""
     if trailing(evidence) > SURE:
         raise InputError(
-            "not decided: charge trails hot pixels in one direction, the farther they are from the "
-            "output the more, as incomplete charge transfer leaves it; this is no crosstalk"
+            "not decided: hot pixels have trails in one direction, which grow with the distance "
+            "from the output; this is incomplete charge transfer, not crosstalk"
         )
     if not evidence.fringes:
         evidence = central_crop(evidence, MOST_PIXELS)
@@ -234,7 +234,7 @@ def coupling_of(classes: PixelClasses, number: int, back: int, step: Place) -> C
 
 
 def _shares_of(every: Sequence[Coupling], known: Sequence[Coupling]) -> F64:
-    """Shares of all couplings where some, of shorter periods too, are known."""
+    """Shares of all couplings, given some known ones, which may have a shorter period."""
     shares = np.zeros(len(every))
     for k in known:
         for n, c in enumerate(every):

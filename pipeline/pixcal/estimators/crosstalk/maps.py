@@ -3,7 +3,7 @@
 A pixel that receives the share k from one a step n away has its fringe multiplied by ``1 + k
 (exp(-i K n) - 1)``, whatever the flat, to first order. The real part changes the visibility, the
 imaginary part shifts the offset by ``1 / |K|`` of it. A true displacement is the same at every K,
-so only differences of offsets between sets count, which needs more sets than the two axes. The
+so only differences of offsets between sets count; this needs more than one set per axis. The
 visibility needs one set, if pixels of all classes are equally wide (to within `WIDTH`).
 
 True offsets have a pattern of classes by chance, or a real one, whose size is learnt together with
@@ -34,7 +34,7 @@ MIN_PIXELS = 100
 
 @dataclass(frozen=True)
 class Maps:
-    """Maps of all sets without smooth modes, freed of known couplings."""
+    """Maps of all sets without smooth modes, corrected for known couplings."""
 
     sets: tuple[FringeEvidence, ...]
     good: Mask  # (y, x) pixels with an offset in every set

@@ -1,10 +1,10 @@
 """Residuals of frames, as noise to be correlated between pixels.
 
-Frames are freed of the couplings known so far. Two parts are removed: what is common to the pixels
-of a frame (offset; light, contrast and phase, constant over the window or linear along it), and
-what is common to the frames of a pixel (its level; its fringe with harmonics). Removing the first
-correlates residuals by minus the products of the modes, which are appended as if they were frames.
-Removing the second makes residuals smaller, which is corrected here.
+Frames are corrected for the couplings known so far. Two parts are removed: what is common to the
+pixels of a frame (offset; light, contrast and phase, constant over the window or linear along it),
+and what is common to the frames of a pixel (its level; its fringe with harmonics). Removing the
+first correlates residuals by minus the products of the modes, which are appended as if they were
+frames. Removing the second makes residuals smaller, which is corrected here.
 """
 
 from collections.abc import Iterator, Sequence
@@ -82,7 +82,7 @@ def _of_stack(stack: Stack, evidence: Evidence, known: Sequence[Coupling]) -> Re
 
 
 def _of_fringes(found: FringeEvidence, known: Sequence[Coupling]) -> Residuals:
-    """Fringe frames less the fit, as they were before they were divided by the flat."""
+    """Fringe frames less the fit, before division by the flat."""
     at, good = _spread(len(found.g), found.good.size), found.good
     flat = 1 / found.shot_factor
     found = replace(found, electrons=found.electrons[at], g=found.g[at], dk=found.dk[at])
@@ -110,7 +110,7 @@ def _of_fringes(found: FringeEvidence, known: Sequence[Coupling]) -> Residuals:
 def _noise(
     rest: F32, charge: F32, read: F32, of_time: F32, of_place: F32, good: Mask, steady: bool
 ) -> Residuals:
-    """Residuals (t, n) of the good pixels without what is common to pixels and to frames."""
+    """Residuals (t, n) of the good pixels without the parts common to pixels or to frames."""
     variance = charge + read
     weight = np.where(rest**2 < CLIP**2 * variance, 1 / variance, np.float32(0))
     freedom = TwoWay(weight, of_time, of_place)

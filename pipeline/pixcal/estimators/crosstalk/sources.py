@@ -1,4 +1,4 @@
-"""The sources that measure shares: noise, hot pixels and maps, freed of the couplings known so far.
+"""The sources that measure shares: noise, hot pixels and maps, corrected for known couplings.
 
 Each class of pixels has two unknown shares for a link, there and back: what remains beyond the
 known ones. Every source is linear in these, and gives least-squares sums of the same unknowns.
@@ -73,9 +73,9 @@ class Sources:
     def level_dependence(self) -> tuple[float, float, bool]:
         """Relative change of the known shares with the signal, zero if not certain; its error.
 
-        Both in 1/ke-. All shares change alike; of rises, boundaries that charge shifts
-        (brighter-fatter) are the cause where these describe the noise much better. Last, whether
-        either may be.
+        Both in 1/ke-. All shares change by the same factor. A rise is attributed to boundaries
+        shifted by charge (brighter-fatter) if these describe the noise much better. The last value:
+        whether either is possible.
         """
         there = self._by_link(self.known) != 0
         shares, rises, covariances, used = [], [], [], []  # of each measured value
@@ -177,7 +177,7 @@ def sources_of(
     """What several parts of the frames measure together; None without light and dark signal.
 
     ``parts``: of the same pixels, each needed once. ``steps_in``: steps (dy, dx) in a window of
-    given rows and columns. ``known``: couplings that all is freed of first.
+    given rows and columns. ``known``: couplings for which all data are corrected first.
     """
     noise: list[Products | None] = []
     found: Sources | None = None

@@ -1,8 +1,8 @@
-"""Trails of charge behind hot pixels, longer the more often a pixel's charge was transferred.
+"""Trails of charge behind hot pixels, which grow with the number of transfers.
 
 A transfer that is not complete leaves charge to the next pixel of the column (or row), so a trail
 points away from the output, and holds a share of the charge that grows with the distance to it.
-Crosstalk does not know where the output is.
+Crosstalk does not depend on the place of the output.
 """
 
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ def trails_of(
 
 
 def trailing(evidence: Evidence) -> float:
-    """Significance of trails along either axis; 0 where hot pixels do not tell."""
+    """Significance of trails along either axis; 0 without enough hot pixels."""
     found = trails(evidence)
     return 0.0 if found is None else sigmas_of_best(*(one.significance for one in found))
 

@@ -1,9 +1,9 @@
-"""Amplifiers of slightly different gain: steps in the flat that the noise has as well.
+"""Amplifiers of slightly different gain: steps that occur both in the flat and in the noise.
 
 A response step between two blocks of columns or rows is a gain step if the shot noise steps with
 it. The amplifier with more e-/ADU gives fewer ADU for the same light, and its noise, computed with
-the common gain, is smaller by the same factor. Where the pixels themselves respond differently,
-the noise follows the light and has no step.
+the common gain, is smaller by the same factor. If instead the pixels respond differently, the noise
+follows the light and has no step.
 """
 
 from collections.abc import Sequence
@@ -54,7 +54,7 @@ def _used(flat: F64, noise: F64, good: Mask) -> tuple[F64, F64]:
 
 @dataclass(frozen=True)
 class Outputs:
-    """Outputs whose gains differ, told by flat and noise alike."""
+    """Outputs whose gains differ, according to both flat and noise."""
 
     names: list[str]  # which rows and columns each output reads
     gain: F64  # gain, error: (output,) over the mean, by the noise

@@ -191,16 +191,16 @@ def noisy_factor(
 
 
 def noisy_beyond(least: float, spread: float) -> float:
-    """The same where the scatter of the logarithm of noise over pixels is known."""
+    """As above, given the scatter over pixels of the logarithm of the noise."""
     return max(least, math.exp(_POPULATION * spread))
 
 
 def nonlinear(steps: Sequence[ExposureLevel], levels: F64, limit: float) -> Mask:
     """Pixels whose signal departs from that of others over exposure-time steps of flats.
 
-    Compared with pixels of equal brightness: a nonlinearity of all is no defect. ``steps``:
-    any number; with fewer than three none is flagged. ``levels``: (step,) of `step_levels`.
-    ``limit``: largest relative change of the pixel's share of the level.
+    Compared with pixels of equal brightness, because a nonlinearity of all pixels is no defect.
+    ``steps``: any number; with fewer than three none is flagged. ``levels``: (step,) of
+    `step_levels`. ``limit``: largest relative change of the pixel's share of the level.
     """
     shape = steps[0].signal.shape
     if len(steps) < MIN_STEPS:

@@ -134,7 +134,7 @@ def _highest(power: Callable[[float], float], start: float, width: float) -> flo
 
 
 def _agreement(codes: I64, there: Mask, step: float) -> float:
-    """Share of the gaps that a step predicts, minus the share of occupied codes it excludes."""
+    """Share of the gaps that a step predicts, less the share of occupied codes that it excludes."""
     multiple = np.rint(codes / step)
     distance = np.abs(codes - multiple * step)
     # A multiple half-way between two codes is rounded up or down: exactly one of the two occurs.
@@ -160,7 +160,7 @@ class Ripple:
 
 
 class Law(NamedTuple):
-    """Where a code begins, given the levels that the weights of its bits make."""
+    """Threshold of a code, given the levels made by the weights of its bits."""
 
     below: float  # weight of the level of the code below in a threshold
     any_code: bool = False  # whether that is the code of the next lower level, whatever its number
@@ -191,7 +191,7 @@ def level_errors(bits: F64, codes: int) -> F64:
 
 
 def code_cells(bits: F64, law: Law, codes: int) -> tuple[F64, I64]:
-    """Where each code begins, and the codes in this order.
+    """Threshold of each code, and the codes in the order of their thresholds.
 
     ``bits``: (n,) error (codes) of the weight of each bit, lowest bit first.
     """
@@ -461,7 +461,7 @@ class CodeWidths:
 def code_widths(
     counts: F64, noise: float, first: float = 0.0, last: float = np.inf
 ) -> CodeWidths | None:
-    """Widths from the counts (n,) of a converter's codes; None where too few came up.
+    """Widths from the counts (n,) of a converter's codes; None if too few codes occur.
 
     ``noise``: least noise of a sample, codes, from code ``first`` on; at ``last`` samples saturate.
     """

@@ -31,8 +31,8 @@ def without_cut_off(
     """Frames without light, corrected for clipping at their ``lowest`` code (ADU).
 
     ``found``: of some pixels, ADU; ``step``: of the samples, ADU. Returns them with corrected means
-    and variances where most pixels' noise is clipped, and the variance of a sample over that of the
-    samples as they are.
+    and variances, if the noise of most pixels is clipped, and the ratio of the true variance of a
+    sample to that of the clipped samples.
     """
     if lowest:
         above_lowest = replace(found, mean=found.mean - lowest)

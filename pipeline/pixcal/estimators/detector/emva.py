@@ -1,9 +1,9 @@
 """Figures of merit of a detector after EMVA 1288 (release 4.0), in electrons.
 
 Spatial nonuniformity is measured from two averages of independent frames, such as the even and the
-odd ones: their common part is the detector's, their difference is noise, and no noise model is
-needed. Analysis of variance splits it into rows, columns and pixels (Searle, Casella and McCulloch,
-*Variance Components*, 1992, section 4.3).
+odd ones: their common part belongs to the detector, their difference is noise, and no noise model
+is needed. Analysis of variance splits it into rows, columns and pixels (Searle, Casella and
+McCulloch, *Variance Components*, 1992, section 4.3).
 """
 
 import math
@@ -79,7 +79,7 @@ def _root(variance: float, error: float) -> Measure:
 
 
 def alternation(a: F64, b: F64, *, axis: int) -> Measure:
-    """Excess of every second row (axis 0) or column (axis 1) over those between."""
+    """Excess of every second row (axis 0) or column (axis 1) over the others."""
     # Twice the amplitude at the Nyquist frequency; the error is from the scatter over the lines.
     means = (a.mean(axis=1 - axis) + b.mean(axis=1 - axis)) / 2
     # Slow structure differs little between neighbours; only pairs of lines are compared.
@@ -187,8 +187,8 @@ def dynamic_range(full_well: Measure, read_noise: Measure) -> tuple[float, float
 def dark_slope(times: F64, means: F64) -> Measure | None:
     """Dark signal (per second) from the means of frames, with an error from their scatter.
 
-    A black level reset at each exposure time moves means off the line: that scatter counts where it
-    is the larger one. ``times``: (frame,) s. None with fewer than three frames or a single exposure
+    A black level that is reset at each exposure time moves the means off the line; that scatter is
+    used if larger. ``times``: (frame,) s. None with fewer than three frames or a single exposure
     time.
     """
     if len(times) < 3:

@@ -152,7 +152,7 @@ def ladder(evidence: Evidence) -> Ladder | None:
 
 @cached_on_evidence
 def unproven_ladder(evidence: Evidence) -> Ladder | None:
-    """The ladder by its levels; None with too few of them, or a lamp that was changed."""
+    """The ladder from its levels alone; None with too few of them, or a lamp that was changed."""
     stacks = [s for s in evidence.ladder if s.exptime_s > 0]
     light = [light_of(evidence, s) for s in stacks]
     times = np.array([s.exptime_s for s in stacks])
@@ -175,7 +175,7 @@ def unproven_ladder(evidence: Evidence) -> Ladder | None:
 def _of_one_lamp(
     times: F64, levels: F64, error: F64, moments: tuple[float, float]
 ) -> Ladder | None:
-    """The ladder without a level far off the curve of the others: no response has such a step."""
+    """The ladder without a level far from the curve of the others: no response has such a step."""
     # The end levels are always kept, as a response may have a knee there.
     whole = _bent(times, levels, error, moments)
     if whole is None or len(times) <= _WITH_CUBIC:

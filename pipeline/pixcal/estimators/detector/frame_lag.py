@@ -1,4 +1,4 @@
-"""Lag of all pixels, from fringe contrast or first frames of flats; its variation over pixels."""
+"""Lag of all pixels, from fringe contrast or first frames of flats; its scatter over pixels."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -35,7 +35,7 @@ _NOT_EXPONENTIAL = 40.0  # chi-square from which releases are free in each frame
 
 @dataclass(frozen=True)
 class LagNonuniformity:
-    """Scatter of the pixels' shares of the frame before: mean square and its error."""
+    """Scatter over pixels of the share of the previous frame: mean square and its error."""
 
     square: float
     error: float
@@ -212,7 +212,7 @@ class CommonLag:
 
     @property
     def release(self) -> F64:
-        """Parts (lag,) of the charge left that come out 1, 2, ... frames later."""
+        """Parts (lag,) of the charge left behind that are released 1, 2, ... frames later."""
         return np.asarray((1 - self.keep) * self.keep ** np.arange(LAGS))
 
     @property
@@ -297,9 +297,9 @@ def _freely(found: CommonLag, information: F64, right: F64) -> CommonLag:
 def lag_of_flats(evidence: Evidence) -> tuple[float, float, float] | None:
     """Share by which the first frame of each series of flats is fainter than the rest, its error.
 
-    It lacks a share of its own level, and gains one of the frame before unless the detector was
-    cleared: the levels decide which. The third number is 1 if that charge was added, 0 after a
-    clear. None if the flats do not constrain it.
+    It lacks a share of its own level, and gains one of the previous frame unless the detector was
+    cleared; the levels show which. The third number is 1 if that charge was added, 0 if the
+    detector was cleared. None if the flats do not constrain it.
     """
     found = [(s, f) for s in evidence.stacks if (f := _first_frame(s, evidence)) is not None]
     if len(found) <= 2:
@@ -323,7 +323,7 @@ def lag_of_flats(evidence: Evidence) -> tuple[float, float, float] | None:
 def _fit_steps(
     lacking: F64, step: F64, error: F64, flat: Mask, lamp: tuple[F64, float, float]
 ) -> tuple[float, float, float]:
-    """Share of what first frames lack, its error, and the chi-square of the steps."""
+    """Share missing from first frames, its error, and the chi-square of the steps."""
     # ``lamp``: change of the steps per unit rise of the light, the rise, and its error.
     later, rise, of_rise = lamp
     step = step + rise * later

@@ -1,4 +1,4 @@
-"""Response at each level of a ladder of flats, where no polynomial of low order describes it.
+"""Response at each level of a ladder of flats, if no polynomial of low order describes it.
 
 The noise of flats follows the slope of the response; their levels follow the response itself if the
 lamp and its exposure times are steady. Together they give the charge of each level: signal plus a
@@ -66,7 +66,7 @@ def _bends_by_noise(curve: TransferCurve) -> bool:
 
 
 def _bends_by_levels(found: Ladder, linearised: Callable[[F32], F32]) -> bool:
-    """Whether levels depart from a polynomial by more than a lamp does."""
+    """Whether levels depart from a polynomial by more than a lamp may cause."""
     charge = linearised(found.levels.astype(np.float32)).astype(float)
     rest = (charge / straight_line(found.times, charge, found.times) - 1) / LAMP
     return sigmas_of_chi2(float(rest @ rest), len(rest) - 2) > SIGNIFICANT

@@ -45,8 +45,8 @@ def by_level(
 ) -> tuple[dict[str, Any], dict[str, float]]:
     """Parameters of a lag whose share depends on the level, or is limited by traps; their errors.
 
-    Both are empty if the share is even.
-    ``share``: mean one; ``level_e``: full scale, e-.
+    Both are empty if the share is the same at all levels. ``share``: mean one; ``level_e``: full
+    scale, e-.
     """
 
     def taken(shares: F64, charge: F32) -> F32:
@@ -83,7 +83,7 @@ def by_level(
 
 
 def _kept(keep: float) -> float:
-    """Share that traps keep for another frame, in the range that frames can tell."""
+    """Share that traps keep for another frame, in the measurable range."""
     return float(np.clip(keep, 1e-3, np.exp(-1 / MAX_DECAY)))
 
 

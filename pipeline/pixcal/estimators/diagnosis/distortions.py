@@ -257,7 +257,7 @@ class _SetFit:
         self.normal = np.array([self._weighted_dots(rest) for rest in self._left])
 
     def right(self, sizes: F64) -> F64:
-        """Right-hand side for a step from some sizes to better ones."""
+        """Right-hand side for a step that improves the sizes."""
         residual = self._residual
         if np.any(sizes):
             freedom = self._freedom

@@ -120,7 +120,7 @@ def colour_of(series: FrameSeries) -> F64:
 
 
 def find_hops(series: FrameSeries) -> tuple[Hop, ...]:
-    """Jumps of the wavelength: along the fringe vector, and sharper than its other motion."""
+    """Jumps of the wavelength: along the fringe vector, and sharper than other motion."""
     # Differences of means before and after are compared with their scatter along the run. The
     # narrowest significant difference locates the hop.
     k, along = np.array(series.k), colour_of(series)

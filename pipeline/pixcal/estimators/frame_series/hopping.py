@@ -84,7 +84,7 @@ def find_hopping(
 
 
 def scatter_of(values: F64) -> float:
-    """Standard deviation of a series from differences of frames, as if it were only noise."""
+    """Standard deviation of a series from differences of frames, assuming noise alone."""
     return robust_sigma(np.diff(values)) / float(np.sqrt(2)) or 1e-300
 
 

@@ -1,10 +1,10 @@
 """A constant added to a whole frame, separated from noise of rows, columns and pixels.
 
-Stripes of rows and stripes of columns halve the pixels. The mean of a frame (W) holds its offset
-and all noise; the difference of halves by rows (R) the noise of rows and pixels, by columns (C) of
-columns and pixels, by both (K) of pixels alone, each with the same variance as in the mean. The
-four variances therefore give that of the offset, without a noise model; offsets are Wiener-filtered
-accordingly.
+Stripes of rows divide the pixels into halves, and so do stripes of columns. The mean of a frame (W)
+holds its offset and all noise; the difference of halves by rows (R) the noise of rows and pixels,
+by columns (C) of columns and pixels, by both (K) of pixels alone, each with the same variance as in
+the mean. The four variances therefore give that of the offset, without a noise model; offsets are
+Wiener-filtered accordingly.
 """
 
 from collections.abc import Sequence

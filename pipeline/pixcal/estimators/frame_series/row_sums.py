@@ -1,8 +1,8 @@
 """Light of other frames in the rows of a frame, from sums over each row.
 
 In any row such light is a sum of the pixels' maps, so the products of the residuals with the maps,
-and of the maps with each other, are sufficient statistics. Light of the next or the last frame
-grows with the row.
+and of the maps with each other, are sufficient statistics. Light of the next or of the previous
+frame grows with the row.
 """
 
 from collections.abc import Sequence
@@ -107,7 +107,7 @@ class RowSums:
 
 @dataclass(frozen=True)
 class RowRamp:
-    """A share of another frame that grows with the row from a knee on (before it, of the last)."""
+    """A share of the next frame, growing with the row beyond a knee; before it, of the last."""
 
     way: int
     slope: float

@@ -1,8 +1,8 @@
 """Series of a fringe set's frames: their light, their fringe vector.
 
-The bench is the same for all pixels of a frame, the noise of the samples is not. Half the
-difference of two halves of the pixels therefore holds the noise alone, whatever its origin. It is
-fitted together with the series, so no noise model is needed.
+All pixels of a frame share the bench, but not the noise of the samples. Half the difference of two
+halves of the pixels therefore contains only noise, whatever its origin. It is fitted together with
+the series, so no noise model is needed.
 """
 
 from collections.abc import Callable, Sequence

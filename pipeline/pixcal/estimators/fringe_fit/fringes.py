@@ -91,9 +91,9 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
     start = _peak(light, nominal)
     if start is None:
         raise InputError(
-            "no fringes found: the frames are constant in phase or without contrast, or the "
-            f"fringes are wider than the window of {shape[1]} x {shape[0]} px allows; check the "
-            "frames, and which files the set lists"
+            "no fringes found: the phase or the signal is constant, or the fringe period is too "
+            "long for the window of {shape[1]} x {shape[0]} px ; check the frames, and which "
+            "files the set lists"
         )
     found = _refined(light, start)
     cosine = found @ np.array(nominal) / max(np.hypot(*found) * np.hypot(*nominal), 1e-300)

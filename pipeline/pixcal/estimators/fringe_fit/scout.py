@@ -52,7 +52,7 @@ ABOVE_NOISE = 1.5
 
 
 def serial_map(function: Callable[[int], Any], numbers: Sequence[int]) -> list[Any]:
-    """Call a function with each of the numbers, one after the other."""
+    """Call a function with each of the numbers in turn."""
     return [function(n) for n in numbers]
 
 
@@ -213,14 +213,14 @@ class Scout:
         mix = np.stack([light, fringe.imag, fringe.real])
         if not np.linalg.cond(mix) < 1e6:
             raise InputError(
-                "the frames do not differ enough: the phase was scanned too little; scan it evenly "
-                "over a turn or more"
+                "the frames do not differ enough: the phase was scanned too little; scan it "
+                "evenly over 2π or more"
             )
         g = g @ np.linalg.inv(mix)
         return np.asarray(g / self._norm(g))
 
     def _count_fringes(self) -> None:
-        """Reject false fringes, and too wide ones (the fringe vector is accurate at this point)."""
+        """Reject false fringes and too long periods (the fringe vector is now accurate)."""
         tile, theta = self.tiles[0], self.theta[0]
         level = np.where(tile.good, theta[0], 1.0)
         phasor = np.where(tile.good, theta[2] + 1j * theta[1], 0.0) / level

@@ -1,7 +1,7 @@
 """The detector of the simulated stars: true and measured positions of its pixels.
 
 True offsets are the measured ones plus a draw of their errors. The error of a centroid with pixels
-at their measured places comes from the draw alone. Relative to a perfect grid, such a detector
+at their measured positions comes from the draw alone. Relative to a perfect grid, such a detector
 contains the maps' errors twice, which `summary` subtracts. A given truth is used as the detector,
 less the modes that are degenerate with the bench (docs/explanation/gauge.md).
 """

@@ -214,12 +214,13 @@ def _warnings(result: Mapping[str, Any]) -> list[str]:
             )
     if "fringe" in result["axes"]:
         sentences.append(
-            "offsets are known along one axis only; those along the other axis, taken as zero "
-            "here, also move stars"
+            "offsets are known along one axis only; those along the other axis also move stars, "
+            "but are assumed to be zero here"
         )
     if result["detector"]["modes_removed_px"] is None:
         sentences.append(
-            "without --truth, SIGMA is taken as the error of the maps: no systematic errors"
+            "without --truth, the maps are assumed to have random errors of SIGMA and "
+            "no systematic errors"
         )
     return sentences
 

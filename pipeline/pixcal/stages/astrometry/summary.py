@@ -1,9 +1,9 @@
 """The errors of the stars as the numbers of ``astrometry.json``, and as a table.
 
-True offsets t, errors of the maps e and their draw d are independent, e and d alike. Stars fitted
-on a perfect grid have errors K(t + e + d), K being the weights of the pixels; those fitted with
-mapped positions have errors K d. So the mean square due to true offsets is the first mean square
-minus twice the second.
+True offsets t, errors of the maps e and their draw d are independent; e and d have equal variance.
+Stars fitted on a perfect grid have errors K(t + e + d), K being the weights of the pixels; those
+fitted with mapped positions have errors K d. So the mean square due to true offsets is the first
+mean square minus twice the second.
 """
 
 import math

@@ -102,7 +102,7 @@ def sampling_loss(iota: float, alpha: float, variance: float, phases: F64) -> tu
 
 @dataclass(frozen=True)
 class WeightErrors:
-    """Cost of wrong weights: relative increase in frames per squared error.
+    """Cost of wrong weights: relative increase of the frames needed, per squared relative error.
 
     Weights ``(1 + e(u)) / variance`` add the variance of e over the phases, by their information.
     """

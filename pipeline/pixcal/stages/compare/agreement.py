@@ -2,8 +2,8 @@
 
 The squares of a map's means over blocks of 1, 2, 4, ... pixels a side fall with the side. The loss
 from one side to the next is the part of the map at that scale (a nested analysis of variance). The
-parts add up, and for white noise each has the variance of a pixel per degree of freedom.
-Products of two maps are decomposed alike: the common signal is their covariance at a scale.
+parts add up, and for white noise each has the variance of a pixel per degree of freedom. Products
+of two maps are decomposed in the same way: the common signal is their covariance at a scale.
 
 Modes degenerate in either map are removed from the sums of products, so that maps of any size are
 read once, tile by tile. Sums over blocks are one array (k + 3, y, x): of the two maps and their
@@ -87,7 +87,7 @@ class Projection:
         return Part(pixels, freedom, float(first), float(second), float(both), (noise[0], noise[1]))
 
     def taken(self, products: F64) -> float:
-        """Degrees of freedom that the modes remove from products (k, k)."""
+        """Degrees of freedom that removal of the modes takes from products (k, k)."""
         return float(np.sum(self.inverse * products[2:, 2:]))
 
 

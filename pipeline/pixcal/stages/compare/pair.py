@@ -48,7 +48,7 @@ class Pair:
 
     @property
     def coarse(self) -> int:
-        """Number of doublings of the block side inside a tile; these blocks are kept in memory."""
+        """Number of doublings of the block side inside a tile; these blocks stay in memory."""
         most = int(np.log2(min(self.tile_side)))
         return min(most, max(0, int(np.ceil(np.log2(max(self.window) / COARSE)))))
 

@@ -200,7 +200,7 @@ def _sums(
 
 
 def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, phase: F64) -> list[FringeMaps]:
-    """The maps with unknown pixels perturbed by their errors, in the patterns of `SIGNS`.
+    """The maps with unknown pixels perturbed by their errors, with the signs of `SIGNS`.
 
     ``unknown``: pixels with any light up to twice that around them; ``beyond``: pixels outside the
     window, whose unknown offsets scatter like ``phase`` (y, x), rad.

@@ -99,7 +99,7 @@ def excess(facts: Mapping[str, Any]) -> float:
 
 
 def worsened(sets: Mapping[str, Any], pairs: Sequence[Mapping[str, Any]]) -> str:
-    """Where the corrected maps are worse than those before; empty if nowhere."""
+    """In which respects the corrected maps are worse than before; empty if in none."""
     # A wrong correction leaves a periodic pattern in a map, or causes disagreement of sets that
     # measure the same offsets.
     for name, facts in sets.items():

@@ -115,7 +115,7 @@ class Swept:
 
 
 def usable(theta: F64, mask: U8) -> Mask:
-    """Pixels (y, x) whose fitted signal is usable, flagged or not."""
+    """Pixels (y, x) with a usable fitted signal, even if flagged."""
     return np.asarray(np.isfinite(theta).all(axis=0) & (mask & UNKNOWN == 0))
 
 

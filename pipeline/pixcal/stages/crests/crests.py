@@ -4,8 +4,8 @@ Where the phase of the fringes is k pi they have a crest (k even) or a valley (k
 measured in windows a few fringes wide and a segment long, apart from the background and from slopes
 of the contrast; a path's point is where it crosses k pi. Windows share no pixel, so the errors of
 their points are independent. A first pass over one frame, with a straight carrier, gives a
-polynomial that numbers the fringes; the second, over every frame, takes it for a carrier and
-divides by the smooth illumination.
+polynomial that numbers the fringes; the second, over every frame, uses it as a carrier and divides
+by the smooth illumination.
 """
 
 from collections.abc import Callable

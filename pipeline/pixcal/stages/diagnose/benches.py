@@ -1,4 +1,4 @@
-"""Simulated benches of a search: each as often as asked, and no more than the search may use."""
+"""Simulations of the benches of a search, within the number that the search may use."""
 
 from collections.abc import Callable, Sequence
 

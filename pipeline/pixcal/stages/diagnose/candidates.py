@@ -89,7 +89,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Considered:
-    """Effects that a diagnosis considers, and what the fitted frames say of them."""
+    """Effects that a diagnosis considers, with their estimates from the fitted frames."""
 
     kinds: Mapping[str, type[Effect]] = field(default_factory=dict)  # that may be causes, by name
     base: Effects = ()  # that the nominal bench includes; they are no candidates

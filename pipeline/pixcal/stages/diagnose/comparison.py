@@ -177,8 +177,8 @@ class Comparison:
     def settles(self, own: Key, fewer: Trial, trial: Trial) -> bool:
         """Whether the data show all that a cause, added to ``fewer``, changes in simulations.
 
-        Almost nothing of it stays open or opens anew. More than ``own``, its significance, was
-        open: fitted and held-out frames agree in that, whatever the true cause.
+        It leaves almost no difference and causes almost no new one. Not only ``own``, its
+        significance, differed: fitted and held-out frames agree in that, whatever the true cause.
         """
         moved = compare(trial.expected.mean, fewer.expected)
         changed = {key for key, one in moved.items() if abs(one.sigmas[one.worst]) > CHANGED}

@@ -29,7 +29,7 @@ TURNS = 5  # iterations of the fits of pixels and frames: each gains a factor of
 
 
 def levels_before(levels: F64, effects: Sequence[Effect]) -> F64:
-    """Levels (e-) of uniform frames without the effects that are undone on samples."""
+    """Levels (e-) of uniform frames after the effects on samples are undone."""
     frames = np.broadcast_to(levels[:, None, None], (len(levels), ACROSS, ACROSS))
     found = start = np.asarray(frames, np.float32)
     for effect in sorted(effects, key=lambda e: e.sort_key, reverse=True):

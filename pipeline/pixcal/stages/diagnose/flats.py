@@ -1,7 +1,7 @@
-"""What flats tell of the nominal bench: the light of their lamp, and the gain.
+"""Properties of the nominal bench from flats: the light of their lamp, and the gain.
 
-Lamps are never quite steady, and not part of the detector. The gain is that of the flats and the
-declared one together.
+Lamps are never quite steady, and are not part of the detector. The gain is that of the flats and
+the declared one together.
 """
 
 import math

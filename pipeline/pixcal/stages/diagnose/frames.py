@@ -1,7 +1,7 @@
 """Frames to analyse: their series, the halves to fit and to test effects, and what is missing.
 
-Light between bias or dark frames may leave charge in the frames after it: it divides series. The
-fields of `FramesUsed` are keys of ``diagnosis.json``.
+Light between bias or dark frames may leave charge in later frames, so it ends a series. The fields
+of `FramesUsed` are keys of ``diagnosis.json``.
 """
 
 import itertools

@@ -1,4 +1,4 @@
-"""Dark current that hot pixels hand to their neighbours."""
+"""Dark current of hot pixels that appears in their neighbours."""
 
 from typing import TypeVar
 

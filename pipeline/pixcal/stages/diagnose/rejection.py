@@ -63,7 +63,7 @@ def gain_too_small(gain: float, candidate: Candidate) -> str:
 def redundant(
     comparison: Comparison, current: Trial, without: Mapping[str, Trial]
 ) -> Rejection | None:
-    """A cause without which the held-out frames are about as likely."""
+    """Why a cause is rejected without which the held-out frames are about as likely."""
     gains = {name: comparison.gain_over(trial, current) for name, trial in without.items()}
     least = min(gains, key=lambda name: gains[name], default=None)
     if least is None or gains[least] >= MIN_LOGLIK_GAIN:
@@ -88,10 +88,10 @@ def all_close_little(
 ) -> dict[str, float]:
     """Fraction of the gap that each candidate closes alone; empty unless all close little.
 
-    So it is if together they close less than `MIN_JOINT_GAP_CLOSED`, and each less than a quarter
-    of that: beside one that closes more, others may appear. If the fractions add up, `doubtful`
-    would reject any set of these candidates.
-    ``alone``: names of candidates, and benches with this one only.
+    This requires that together they close less than `MIN_JOINT_GAP_CLOSED`, and each less than a
+    quarter of that: once a candidate closes more, others may become significant. If the fractions
+    add up, `doubtful` would reject any set of these candidates. ``alone``: names of candidates, and
+    benches with this one only.
     """
     if not comparison.differs(comparison.nominal):
         return {}
@@ -110,7 +110,7 @@ def unhelpful(
     without: Mapping[str, Trial],
     candidates: Mapping[str, Candidate],
 ) -> Rejection | None:
-    """A cause that does not reduce the differences left by the other causes."""
+    """Why a cause is rejected that does not reduce the differences left by the others."""
     # Where much of the gap stays open, also one that reduces none alone: it compensates others.
     where = comparison.gap_of(current)
     left = comparison.residual_size(current, where)
@@ -152,7 +152,7 @@ def doubtful(
     without: Mapping[str, Trial],
     candidates: Mapping[str, Candidate],
 ) -> Rejection | None:
-    """A cause that closes little of the gap and may be a proxy for another."""
+    """Why a cause is rejected that closes little of the gap and may be a proxy for another."""
     # For an unknown cause: more stays open of a large gap than it closes, unless a candidate that
     # was not tried may be its cause. For another law of other causes: these produce much of its
     # significance, or it has none.

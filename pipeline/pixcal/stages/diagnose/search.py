@@ -132,7 +132,7 @@ class Search:
         return True
 
     def _unexplainable(self, laws: Additions, replays: Additions) -> bool:
-        """Reject all candidates if they leave most of the gap, each alone and all together."""
+        """Reject all candidates if most of the gap remains, with each alone and with all."""
         if self._effects:
             return False
         alone = [(one.name, one.trial) for one in (*laws.values(), *replays.values())]

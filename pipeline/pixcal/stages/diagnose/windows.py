@@ -13,9 +13,9 @@ APART = 4  # least size of a detector, in window sides, for windows aligned to c
 def chosen_windows(shape: tuple[int, int], frames: int = 0) -> tuple[Part, tuple[Part, ...]]:
     """The window to which effects are fitted, and those on which they are tested.
 
-    A small detector is one window. On a large one, the former is in the middle, the latter at four
-    other places (two if one side is short). Without fringes, ``frames``, the number in each half,
-    sets the size: the fewer frames, the more pixels.
+    A small detector is one window. On a large one, the first is in the centre, the others are at
+    four other places (two if one side is short). Without fringes, ``frames``, the number in each
+    half, sets the size: the fewer frames, the more pixels.
     """
     if max(shape) <= LARGEST or 0 < frames * math.prod(shape) <= SAMPLES:
         return whole_of(shape), (whole_of(shape),)

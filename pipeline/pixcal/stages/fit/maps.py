@@ -254,5 +254,5 @@ def outputs_of(both: bool) -> tuple[str, ...]:
 
 
 def _some(values: F32, number: int) -> F32:
-    """About ``number`` of the values, evenly spaced; a copy, so that the rest can be freed."""
+    """A copy of about ``number`` evenly spaced values, so that the rest can be freed."""
     return values[:: max(1, len(values) // number)].copy()

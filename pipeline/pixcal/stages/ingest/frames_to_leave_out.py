@@ -1,7 +1,7 @@
-"""Frames to leave out: with interrupted transfer, or delivered twice by a camera or grabber.
+"""Frames to leave out: interrupted transfers, and frames that a camera or grabber delivered twice.
 
-An interrupted frame is constant, mostly zero, from some row to the end. The noise of a repeated one
-is not its own.
+An interrupted frame is constant, mostly zero, from some row to the end. A repeated frame has no
+noise of its own.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,8 +19,8 @@ _ONE_VALUE = 0.5  # share of a row with one value from which its noise is not se
 def cut_from(array: str, facts: Mapping[str, F64], rows: int) -> list[int | None]:
     """First row without samples of each frame; None if all rows have them.
 
-    Noise makes an exactly constant last row unlikely. It is no evidence if most frames have one, or
-    nearly: rows may be dark on a camera whose noise is cut off at zero or below one code. Saturated
+    Noise makes an exactly constant last row unlikely. Such a row is no evidence if most frames have
+    one: rows may be dark on a camera whose noise is cut off at zero or below one code. Saturated
     rows are no evidence either. ``array``: ``bias``, ``dark``, ``flat``, ``fringes/<set>``.
     ``facts``: `pixcal.storage.frame_decoding.FACTS` by name, (time, band). ``rows``: of a frame.
     """
@@ -43,7 +43,7 @@ def cut_from(array: str, facts: Mapping[str, F64], rows: int) -> list[int | None
 
 
 def _first_row(last: F64, constant: F64, rows: int) -> int:
-    """First of the final constant rows, from the last sample and constant rows of each band."""
+    """First of the constant rows at the end, from the last sample and constant rows of bands."""
     first = rows
     for band in range(len(last) - 1, -1, -1):
         if not np.array_equal(last[band], last[-1], equal_nan=True):
@@ -75,9 +75,9 @@ def left_out(what: str, found: Sequence[str], count: int, key: str) -> list[str]
 def repeats_of(facts: Mapping[str, F64]) -> list[int | None]:
     """Number of the first frame of an array with the same samples as each; None if there is none.
 
-    By the checksums and largest samples of bands. Frames without noise, or with noise far below one
-    code, are alike anyway: it is no evidence if the last row of a frame has one value in half of
-    its pixels, as in a saturated flat, or if less than half of the frames are different. ``facts``:
+    By the checksums and largest samples of bands. Frames with noise far below one code are
+    identical anyway. So equal frames are no evidence if half of the pixels of a last row have one
+    value, as in a saturated flat, or if less than half of the frames are different. ``facts``:
     `pixcal.storage.frame_decoding.FACTS` by name, (time, band).
     """
     first: dict[bytes, int] = {}

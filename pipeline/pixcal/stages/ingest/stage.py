@@ -162,7 +162,7 @@ def _check(
     answers = [answer for batch in results for answer in batch]
     problems = [answer for answer in answers if isinstance(answer, str)]
     if problems:
-        more = f" ({len(problems) - 1} more files are bad)" if len(problems) > 1 else ""
+        more = f" ({len(problems) - 1} more bad files)" if len(problems) > 1 else ""
         raise InputError(problems[0] + more)
     files = iter(answer for answer in answers if isinstance(answer, FrameFile))
     read = {array: [next(files) for _ in its_files] for array, its_files in unknown.items()}
@@ -200,7 +200,7 @@ def _check_shapes(by_array: Mapping[str, Sequence[FrameFile]]) -> None:
         raise InputError(
             f"{odd.source.path}: frames of {sizes[0]} pixels (x × y), where those of "
             f"{other.source.name} and of most files have {sizes[1]}; all frames of an acquisition "
-            "have one size"
+            "must have the same size"
         )
 
 

@@ -162,7 +162,7 @@ def _edge(found: _Counts, step: float) -> int:
 
 
 def _changing(samples: NDArray[Any], code: int) -> float:
-    """Share of samples (t, y, x) at a code, without pixels that are broken: that never change."""
+    """Share of samples (t, y, x) at a code, without broken pixels, which never change."""
     at_code = samples == code
     if len(samples) == 1 or np.median(samples) == code:
         return float(at_code.mean())

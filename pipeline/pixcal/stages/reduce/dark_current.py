@@ -1,6 +1,6 @@
-"""Mean dark signal of a detector, and what the clipping of outliers leaves out of it.
+"""Mean dark signal of a detector, and the part that clipping of outliers removes.
 
-From the levels of single frames without light, and the charge that light before them left there.
+From the levels of single frames without light, and the charge left there by earlier light.
 """
 
 import math
@@ -55,9 +55,9 @@ def dark_current(
 ) -> DarkCurrent | None:
     """The dark current; its error is from frames, bias drift included. None if it is unknown.
 
-    Without charge that light before the darks left, where that is told from a drift of the bias; a
-    warning tells of either.
-    ``conversion``: gain with its error (e-/ADU); ``scale``: over the gain used for the maps.
+    Excludes charge left by light before the darks, if the frames separate it from a drift of the
+    bias; a warning names either. ``conversion``: gain with its error (e-/ADU); ``scale``: over the
+    gain used for the maps.
     """
     if not source.exposures.has_rate:
         return None
@@ -80,8 +80,8 @@ def dark_current(
             error = math.hypot(error, _OF_CORRECTION * left_out)
         elif not job.subtracted[0] and left_out > max(_SURE * error, _NOTABLE * gain * slope[0]):
             notes.append(
-                f"outliers that are left out hold {left_out:.2g} {unit} more: particles, or charge "
-                "that an electron multiplier spreads widely"
+                f"excludes outliers, which hold {left_out:.2g} {unit} more: particles, or the "
+                "tail of an electron multiplier"
             )
     note, rate = _temperature(source.tables), float(rates[good].mean(dtype=float))
     subtracted, off = job.subtracted
@@ -95,7 +95,7 @@ def dark_current(
     late = late_rate(source, levels, gain, gain * job.read_noise) if given else None
     if late is not None and late.sure:
         rate, error = rate - late.rate, late.error
-        notes.append(f"without {late.rate:.2g} {unit} that light before the darks left")
+        notes.append(f"excludes {late.rate:.2g} {unit} of charge left by light before the darks")
     warnings = () if late is None else (late.warning(unit),)
     return DarkCurrent((rate, error), unit, "; ".join([note, *notes]), warnings)
 
@@ -189,7 +189,7 @@ def middle_rows(middle: Part) -> slice:
 
 @dataclass(frozen=True)
 class LateRate:
-    """Charge in dark frames that light before them left, as if it were dark signal."""
+    """Charge left in dark frames by earlier light, as if it were dark signal."""
 
     rate: float  # e-/s, or e-/exposure
     error: float  # of the dark signal without it
@@ -197,7 +197,7 @@ class LateRate:
     sure: bool  # whether it is told from a drift of the bias
 
     def warning(self, unit: str) -> str:
-        """What it means for the map of the dark signal; ``unit``: of the rates."""
+        """Its consequence for the map of the dark signal; ``unit``: of the rates."""
         of_time = "s" if self.lag.in_seconds else "frames"
         decays = [self.lag.decay, self.lag.slow] if self.lag.slow_part else [self.lag.decay]
         decay = " and ".join(f"{number(one, 2)} {of_time}" for one in decays)
@@ -208,7 +208,7 @@ class LateRate:
                 f"bias; record darks before the light, or {gone} or more after it"
             )
         return (
-            f"the darks hold charge that light before them left, which decays over {decay}: the "
+            f"the darks hold charge left by earlier light, which decays over {decay}: the "
             f"map of the dark signal holds {number(self.rate, 2)} {unit} of it on average; record "
             f"darks {gone} or more after light"
         )
@@ -217,9 +217,9 @@ class LateRate:
 def late_rate(
     source: Ingested, levels: DarkLevels, gain: float, read_noise: float
 ) -> LateRate | None:
-    """Charge that light left in the darks, by the fit of the diagnosis; None if insignificant.
+    """Charge left in the darks by light, from the fit of the diagnosis; None if insignificant.
 
-    ``gain``: e-/ADU; ``read_noise``: e-. Not where fringes are among the light.
+    ``gain``: e-/ADU; ``read_noise``: e-. Not if the light includes fringes.
     """
     if not any(g.array == "flat" for g in levels.groups) or len(levels.times) < 3:
         return None

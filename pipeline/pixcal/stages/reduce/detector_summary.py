@@ -166,7 +166,7 @@ def summarise(job: Measuring, folder: Place, source: Ingested) -> Summary:
 
 
 def _tells_noise(gain: GainFit) -> bool:
-    """Whether flats alone tell the noise at level zero."""
+    """Whether the noise at level zero comes from flats alone."""
     variance, error = gain.read_variance
     return gain.without_dark and error < _KNOWN * variance
 
@@ -242,7 +242,7 @@ def _steps(job: Measuring) -> tuple[float, float]:
 
 
 def _exposure_steps(tables: F64, job: Measuring) -> tuple[F64, Mask, Mask]:
-    """Level of each step (ADU) over the columns that have one at all steps, and which to use."""
+    """Level of each step (ADU) over columns with a level at every step; which steps to use."""
     # Also the steps at which some pixels are full, or nearly so.
     if not job.flat:
         return np.zeros(0), np.zeros(0, np.bool_), np.zeros(0, np.bool_)

@@ -47,9 +47,10 @@ def detector_warnings(
     if nearby is not None and filtered:
         along = " and ".join(f"{size:.2g} along {line}s" for line, size in nearby.near.items())
         warnings.append(
-            f"neighbours share noise in frames without light (correlation {along}): the samples "
+            "the noise of neighbouring pixels is correlated in frames without light ( "
+            f"{along}): the samples "
             "were filtered, smoothed or resampled before they were written; gain and noise are "
-            "those of filtered samples and photon transfer does not hold; record raw frames"
+            "those of the filtered samples, and photon transfer is invalid; record raw frames"
         )
     if saturation is not None:
         warnings.append(
@@ -155,12 +156,12 @@ def lamp_warnings(series: Sequence[tuple[float, F64]]) -> list[str]:
 
 
 def _linearity_warnings(summary: Summary) -> list[str]:
-    """Why the levels of the flats are not straight over exposure time."""
+    """Why the levels of the flats deviate from a straight line over exposure time."""
     found = summary.linearity
     if found is None:
         return []
     off, said = f"{100 * found.line.max_deviation:.2g} %", []
-    unflagged = "; no pixels are flagged NONLINEAR for it"
+    unflagged = "; it does not flag pixels as NONLINEAR"
     if found.drift > _LATE:
         said.append(
             f"the light of the flats changes by up to {100 * found.drift:.2g} %, as the frames of "
@@ -170,34 +171,35 @@ def _linearity_warnings(summary: Summary) -> list[str]:
         said.append(
             f"the exposure times of the flats seem rounded to {found.rounded:g} s: deviations of "
             f"the levels from a straight line, of up to {off}, are within half a step "
-            f"({found.rounded / 2:g} s) of the exposure times, and their noise does not follow; "
-            "the linearity error allows for it. Write the true times into the headers, or expose "
+            f"({found.rounded / 2:g} s) of the exposure times, and their noise shows no nonlinear "
+            "response; the linearity error allows for it. Write the true times into "
+            "the headers, or expose "
             "for whole multiples of the step" + unflagged
         )
     elif found.scatter:
         said.append(
             f"the levels of the flats scatter by {100 * found.scatter:.2g} % about a smooth curve "
-            "over exposure time, and their noise does not follow: exposure times that are rounded, "
-            "a lamp that is set anew for each level, or a step in the response would do that; the "
+            "over exposure time, while their noise shows no nonlinear response; possible causes: "
+            "rounded exposure times, a lamp reset for each level, or a step in the response; the "
             "linearity error allows for it" + unflagged
         )
     elif found.lamp:
         said.append(
             f"the levels of the flats deviate by up to {off} from a straight line over exposure "
-            "time: they do not tell a response that is not linear from a lamp that drifts; repeat "
-            "the first level at the end, with several flats of each level" + unflagged
+            "time: the response may be nonlinear, or the lamp may drift; to separate the two, "
+            "repeat the first level at the end, with several flats of each level" + unflagged
         )
     elif found.line.max_deviation > _LINEARITY:
         said.append(
             f"the levels of the flats deviate by up to {off} from a straight line over exposure "
-            "time: the response of all pixels is not linear, the lamp is not steady, or exposure "
+            "time: the response of all pixels is nonlinear, the lamp is unsteady, or exposure "
             "times are wrong" + unflagged
         )
     return said + _exposure_warnings(summary, found.line)
 
 
 def _exposure_warnings(summary: Summary, straight: Linearity) -> list[str]:
-    """That exposures are longer or shorter than stated, if levels are straight but for that."""
+    """That exposures are longer or shorter than stated, if the levels are otherwise straight."""
     if summary.read_noise is None:  # else the level without light is unknown
         return []
     late, error = straight.late
@@ -245,7 +247,7 @@ def _declared_gain_warnings(fit: GainFit, summary: Summary, used: float) -> list
 
 
 def trail_warnings(calibration: Place, source: Ingested, gain: float) -> list[str]:
-    """That charge trails hot pixels, the more the farther from an output (charge transfer)."""
+    """That hot pixels have trails of charge, which grow with the distance from an output."""
     seconds = max((group.exptime for group in source.exposures.dark), default=0.0)
     if not (source.exposures.has_rate and seconds > 0):
         return []

@@ -98,7 +98,8 @@ def _group_darks(found: Exposures, times: Mapping[str, list[float | None]]) -> N
         found.warnings.append(f"no EXPTIME in {unknown} of {len(dark)} dark frames: not used")
     if not found.dark:
         found.warnings.append(
-            "no bias and no dark frames: bias and dark signal are taken as zero, the gain is not "
+            "no bias and no dark frames: bias and dark signal are assumed to be zero, "
+            "the gain is not "
             "measured, and signals include the bias"
         )
     elif not bias and not found.has_rate:
@@ -152,8 +153,8 @@ def _time_fringes(found: Exposures, name: str, times: list[float | None]) -> Non
     found.fringes[name] = np.array([t or 0.0 for t in times], np.float32)
     if found.has_rate and unknown:
         found.warnings.append(
-            f"{name}: no EXPTIME in {unknown} of {len(times)} frames: their dark signal is taken "
-            "as zero"
+            f"{name}: no EXPTIME in {unknown} of {len(times)} frames: their dark signal is "
+            "assumed to be zero"
         )
     if len(found.dark) == 1 and found.dark[0].array == "dark":
         expected = found.dark[0].exptime

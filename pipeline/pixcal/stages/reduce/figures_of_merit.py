@@ -200,7 +200,7 @@ def _report_outputs(
     ``gain``: of all outputs together (e-/ADU). ``shape``: of the detector.
     """
     sides = found.of_pixel.shape
-    looked_at = "" if sides == shape else " in the middle {} × {} pixels".format(*sides)
+    looked_at = "" if sides == shape else " in the central {} × {} pixels".format(*sides)
     each = zip(found.names, gain * found.gain, gain * found.gain * found.error, strict=True)
     entries: list[dict[str, Any]] = []
     entries += [{"where": n, "gain": float(g), "error": float(e)} for n, g, e in each if g > 0]
@@ -212,8 +212,8 @@ def _report_outputs(
     words = "; ".join(said) + " e-/ADU"
     facts["gain_e_per_adu"]["outputs"] = entries
     facts["warnings"].append(
-        f"the gain differs between outputs{looked_at} ({words}): electrons are counted by one gain "
-        "for all, and the flat map removes the steps"
+        f"the gain differs between outputs{looked_at} ({words}): all signals are converted with "
+        "one common gain, and the flat map removes the steps"
     )
     return f"of all outputs together: {words}"
 

@@ -28,7 +28,7 @@ from pixcal.storage.stage import read_acquisition
 # reasons to leave flats out, and what to do
 _UNLIT = "without light", "list them under frames.dark or frames.bias if they are to be used"
 _MISTIMED = (
-    "whose light contradicts their EXPTIME, while that of all others follows it,",
+    "whose light contradicts their EXPTIME (that of all others agrees)",
     "correct their EXPTIME (for TIFF and PNG in headers.csv) if they are to be used",
 )
 MOST_ADU = 2.0**32  # above any converter's range: larger real numbers are not samples

@@ -140,7 +140,7 @@ def _before_rounding(
 ) -> tuple[Measure | None, float | None]:
     """Noise of the amplifier and its error (ADU), from the codes that pixels have.
 
-    Also the scatter of its logarithm over pixels, where the codes tell it. ``variance``: without
+    Also the scatter of its logarithm over pixels, if the codes show it. ``variance``: without
     ``shot``, that of the dark signal (ADU²).
     """
     assert job.read_series is not None

@@ -1,4 +1,4 @@
-"""Dark signal that the camera subtracts, as the noise of frames without light still shows it.
+"""Dark signal that the camera subtracts, from the noise that it leaves in frames without light.
 
 Cameras that clamp black to their shielded pixels, or compensate for dark current, give frames
 without light of one level at all exposure times. The shot noise of the dark signal stays: its
@@ -28,10 +28,10 @@ _MOSTLY = 0.5  # least share of the dark signal that is subtracted: else the gai
 
 
 def subtracted_rate(source: Ingested, gain: float) -> Measure:
-    """Dark signal (ADU/s) that the camera subtracts, and its error; zero if it is not seen.
+    """Dark signal (ADU/s) that the camera subtracts, and its error; zero if not detected.
 
-    From the middle rows. Noise that is cut off at the lowest code tells nothing. ``gain``: e-/ADU;
-    as a declared one may be wrong, it must agree with that of two flats on what is subtracted.
+    From the middle rows. Noise that is cut off at the lowest code cannot be used. ``gain``: e-/ADU;
+    a declared one may be wrong, so with the gain of two flats the result must be the same.
     """
     if source.black is not None:
         return source.black.subtracted, 0.0
@@ -58,7 +58,7 @@ def subtracted_rate(source: Ingested, gain: float) -> Measure:
 def subtracted_dark(
     levels: tuple[F64, F64], noise: tuple[F64, F64, F64], gain: float
 ) -> Measure | None:
-    """Dark signal (ADU/s) that frames without light lack, and its error; None if they lack none.
+    """Dark signal (ADU/s) missing from frames without light, and its error; None if none is.
 
     levels : exposure time (s) and mean (ADU) of each frame without light
     noise : exposure time (s) of each series, variance of a usual sample (ADU²) and its error
@@ -103,7 +103,7 @@ def _of_pairs(source: Ingested, group: Group) -> tuple[list[float], list[float],
 
 
 def _of_flats(source: Ingested) -> list[float]:
-    """Rough gain (e-/ADU) from two flats, if any tell it."""
+    """Rough gain (e-/ADU) from two flats, if they show shot noise."""
     if source.survey is None:
         return []
     groups = [group.frames for group in source.exposures.flat]
@@ -119,7 +119,7 @@ def subtracted_warnings(subtracted: Measure, gain: float) -> list[str]:
     if not value:
         return []
     return [
-        f"the noise of frames without light grows with exposure time as with {value:.3g} ± "
-        f"{error:.2g} e-/s of dark current that their level does not show: the camera subtracts it "
+        f"the noise of frames without light grows with exposure time like that of {value:.3g} ± "
+        f"{error:.2g} e-/s of dark current, but their level does not: the camera subtracts it "
         "(black-level clamp, dark-current compensation). Its noise is allowed for"
     ]

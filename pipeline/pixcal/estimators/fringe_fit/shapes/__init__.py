@@ -1,7 +1,7 @@
 """Shapes of the fringes over the window, one file each; found by `fringe_models`.
 
-A shape is what the offsets are measured from: a phase with a few parameters, whose derivatives are
-modes that the offsets cannot hold. A new one is a file with a subclass of `FringeShape` and a
+Offsets are measured relative to a shape: a phase with a few parameters, whose derivatives are modes
+that the offsets cannot contain. A new one is a file with a subclass of `FringeShape` and a
 module-level ``SHAPE`` naming it.
 """
 
@@ -22,7 +22,7 @@ from pixcal.model.arrays import F64
 
 @dataclass(frozen=True)
 class Start:
-    """What a shape starts from."""
+    """Input of a new shape."""
 
     k: tuple[float, float]  # measured fringe vector (kx, ky) at the reference, rad/px
     reference: tuple[float, float]  # point (y, x), px
@@ -50,12 +50,12 @@ class FringeShape(ABC):
 
     @property
     def precision(self) -> F64:
-        """What is known beforehand: 1 / variance of each mode's coefficient, zero for nothing."""
+        """Prior: 1 / variance of the coefficient of each mode, zero without a prior."""
         return np.zeros(len(self.names))
 
     @property
     def prior_offset(self) -> F64:
-        """Present coefficients, counted from what was known beforehand."""
+        """Present coefficients, relative to the prior."""
         return np.zeros(len(self.names))
 
     @abstractmethod

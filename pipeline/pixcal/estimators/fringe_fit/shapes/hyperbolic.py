@@ -1,7 +1,8 @@
 """Exact fringes: the difference of the paths from two fibre tips (paper, equation 3).
 
 The phases of tiles, unwrapped, make the fit of the fibres' positions nearly linear (physics note,
-section 4). What a small window cannot tell, the bench's nominal values hold within `prior_errors`.
+section 4). Parameters that a small window cannot determine keep their nominal values within
+`prior_errors`.
 """
 
 from dataclasses import dataclass, replace
