@@ -92,7 +92,7 @@ def _clear(graded: Grade) -> bool:
 
 
 def _count(answers: Iterable[bool]) -> dict[str, Any]:
-    """How many are right, of how many, with an interval of 95 % (Clopper and Pearson 1934)."""
+    """Number of right answers, of all, with its 95 % interval (Clopper and Pearson 1934)."""
     given = list(answers)
     right, of = sum(given), len(given)
     if not of:

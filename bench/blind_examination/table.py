@@ -150,7 +150,7 @@ def _before_after(medians: Mapping[str, float | None]) -> str:
 
 
 def _confusion(confusion: Mapping[str, Mapping[str, int]]) -> str:
-    """What was named first in place of the single effect that was in the data."""
+    """Effects named first instead of the only effect in the data."""
     rows = []
     for true, named in confusion.items():
         others = [f"{n} {count}" for n, count in named.items() if n != true]
@@ -199,7 +199,7 @@ def write_between(page: Path, size: str, text: str) -> None:
 
 
 def around_table(page: Path, size: str) -> tuple[str, str]:
-    """What stands on a page before and after a table, marks included; InputError without them."""
+    """Text of a page before and after a table, marks included; InputError without them."""
     begin, end = f"<!-- blind:{size} -->", "<!-- end -->"
     if not page.is_file():
         raise InputError(f"--write {page}: not found")

@@ -16,7 +16,7 @@ def stack(sensor: Sensor) -> Drawn:
 
 @kind()
 def fading_lamp(sensor: Sensor) -> Drawn:
-    """A lamp that warms up along the ladder, repeats its levels badly, and exposures with a lag."""
+    """A lamp that warms up along the ladder and repeats its levels badly; delayed exposures."""
     rng, flats = sensor.rng, [one for one in sensor.series if one.kind == "flat"]
     drift, scatter = float(rng.uniform(-0.05, 0.05)), float(rng.uniform(0.001, 0.005))
     late = float(rng.uniform(0, 0.05)) * min(one.exptime_s for one in flats)
@@ -75,7 +75,7 @@ def twilight(sensor: Sensor) -> Drawn:
 
 @kind()
 def round_field(sensor: Sensor) -> Drawn:
-    """A round field is lit; corners lie in the dark."""
+    """A round field is lit; the corners are dark."""
     rng, (ny, nx) = sensor.rng, sensor.shape
     y, x = np.mgrid[:ny, :nx]
     radius, soft = float(rng.uniform(0.42, 0.55) * nx), float(rng.uniform(1, 12))
@@ -96,7 +96,7 @@ def strong_vignetting(sensor: Sensor) -> Drawn:
 
 @kind("?")
 def moving_dust(sensor: Sensor) -> Drawn:
-    """Grains of dust that lie elsewhere from some frame on."""
+    """Grains of dust that move at some frame."""
     rng, (ny, nx) = sensor.rng, sensor.shape
     y, x = np.mgrid[:ny, :nx]
     flats = sum(one.frames for one in sensor.series if one.kind == "flat")
@@ -131,7 +131,7 @@ def warming_darks(sensor: Sensor) -> Drawn:
 
 @kind("cosmic_hits")
 def particles(sensor: Sensor) -> Drawn:
-    """Tracks of particles in all frames, while they are read out as well."""
+    """Tracks of particles in all frames, also during readout."""
     rng, (ny, nx) = sensor.rng, sensor.shape
     often = float(np.exp(rng.uniform(np.log(1), np.log(10))))
     per_px = float(rng.uniform(20, 60) * sensor.read_noise_e.mean())

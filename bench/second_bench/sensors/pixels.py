@@ -43,7 +43,7 @@ def defects(sensor: Sensor) -> Drawn:
 
 @kind("nonlinearity")
 def nonlinearity(sensor: Sensor) -> Drawn:
-    """A response curve that falls behind, in proportion to the signal."""
+    """A response curve that falls in proportion to the signal."""
     size, top = float(np.exp(sensor.rng.uniform(np.log(0.01), np.log(0.12)))), sensor.top_e
     sensor.response_curve = lambda e: e * (1 - size * e / top)
     return {"quadratic": -size}
@@ -51,7 +51,7 @@ def nonlinearity(sensor: Sensor) -> Drawn:
 
 @kind("nonlinearity")
 def curved(sensor: Sensor) -> Drawn:
-    """Response curves of other shapes: bent near the full well only, ever softer, or like an S."""
+    """Response curves of other shapes: bent near the full well, increasingly flat, or S-shaped."""
     rng, top = sensor.rng, sensor.top_e
     size = float(np.exp(rng.uniform(np.log(0.01), np.log(0.12))))
     soft = np.sqrt(3 * size) / top
@@ -83,7 +83,7 @@ def _to_neighbours(
 
 @kind("ipc")
 def ipc(sensor: Sensor) -> Drawn:
-    """A part of the signal shows in the neighbours."""
+    """A part of the signal appears in the neighbours."""
     x, y = sensor.rng.uniform(0.004, 0.02, 2)
     _to_neighbours(sensor, float(x), float(y))
     return {"x": float(x), "y": float(y)}
@@ -91,7 +91,7 @@ def ipc(sensor: Sensor) -> Drawn:
 
 @kind("ipc brighter_fatter")
 def coupling(sensor: Sensor) -> Drawn:
-    """A part of the signal that rises with it shows in the neighbours of the row."""
+    """A share of the signal, which rises with it, appears in the neighbours along the row."""
     x = float(sensor.rng.uniform(0.004, 0.02))
     _to_neighbours(sensor, x, 0.0, 0.0, 1.0)
     return {"x": x}
@@ -99,7 +99,7 @@ def coupling(sensor: Sensor) -> Drawn:
 
 @kind("ipc")
 def growing(sensor: Sensor) -> Drawn:
-    """The share that shows in the neighbours grows to two to four times that of small signals."""
+    """The share that appears in the neighbours grows to two to four times that of small signals."""
     (x, y), rise = sensor.rng.uniform(0.004, 0.012, 2), float(sensor.rng.uniform(1, 3))
     _to_neighbours(sensor, float(x), float(y), 1.0, rise)
     return {"x": float(x), "y": float(y), "rise": rise, "per_ke": 1e3 * rise / sensor.top_e}
@@ -107,7 +107,7 @@ def growing(sensor: Sensor) -> Drawn:
 
 @kind("lag")
 def lag(sensor: Sensor) -> Drawn:
-    """A part of the charge of a frame comes with the next."""
+    """A part of the charge of a frame is read with the next frame."""
     share = float(np.exp(sensor.rng.uniform(np.log(0.005), np.log(0.03))))
     kept = np.zeros(sensor.shape)
 

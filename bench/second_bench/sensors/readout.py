@@ -75,7 +75,7 @@ def declared_gain(sensor: Sensor) -> Drawn:
 
 @kind("quantisation")
 def codes(sensor: Sensor) -> Drawn:
-    """A tenth of the codes never comes; the next higher one comes instead."""
+    """A tenth of the codes never occurs; the next higher one takes their place."""
     # Read noise of many codes would hide missing ones.
     sensor.read_noise_e = sensor.read_noise_e * min(1, 2 * sensor.gain / sensor.read_noise_e.mean())
     there = sensor.rng.random(2**sensor.bits) >= 0.1
@@ -132,7 +132,7 @@ def _wave(sensor: Sensor, size: float, columns: float, rows: float) -> None:
 
 @kind("pickup")
 def hum(sensor: Sensor) -> Drawn:
-    """Hum of the mains, which goes through a cycle in some rows, and hardly changes along one."""
+    """Mains hum: one cycle takes several rows, so it hardly changes along a row."""
     rng = sensor.rng
     size = float(rng.uniform(0.15, 0.8) * sensor.read_noise_e.mean())
     rows = float(rng.uniform(0.06, 0.44))
@@ -165,7 +165,7 @@ _APART = np.sqrt(3 / 4)
 
 @kind("output_jitter")
 def drifting_outputs(sensor: Sensor) -> Drawn:
-    """Four outputs whose levels jump from frame to frame, each by itself."""
+    """Four outputs whose levels jump independently from frame to frame."""
     rng, outputs = sensor.rng, _outputs(sensor, (0.5, 0.5))
     size = float(rng.uniform(0.1, 0.5) * sensor.read_noise_e.mean())
     sensor.shared_e = size * _APART
@@ -175,7 +175,7 @@ def drifting_outputs(sensor: Sensor) -> Drawn:
 
 @kind("output_jitter")
 def wandering_outputs(sensor: Sensor) -> Drawn:
-    """Four outputs whose levels walk and jump, each by itself; they meet somewhere."""
+    """Four outputs whose levels walk and jump independently; they meet off-centre."""
     rng, at = sensor.rng, sensor.rng.uniform(0.3, 0.7, 2)
     outputs = _outputs(sensor, (float(at[0]), float(at[1])))
     step, size = rng.uniform(0.03, 0.15, 2) * sensor.read_noise_e.mean()
@@ -192,7 +192,7 @@ def wandering_outputs(sensor: Sensor) -> Drawn:
 
 @kind()
 def output_boundary(sensor: Sensor) -> Drawn:
-    """Four outputs with offsets and gains of their own, which do not meet in the middle."""
+    """Four outputs with different offsets and gains, which do not meet in the centre."""
     rng = sensor.rng
     at = rng.uniform(0.2, 0.8, 2)
     outputs = _outputs(sensor, (float(at[0]), float(at[1])))

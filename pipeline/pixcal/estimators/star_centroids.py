@@ -1,7 +1,7 @@
 """Centroids of stars by a PSF fit, the effect of wrong pixel positions, and its correction.
 
 From a star at (a, b), with N electrons on a background of B in each pixel, a pixel whose response
-lies at (x + dx, y + dy) receives
+is centred at (x + dx, y + dy) receives
 
     S = N P(x + dx - a, y + dy - b) + B
 

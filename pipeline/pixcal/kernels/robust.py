@@ -8,10 +8,10 @@ where no sample is excluded, the result is the plain mean.
 
 Bias of the clipping: on Gaussian noise the mean keeps its value, the variance is too small by
 `clipped_variance_factor` (0.1 % at 4 sigma, 1.5e-5 at 5), for which it is corrected. Limits are
-never closer than the usual noise of the tile requires, since that of one pixel is known from few
-samples only; below 4 sigmas the correction would be too large for that reason. An outlier beyond
-the limit has no weight; one just inside it moves the mean of n frames by ``clip / sqrt(n)`` of the
-mean's own noise.
+never narrower than the typical noise of the tile requires, because few samples determine that of
+one pixel; for the same reason, limits below 4 sigmas would need too large a correction. An outlier
+beyond the limit has no weight; one just inside it moves the mean of n frames by ``clip / sqrt(n)``
+of the mean's own noise.
 """
 
 import math
@@ -108,7 +108,7 @@ def median_and_deviation(frames: F32) -> tuple[F32, F32]:
 
 
 def median_around(values: NDArray[Any], side: int) -> F32:
-    """Median (y, x) of an odd square about each pixel, NaN left out; edges mirror the map."""
+    """Median (y, x) of an odd square around each pixel, NaN excluded; edges mirror the map."""
     out = np.empty(values.shape, np.float32)
     wide = np.pad(values.astype(np.float32), side // 2, "symmetric")
     for y, row in enumerate(out):

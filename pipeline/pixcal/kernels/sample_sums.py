@@ -70,7 +70,7 @@ def level_sums(
 
 
 def count_remainders(codes: Any, good: Mask, divisor: int) -> Indices:
-    """How often whole numbers (t, y, x) of good pixels have each remainder on division by 2ⁿ."""
+    """Counts of each remainder, on division by 2ⁿ, of whole numbers (t, y, x) of good pixels."""
     # Frame by frame: NumPy counts in a copy of 64 bits.
     counts = (np.bincount(frame[good] & (divisor - 1), minlength=divisor) for frame in codes)
     return np.asarray(np.sum(list(counts), axis=0))
@@ -87,7 +87,7 @@ def pixel_moments(values: F32) -> tuple[F64, F64]:
 
 
 def frame_means(values: Any, good: Mask) -> F64:
-    """Mean (t,) over the good pixels of each frame (t, y, x); what others hold may be NaN."""
+    """Mean (t,) over the good pixels of each frame (t, y, x); the others may be NaN."""
     sums: F64 = np.sum(values, axis=(1, 2), dtype=float, where=good)
     return sums / max(int(np.count_nonzero(good)), 1)
 
@@ -96,8 +96,8 @@ def neighbour_products(values: F32, pairs: F32, steps: Indices, every: int = 1) 
     """Sums (step, y) of the products of samples with those a step away, by their first row.
 
     ``pairs``: (step, y, x) weight of each pair, by the place of its first row and of its column
-    that is further left; those beyond the edges are not looked at. ``steps``: (step, 2) rows down
-    (not negative) and columns to the right. Only ``every`` so many frames are used.
+    that is further left; those beyond the edges are ignored. ``steps``: (step, 2) rows down (not
+    negative) and columns to the right. Only ``every`` so many frames are used.
     """
     sums = np.zeros((len(steps), values.shape[1]))
     _add_products(values, pairs, steps, every, sums)
@@ -107,7 +107,7 @@ def neighbour_products(values: F32, pairs: F32, steps: Indices, every: int = 1) 
 def products_by_level(
     values: F32, level: F32, middle: np.float32, pairs: F32, steps: Indices, every: int = 1
 ) -> F64:
-    """The same (2, step, y) of pairs that are both above the ``middle`` of ``level``, both not."""
+    """As above (2, step, y), of pairs both above the ``middle`` of ``level``, and both below."""
     some, high = values[::every], level[::every] > middle
     parts = (some * part for part in (high, ~high))  # a choice takes many times as long
     return np.stack([neighbour_products(part, pairs, steps) for part in parts])

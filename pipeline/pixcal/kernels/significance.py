@@ -62,7 +62,7 @@ def sigmas_of_largest(largest: float, count: int) -> float:
 
 
 def log_of_any(log_chance: float, count: float) -> float:
-    """Log probability that any of independent events happens, each of the same probability."""
+    """Log probability of at least one of several independent events of equal probability."""
     # One minus the probability that none does.
     none = count * math.log1p(-math.exp(log_chance))
     return math.log(-math.expm1(none)) if none < -1e-12 else log_chance + math.log(count)

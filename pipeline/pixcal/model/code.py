@@ -9,7 +9,7 @@ import pixcal
 
 @cache
 def code_digest() -> str:
-    """Digest (hex, 16 characters) of the program's own files, which change between two releases."""
+    """Digest (hex, 16 characters) of the program's own files, which may change between releases."""
     code = hashlib.sha256()
     root = Path(pixcal.__file__).parent
     for file in sorted(root.rglob("[a-z_]*.py")):

@@ -23,8 +23,8 @@ class _Section(dict[str, Any]):
 class _StrictLoader(yaml.SafeLoader):
     """Plain YAML only: no tags, no aliases, no duplicate keys.
 
-    Bare words have their YAML 1.2 meaning: PyYAML's default is to read ``010`` as 8, ``1:30`` as
-    90, ``no`` as false and ``4e2`` as text.
+    Bare words have their YAML 1.2 meaning: by default, PyYAML reads ``010`` as 8, ``1:30`` as 90,
+    ``no`` as false and ``4e2`` as text.
     """
 
     def compose_node(self, parent: Any, index: Any) -> Any:

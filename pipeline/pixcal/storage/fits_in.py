@@ -1,4 +1,4 @@
-"""What a FITS file of a bench holds, read from its header and held against its length.
+"""Contents of a FITS file of a bench, read from its header and checked against its length.
 
 No data are read here: all files of an acquisition can be checked in seconds before hours of reading
 begin. `pixcal.storage.frame_decoding` reads the samples.

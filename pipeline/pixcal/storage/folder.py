@@ -224,8 +224,8 @@ def _batches(files: Iterable[File]) -> Iterator[dict[str, bytes]]:
 def link_files(source: Path, target: Path) -> None:
     """Link every file below a folder into another; copy where there are no links.
 
-    What is there stays, so a call cut short can be repeated; hidden (half-written) files are left
-    out. Linked files share their bytes: replace them, and never write into them.
+    Existing files stay, so an interrupted call can be repeated; hidden (half-written) files are
+    left out. Linked files share their bytes: replace them, and never write into them.
     """
     for folder, _, names in os.walk(source):
         there = target / Path(folder).relative_to(source)
@@ -247,7 +247,7 @@ def _link(file: Path, target: Path) -> None:
 def copy_files(source: Place, target: Place, names: Sequence[str]) -> None:
     """Copy files of a folder to another, either of which may be at a URL.
 
-    Inside one store the store copies, and what is there stays. Raises OSError if a file is missing.
+    Within one store the store copies; existing files stay. Raises OSError if a file is missing.
     """
     if isinstance(source, UrlPath) and isinstance(target, UrlPath):
         inside = UrlFolder(target).copy(source, names)

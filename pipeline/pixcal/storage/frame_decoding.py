@@ -45,7 +45,7 @@ _PIECE = 1 << 20  # bytes to read at a time
 
 
 def bands(rows: tuple[int, int]) -> list[tuple[int, int]]:
-    """Rows (first, one after the last) of each band; the last one may be lower."""
+    """Rows (first, one after the last) of each band; the last band may have fewer rows."""
     return [(y, min(y + BAND, rows[1])) for y in range(*rows, BAND)]
 
 
@@ -106,7 +106,7 @@ def rows_at_once(file: FrameFile) -> int:
 
 
 def _largest_and_ending(values: NDArray[Any], zero: float) -> tuple[float, float, float, int]:
-    """The facts of a band beside its checksum, of samples less ``zero``."""
+    """The facts of a band other than its checksum, of samples less ``zero``."""
     bits = values.view(f"u{values.itemsize}")  # NaN equals itself
     largest, last = float(np.fmax.reduce(values, axis=None)) + zero, float(values[-1, -1]) + zero
     share = np.count_nonzero(bits[-1] == bits[-1, -1]) / bits.shape[1]

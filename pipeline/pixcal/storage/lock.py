@@ -1,4 +1,4 @@
-"""Lock of a run directory for one process; damaged data found meanwhile are made again.
+"""Lock of a run directory for one process; damaged data found meanwhile are remade.
 
 Damage is noted in the artefact, which is not up to date from then on.
 """

@@ -70,7 +70,7 @@ class MemoryPath:
 
 
 class MemoryBuild:
-    """What a stage builds in memory; as `pixcal.storage.artefact.Build`, without an artefact."""
+    """Build of a stage in memory; as `pixcal.storage.artefact.Build`, without an artefact."""
 
     def __init__(self, folder: MemoryPath) -> None:
         self.folder = self.cubes = folder

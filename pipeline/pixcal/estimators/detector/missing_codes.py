@@ -1,4 +1,4 @@
-"""Read noise of a converter with missing codes: what these add to noise and to mean levels.
+"""Read noise of a converter with missing codes, which change noise and mean levels.
 
 A sample whose code is missing gets a neighbouring code. The variance of noise of a few codes then
 depends on the level; the noise is found from a model of the conversion, pixel by pixel. Noise below

@@ -1,10 +1,10 @@
 """Electron multiplication before the output, from the third moment of the noise of flats.
 
 The cumulants of n electrons that arrive by chance, each read as a random signal x, are ``n <x>``,
-``n <x²>`` and ``n <x³>``. So ``<x³> <x> / <x²>²``, which needs no gain, is 1 where all electrons
-count alike, and 3/2 after a multiplying register, where x is nearly exponential (Robbins & Hadwen
-2003, IEEE Trans. Electron Devices 50, 1227). Its noise, over that of the light, is
-``F² = 2 - 1/G`` for a multiplication G. Photon transfer alone cannot tell F² from another gain.
+``n <x²>`` and ``n <x³>``. So ``<x³> <x> / <x²>²``, which needs no gain, is 1 if all electrons count
+equally, and 3/2 after a multiplying register, where x is nearly exponential (Robbins & Hadwen 2003,
+IEEE Trans. Electron Devices 50, 1227). Its noise, over that of the light, is ``F² = 2 - 1/G`` for a
+multiplication G. Photon transfer alone cannot distinguish F² from a different gain.
 """
 
 from collections.abc import Iterable

@@ -4,7 +4,7 @@ The covariance of neighbours has a constant part (rows, columns, electronics), a
 to the level (crosstalk: a share of the shot noise), and one to its square (brighter-fatter).
 Weighted least squares on products of neighbouring residuals of fringe frames and flats separates
 them; the first two are free in each direction. Outliers, and any function of the phase common to
-all frames, are removed first: a nonlinear response cannot pass for noise.
+all frames, are removed first, so that a nonlinear response is not mistaken for noise.
 """
 
 from collections.abc import Iterator

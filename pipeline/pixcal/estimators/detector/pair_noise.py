@@ -93,7 +93,7 @@ def _clipped(difference: F32, quantum: float) -> F64:
 def along_lines(difference: F32, quantum: float) -> F64:
     """Covariances (2 lines, 2 lags) of pixels along a row, and along a column, next and far (ADU²).
 
-    A line's own noise is the same at both lags; that of a filter ends before the far one.
+    Noise of a whole line is the same at both lags; that of a filter is absent at the far one.
     ``difference``: as in `shared_by_blocks`.
     """
     blocks = _clipped(difference, quantum)
@@ -128,7 +128,7 @@ def flat_pair_sums(
     full: F32 | float = np.inf,
     dark: float = 0.0,
 ) -> F64:
-    """The same for flats (2, N_BINS, COLUMNS): of the frames, and without what rows share.
+    """As above for flats (2, N_BINS, COLUMNS): of the frames, and without noise that rows share.
 
     The two frames of a pair are scaled to equal level. `without_bands` takes the result.
 
@@ -162,7 +162,7 @@ def flat_pair_sums(
 
 
 def without_bands(lit: F64, rest: F64) -> F64:
-    """Sums of flats: ``rest``, without what rows share, if that exceeds the error of their noise.
+    """Sums of flats: ``rest``, without the noise that rows share, if that exceeds its error.
 
     A lamp that flickers while rows are exposed one by one makes bands, which are no photon noise.
     """

@@ -53,7 +53,7 @@ class _Sequence:
     places: tuple[tuple[Stack, Indices, F64], ...]  # measured frames of each series, and means, e-
 
     def released(self, decay: float, in_seconds: bool) -> F64:
-        """Charge (t,) that comes out in each frame, for a share of one."""
+        """Charge (t,) released in each frame, for a share of one."""
         spans = self.period / decay if in_seconds else np.full(len(self.period), 1 / decay)
         after = np.exp(-self.pause / decay) if in_seconds else np.ones(len(spans))
         found, held = np.empty(len(spans)), 0.0
@@ -63,7 +63,7 @@ class _Sequence:
         return found
 
     def late(self, lag: Persistence) -> F64:
-        """Charge (t,) that comes out in each frame, e-."""
+        """Charge (t,) released in each frame, e-."""
         found = (1 - lag.slow_part) * self.released(lag.decay, lag.in_seconds)
         if lag.slow_part:
             found = found + lag.slow_part * self.released(lag.slow, True)
@@ -77,7 +77,7 @@ class _Sequence:
 
 
 def persistence(evidence: Evidence) -> Persistence | None:
-    """As `released_late`, of pixels of a part of the window that no frame lacks."""
+    """As `released_late`, from pixels of a part of the window that are valid in all frames."""
     used = evidence.good.copy()
     for stack in evidence.stacks:
         used &= np.isfinite(stack.adu).all(axis=0)
@@ -129,12 +129,12 @@ def released_late(levels: Levels, least: float) -> tuple[Persistence, list[F64]]
 
 
 def _placed(stack: Stack) -> bool:
-    """Whether a series must have, or has, a place in time: light may have come at any other."""
+    """Whether a series has a known time or needs none; light at an unknown time may be anywhere."""
     return stack.kind == "flat" or bool(np.isfinite(stack.start_s))
 
 
 def told_from_drift(levels: Levels, late: Sequence[F64], least: float) -> bool:
-    """Whether charge of earlier light is told from a drift of the level without light.
+    """Whether charge of earlier light is distinguished from a drift of the level without light.
 
     It must fit all unlit frames better than a level that settles, or falls steadily, from the start
     of the session on; and the steps from frame to frame after light must follow it, which those of

@@ -1,7 +1,7 @@
-"""From collected light to signal: boundaries that move with the charge, nonlinear response.
+"""From collected light to signal: boundaries shifted by charge, nonlinear response.
 
 Both are fitted together to the residuals of the fringe fit, because both cause a second harmonic of
-the phase. That of the response is equal for all fringes; that of moving boundaries
+the phase. The harmonic of the response is equal for all fringes; that of moving boundaries
 (brighter-fatter) depends on the fringe period.
 """
 

@@ -1,9 +1,9 @@
 """Read noise below a step or so, from the codes of each pixel in a few frames without light.
 
-Rounding changes such noise by an amount that depends on the place of the level between two codes,
-and pixels differ in level and in noise. Their codes are the sample of a mixture: normal noise that
-is log-normal over the pixels, about levels that are normal over the pixels, each rounded. Codes of
-all pixels together have a likelihood; noise is the mean of its posterior.
+Rounding changes such noise by an amount that depends on where the level is between two codes;
+pixels differ in level and in noise. Their codes follow a mixture: rounded normal noise about a
+level. The noise is log-normal over the pixels, the level normal. Codes of all pixels together have
+a likelihood; noise is the mean of its posterior.
 """
 
 from collections.abc import Callable
@@ -41,8 +41,8 @@ def noise_of_codes(codes: I64, shot: float = 0.0) -> tuple[Measure | None, float
 
     Also the standard deviation of its logarithm over the pixels.
 
-    ``codes``: (t, n) of at least two frames, in steps. ``shot``: variance (square steps) that is
-    not of the noise; neither is what all pixels of a frame have in common.
+    ``codes``: (t, n) of at least two frames, in steps. ``shot``: variance (square steps) to
+    subtract; so is that common to all pixels of a frame.
     """
     codes = codes[:FRAMES]
     dof = len(codes) - 1

@@ -1,8 +1,8 @@
 """Levels of flats off a straight line: the response, the lamp, or the exposure times.
 
-A lamp that drifts is seen within the frames of each exposure time, whatever the response. The noise
-of flats follows the slope of the response; levels that it contradicts are off for another reason.
-Exposure times that are stamped rounded are off by a time that does not grow with the exposure.
+A drifting lamp shows within the frames of each exposure time, whatever the response. The noise of
+flats follows the slope of the response; levels that it contradicts deviate for another reason.
+Rounded exposure times are wrong by a time that does not grow with the exposure.
 """
 
 from collections.abc import Sequence
@@ -108,7 +108,7 @@ def straightness(
 
 
 def _one_lamp(rates: F64, line: Linearity) -> bool:
-    """Whether light per second can be of one lamp, perhaps with exposures longer than stated."""
+    """Whether all levels can be of one lamp, perhaps with exposures longer than stated."""
     alike = bool(rates.max() < RATES * rates.min())
     return alike or (np.isfinite(line.late[1]) and line.max_deviation < _BENT)
 
@@ -147,8 +147,8 @@ def _apart(times: F64, deviation: F64) -> float:
 def _drift(levels: Sequence[Level]) -> list[list[F64]] | None:
     """Light (t,) of the lamp in each level, and with each independent error added; None if steady.
 
-    From frames of the same exposure time, without the first of each level, which lag may dim;
-    pairs count whole where a level is repeated, which tells more than they do.
+    From frames of the same exposure time, without the first of each level, which lag may dim. If a
+    level is repeated, pairs keep both frames, because the repeat says more.
     """
     repeated = len({one.exptime for one in levels}) < len(levels)
     every = np.concatenate([one.time for one in levels])
@@ -232,7 +232,7 @@ def _noise_favours_levels(charge: F64, levels: F64, transfer: F64, read_variance
 
 
 def _without_times(found: Straightness, times: F64, levels: F64) -> Straightness:
-    """What levels tell of the response where exposure times, or the lamp, scatter among them."""
+    """The response from levels that scatter because of exposure times or the lamp."""
     step = _rounded_to(times, levels)
     u = levels / levels.max()
     own = step / np.sqrt(12) / times if step else np.ones_like(times)

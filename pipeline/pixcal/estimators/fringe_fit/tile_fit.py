@@ -137,7 +137,7 @@ def start_model(
     k: tuple[float, float],
     start: F64 | None = None,
 ) -> tuple[F32, SmoothPhasor]:
-    """Smooth model (3, y, x) of a tile, for weights without the pixel's own noise; its phasor.
+    """Smooth model (3, y, x) of a tile, for weights free of the pixel's own noise; its phasor.
 
     Phase and visibility are smooth over the tile; the level is the pixel's own. ``k``: near fringe
     vector, rad/px. ``start``: (3, y, x) pixels if known; else from an unweighted fit.

@@ -1,4 +1,4 @@
-"""How far the visibility of the fringes differs from pixel to pixel, in and between sets."""
+"""Pixel-to-pixel scatter of the fringe visibility, within and between sets."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -33,7 +33,7 @@ def visibility_products(evidence: Evidence, sets: Sequence[FringeEvidence]) -> P
 
 
 def mean_light(found: FringeEvidence) -> float:
-    """Mean light of a set's good pixels, e-, to which one charge in all of them is relative."""
+    """Mean light of a set's good pixels, e-, as reference for a charge common to all of them."""
     light = found.theta[0][found.good]
     # Of the inverse squares, since pixels in little light change most; dead corners do not count.
     return float(np.mean(np.maximum(light, 0.1 * np.median(light)) ** -2.0) ** -0.5)

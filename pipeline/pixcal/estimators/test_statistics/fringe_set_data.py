@@ -64,7 +64,7 @@ class FringeSetData:
 
     @property
     def variance(self) -> F64:
-        """Mean variance (t,) of the good samples of each frame, e-², that the noise model gives."""
+        """Mean variance (t,) of the good samples of each frame, e-², from the noise model."""
         return self._calm[2]
 
     @property
@@ -154,7 +154,7 @@ class FringeSetData:
 
     @cached_property
     def maps_beside_fringes(self) -> dict[str, F64]:
-        """The flat maps without residual fringes, whose power errors of four phases vary widely."""
+        """The flat maps less fringes, whose power varies widely with errors of four phases."""
         return {
             name: values - np.tensordot(fit_terms(values, self.fringe_terms), self.fringe_terms, 1)
             for name, values in self.flat_maps.items()

@@ -4,9 +4,9 @@ Values are compared with simulations of the same bench by Student's distribution
 few simulations. Mean squares are compared by a root below their usual size and a logarithm above
 it, whose scatter is nearly normal.
 
-Few simulations limit a significance to some ten sigma, so a strong effect would count no more than
-a weak one. Effect sizes have no such limit, and grow with the strength of an effect: powers are
-compared as amplitudes, and significances without their logarithm.
+With few simulations a significance is limited to about ten sigma, so a strong effect would count no
+more than a weak one. Effect sizes have no such limit, and grow with the strength of an effect:
+powers are compared as amplitudes, and significances without their logarithm.
 """
 
 from collections.abc import Mapping, Set

@@ -48,7 +48,7 @@ def residual_by_level(data: FringeSetData) -> Curve:
     sets=False,
 )
 def photon_transfer(evidence: Evidence) -> Curve:
-    """Variance of differences of flats over what shot and read noise give, for each level."""
+    """Variance of differences of flats over that of shot and read noise, for each level."""
     return Curve.numbered(_noise_of_flats(evidence))
 
 
@@ -75,7 +75,7 @@ def _noise_of_flats(evidence: Evidence) -> F64:
     sets=False,
 )
 def photon_transfer_shape(evidence: Evidence) -> Curve | None:
-    """The same over its mean: how the noise bends is known better than the gain is."""
+    """The same over its mean: the curvature of the noise is known better than the gain."""
     values = _noise_of_flats(evidence)
     if len(values) < MIN_STEPS:
         return None
@@ -99,7 +99,7 @@ def flat_ladder(evidence: Evidence) -> Curve | None:
 
 @of_intensity("frequency of each bit in the samples", "frequency − ½", x="bit")
 def bits(data: FringeSetData) -> Curve | None:
-    """How much more often than every second time each of the lowest bits is set."""
+    """Excess over one half of the frequency with which each of the lowest bits is set."""
     count = data.remainders
     if count is None:
         return None
@@ -110,7 +110,7 @@ def bits(data: FringeSetData) -> Curve | None:
 
 @of_intensity_power("uniformity of ADC codes", "relative scatter", x="codes a class")
 def code_classes(data: FringeSetData) -> Curve | None:
-    """Scatter of how often codes come up, by their remainders on division by powers of two."""
+    """Scatter of the counts of codes, by their remainders on division by powers of two."""
     count = data.remainders
     if count is None:
         return None

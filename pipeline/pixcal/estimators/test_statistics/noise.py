@@ -142,7 +142,7 @@ def _calm(frames: F32, good: Mask) -> F32:
 
 @of_noise("outliers", "outliers", x="sigma, low then high", unit="(2 √count)", floor=1.0)
 def outliers(data: FringeSetData) -> Curve:
-    """Residuals of good pixels beyond 5, 7 and 10 sigma: twice the root of their number."""
+    """Twice the root of the number of residuals of good pixels beyond 5, 7 and 10 sigma."""
     limits = np.array(OUTLIERS)
     return Curve(np.concatenate([-limits, limits]), 2 * np.sqrt(data.outliers.ravel()))
 

@@ -1,7 +1,7 @@
 """Statistics of patterns in single frames: tones of the noise, and smooth light or offsets.
 
-A tone with another phase in every frame is in no map, and hardly correlates neighbours. A frame's
-fit absorbs its level and its fringes, but no other smooth pattern.
+A tone whose phase differs in every frame is absent from maps, and hardly correlates neighbours. A
+frame's fit absorbs its level and its fringes, but no other smooth pattern.
 """
 
 import numpy as np

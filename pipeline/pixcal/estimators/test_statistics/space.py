@@ -1,4 +1,4 @@
-"""Statistics in space: structure of the maps, and how far fringe sets agree on them."""
+"""Statistics in space: structure of the maps, and agreement of the fringe sets."""
 
 from collections.abc import Sequence
 from functools import partial

@@ -1,5 +1,5 @@
 """Telegraph noise of a population of pixels.
 
-`moments` measures each pixel, `classes` gives its likelihood for each amplitude, `population` how
-many pixels jump, how far and how often, `dwell` how long they stay; `find` combines them.
+`moments` measures each pixel, `classes` gives its likelihood for each amplitude, `population` gives
+the number and amplitudes of pixels that jump, `dwell` their dwell times; `find` combines them.
 """

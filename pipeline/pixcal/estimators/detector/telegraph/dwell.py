@@ -2,8 +2,8 @@
 
 Residuals of a pixel that jumps are correlated in time. Their autocovariance falls exponentially
 with the time between two frames (Machlup 1954, J. Appl. Phys. 25, 341), slowly for long dwell
-times. Jumps show which pixels these are and how far they jump, in frames without light or in
-fringes; those that stayed in one level all along go unseen.
+times. Jumps, in frames without light or in fringes, show which pixels these are and their
+amplitudes; pixels that stayed in one level are missed.
 """
 
 from collections.abc import Sequence

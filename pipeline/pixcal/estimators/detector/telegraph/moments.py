@@ -164,7 +164,7 @@ class Signs:
 
 
 def signs(parts: Sequence[Moments]) -> Signs:
-    """How flat, one-sided and alike from frame to frame the noise of pixels is."""
+    """Flatness, asymmetry and frame-to-frame correlation of the noise of pixels."""
     flat = flat_variance = stay = stay_variance = more = more_variance = 0.0
     noisy: set[int] = set()
     for m in parts:

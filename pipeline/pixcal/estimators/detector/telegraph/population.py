@@ -1,4 +1,4 @@
-"""How many pixels jump, and how far, from the distribution of their variances.
+"""Number and amplitudes of pixels that jump, from the distribution of the variances.
 
 A pixel that jumps by A between two equally likely levels has A²/4 more variance, or less where it
 stays long or one level is rare. Maximum likelihood: most pixels have the common noise, a share has
