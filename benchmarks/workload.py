@@ -176,7 +176,7 @@ class Workload:
 
 
 def memory(stage: str, run: Path) -> dict[str, float]:
-    """Peak of a stage in a process of its own (bytes), the largest it planned, and seconds."""
+    """Peak memory of a stage in a separate process (bytes), the largest planned, and seconds."""
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         return pool.submit(_memory, stage, run).result()
 

@@ -85,7 +85,7 @@ def draw_bench(layout: Layout, rng: np.random.Generator) -> Bench:
 
 
 def _sets(layout: Layout, rng: np.random.Generator) -> tuple[SimulatedSet, ...]:
-    """Two axes of different fringe period; in some cases a third set along one of them."""
+    """Two axes of different fringe period; in some cases a third set along one axis."""
     spacings = [rng.uniform(4.2, 5.6), rng.uniform(6.4, 9.0)]
     rng.shuffle(spacings)
     ramp = int(rng.integers(2))

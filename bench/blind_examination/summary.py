@@ -72,7 +72,7 @@ def _more_questions(part: int, own: Sequence[Grade]) -> dict[str, dict[str, Any]
                 )
                 for n, errors in enumerate(WITHIN)
             },
-            "share closed as by the truth": _count(
+            "share of the gap closed as by the true effects": _count(
                 abs(g.closed - g.oracle) <= NEAR
                 for g in own
                 if g.closed is not None and g.oracle is not None

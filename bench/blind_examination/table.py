@@ -10,7 +10,10 @@ from pixcal.model.errors import InputError
 Plain = Mapping[str, Any]
 
 # questions whose names in the score are not their words
-WORDS = {"nobody blamed for most": "no effect credited with most of the gap"}
+WORDS = {
+    "honest": "no false explanation",
+    "nobody blamed for most": "no effect credited with most of the gap",
+}
 BY_STRENGTH = {"below_twice": "named first below twice the threshold", "from_twice": "from there"}
 
 

@@ -6,8 +6,8 @@ pixel gives iota, alpha and, from the second iteration on, its offset, which her
 The fringe vector is the mean of all frames. B and A are set to their means from the second
 iteration on, without which the paper found no sure convergence, or are left free.
 
-Where the paper leaves a choice the simplest is taken: the weights of its equation 5 are 1. With
-A cos(phi) and A sin(phi) as unknowns, and the turn of the fringes to first order, both steps are
+Where the paper leaves a choice, the simplest is used: the weights of its equation 5 are 1. With A
+cos(phi) and A sin(phi) as unknowns, and the turn of the fringes to first order, both steps are
 linear: one product of a small pseudo-inverse and the whole cube each, far faster than a non-linear
 search for every frame and pixel.
 """

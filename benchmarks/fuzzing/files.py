@@ -1,4 +1,4 @@
-"""FITS files that are damaged or lie: what ingest takes from them is held against astropy."""
+"""FITS files that are damaged or have false headers: ingest is compared with astropy."""
 
 import gzip
 import io
@@ -218,7 +218,7 @@ def _ingested(case: Case, spoil: Any) -> None:
 
 
 def _check(acq: Path, run: Path) -> None:
-    """Hold the ingested frames against what astropy reads."""
+    """Compare the ingested frames with those that astropy reads."""
     from pixcal.stages.reduce.ingested import Ingested
 
     source = Ingested(run / "ingest")

@@ -1,4 +1,4 @@
-"""Frames that a bench should not have taken: their maps are held against the truth."""
+"""Frames that a bench should not have recorded: their maps are compared with the truth."""
 
 from typing import Any
 

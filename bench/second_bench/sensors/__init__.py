@@ -1,7 +1,7 @@
 """Cameras without fringes: bias, dark and flat frames of a sensor with a known truth.
 
 Plain numpy, frame by frame; gain, depth of the converter, level of the bias, ladder of flats and
-counts of frames are drawn anew for every seed::
+counts of frames are drawn for every seed::
 
     python -m second_bench.sensors nonlinearity --seed 3 --out acq --truth truth.json
     python -m second_bench.sensors --list

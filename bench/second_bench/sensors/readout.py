@@ -45,7 +45,7 @@ def row_groups(sensor: Sensor) -> Drawn:
 
 @kind()
 def amplifiers(sensor: Sensor) -> Drawn:
-    """Two halves with amplifiers of their own, and converters of their own for columns."""
+    """Two halves with separate amplifiers, and separate converters for columns."""
     rng, nx = sensor.rng, sensor.shape[1]
     apart, columns = float(rng.uniform(-0.03, 0.03)), float(rng.uniform(0.001, 0.01))
     gains = 1 + columns * rng.standard_normal(nx) + apart * (np.arange(nx) >= nx // 2)

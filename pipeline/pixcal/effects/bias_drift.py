@@ -124,7 +124,7 @@ class BiasDrift(Effect):
         return adu + np.float32(offset / shot.bench.detector.gain_e_per_adu)
 
     def _in_run(self, recording: Recording, time_s: float) -> float:
-        """Offset of a fringe frame, e-, that begins anew with its run."""
+        """Offset of a fringe frame, e-, that restarts with its run."""
 
         def normal(level: int, place: int) -> float:
             return float(recording.rng(self.name, _RUN + level, place).standard_normal())

@@ -61,7 +61,7 @@ class ChargeTransfer(Effect):
         doc="exponent: the charge left behind is proportional to this power of the charge",
     )
     level_e: float = quantity(
-        10_000.0, unit="e-", above=0, high=1e7, doc="charge for which rows and columns are given"
+        10_000.0, unit="e-", above=0, high=1e7, doc="charge to which `rows` and `columns` apply"
     )
 
     @property

@@ -261,7 +261,7 @@ def _of_a_beam(waves: Sequence[WaveFit], tied: TiedWaves, evidence: Evidence) ->
 
 def _of_the_flat(waves: Sequence[WaveFit], evidence: Evidence) -> bool:
     """Whether the waves of all sets are one pattern of the light, as from an error of the flat."""
-    # Such a pattern multiplies mean light and fringes alike, and leaves the phases. Ghosts of both
+    # Such a pattern multiplies mean light and fringes equally, not the phases. Ghosts of both
     # fibres do so only where they are in phase.
     first = waves[0]
     same = [w for w in waves if w.q == first.q]

@@ -160,7 +160,7 @@ class _Scatter:
 
 def _scatter(sets: list[FringeEvidence], width: float, scatter: Products) -> _Scatter:
     """Widths that scatter independently along both axes, unless crossed fringes show otherwise."""
-    # A part of the visibility that no width explains, as it is independent of the fringes, is free.
+    # A part of the visibility that is independent of the fringes, which no width explains, is free.
     pairs, products, errors = scatter
     terms = np.empty((len(pairs), 3))
     for at, (m, n) in enumerate(pairs):

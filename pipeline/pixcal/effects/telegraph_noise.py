@@ -48,7 +48,7 @@ class MeasuredPixels:
     def within(
         self, origin: tuple[int, int], shape: tuple[int, ...]
     ) -> tuple[Indices, Indices, Indices]:
-        """Which of the pixels lie in a part of the chip, and their rows and columns there."""
+        """Which of the pixels are in a part of the chip, and their rows and columns there."""
         y, x = np.array(self.row, int) - origin[0], np.array(self.column, int) - origin[1]
         here = np.flatnonzero((y >= 0) & (y < shape[0]) & (x >= 0) & (x < shape[1]))
         return here, y[here], x[here]

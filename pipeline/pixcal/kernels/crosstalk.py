@@ -28,7 +28,7 @@ STEPS = 60
 CONVERGED = 1e-13
 # arrays up to this size have maps of shares: one step then is that of all sources of a distance
 MAP_PIXELS = 1 << 17
-FILL_PX = 2.0  # radius of the neighbourhood that stands in for a pixel without data, px,
+FILL_PX = 2.0  # radius of the neighbourhood that replaces a pixel without data, px,
 FILL_REACH = 16  # and how far it goes
 
 
@@ -72,7 +72,7 @@ class Coupling:
         return replace(self, share=self.share * factor)
 
     def places(self, shape: tuple[int, ...], first: tuple[int, int]) -> tuple[Place, Place]:
-        """Source and receiver pixels that both lie in a sub-window (y, x).
+        """Source and receiver pixels that are both in a sub-window (y, x).
 
         ``first`` are its first row and column in the window.
         """

@@ -97,7 +97,7 @@ def fit_gain(
     uneven : spectral density at low frequency of the converter's deviation from its mean line,
         ADU³: with noise of sigma the local slope varies by rms ``sqrt(uneven / (4 sqrt(pi)
         sigma³))``, and the variance by twice that
-    common : relative error of the noise at all levels alike
+    common : relative error of the noise, the same at all levels
     straight : fit a line only: within few flats the level changes from place to place, as the
         amplifiers do
     without_dark : leave out the noise without light; by default where it is not on the curve

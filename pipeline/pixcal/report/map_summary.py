@@ -159,7 +159,7 @@ def summarise(source: Source, most: int = SHOWN_PIXELS) -> MapSummary:
 
 
 def _sample_step(pixels: int, nx: int) -> int:
-    """Step through the pixels in reading order that visits all columns alike."""
+    """Step through the pixels in reading order that visits all columns equally often."""
     step = -(-pixels // SAMPLE)
     while gcd(step, nx) != 1:
         step += 1

@@ -41,7 +41,7 @@ class FittedFrames:
     read_noise_e: float
     exptime_s: float
     period_s: float
-    vectors_free: bool  # whether each frame has a fringe vector of its own
+    vectors_free: bool  # whether each frame has its own fringe vector
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ class Effect(ForwardModel):
     remedy : str
         What to do about it on a detector without fringes; empty if it shows only in fringes.
     is_gain : bool
-        Whether it scales all samples alike, which photon transfer measures.
+        Whether it scales all samples equally, which photon transfer measures.
     fit_model : str
         Shape of the fringes (`pixcal.estimators.fringe_fit.shapes`) that absorbs it.
     smooth_degree : int

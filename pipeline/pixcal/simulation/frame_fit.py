@@ -287,7 +287,7 @@ class _Fit:
             chance = log_chance(_likelihood(own, after, before), (len(own) + 2) // 2)
         self.chances[field] = chance
         if profile is not None and self.taken and not own[0].steady:
-            # Jointly: what one of them absorbs of another still belongs to the effect.
+            # Jointly: the part of one that another absorbs still belongs to the effect.
             growth = after.likelihood - self.basis.components((), {}).likelihood
             self.chances["all"] = log_chance(growth, (len(self.taken) + len(own) + 2) // 2)
         if profile is None or not self.taken or sigmas(chance) > SIGNIFICANT:

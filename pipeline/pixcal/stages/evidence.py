@@ -25,7 +25,7 @@ from pixcal.storage.stage import read_acquisition, require
 # first row and column in, and shape of, a window
 Window = tuple[tuple[int, int], tuple[int, int]]
 
-MAX_SAMPLES = 1 << 26  # samples of a set that are taken into memory (some ten bytes each)
+MAX_SAMPLES = 1 << 26  # samples of a set that are read into memory (about ten bytes each)
 
 
 def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice(None)) -> Evidence:

@@ -15,7 +15,7 @@ from pixcal.model.errors import InputError
 def nominal_geometry(
     acquisition: Acquisition, name: str, reference: tuple[float, float] = (0.0, 0.0)
 ) -> Geometry:
-    """Nominal geometry of a set, the fibres' centre before a point (y, x) of the window, px."""
+    """Nominal geometry of a set, the fibres centred in front of point (y, x) of the window, px."""
     (baseline,) = (s.baseline_mm for s in acquisition.frames.fringes if s.name == name)
     optics, pitch = acquisition.fibres, acquisition.detector.pitch_um * 1e-3
     centre = (reference[1] * pitch, reference[0] * pitch)

@@ -126,7 +126,7 @@ class ReducedSet:
             yield self._inside(self.signal.read_chunk((block, *tile), buffer), tile, block)
 
     def _inside(self, chunk: U16, tile: Index, block: int) -> U16:
-        """The part of a chunk that lies in the window and the run."""
+        """The part of a chunk inside the window and the run."""
         y, x = self.ranges(tile)
         n = min(self.block, self.n_frames - block * self.block)
         return np.ascontiguousarray(chunk[:n, : y[1] - y[0], : x[1] - x[0]])

@@ -62,7 +62,7 @@ def centred(shape: tuple[int, int], side: int) -> Part:
 
 
 def strips(todo: Sequence[Index], width: int) -> list[Strip]:
-    """Columns side by side, so many at most in a strip."""
+    """Neighbouring columns, divided into strips of at most this number."""
     found: list[list[Index]] = []
     for i, j in todo:
         if found and len(found[-1]) < width and found[-1][-1] == (i, j - 1):

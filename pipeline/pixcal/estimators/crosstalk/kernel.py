@@ -40,7 +40,7 @@ THERE = 3.5
 # most pixels of flats: their sums of pairs up to `links.REACH` apart fill 400 MB
 MOST_PIXELS = 1 << 17
 WORTH = 16.0  # fall in chi-square of the visibility required of another class of pixels
-ALIKE = 0.05  # p-value from which the shares of all classes are taken as equal
+ALIKE = 0.05  # p-value above which the shares of all classes are assumed equal
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ def _kernel(
 ) -> Kernel:
     """All couplings of the links for the classes of a period.
 
-    With ``per_ke``, maps are not used, as they are of one level.
+    With ``per_ke``, maps are not used, because they have one level.
     """
     every = tuple(
         coupling_of(classes, *divmod(u, 2), step)

@@ -132,7 +132,7 @@ def _alike(patterns: Sequence[Mask]) -> tuple[list[int], I64]:
 
 
 def _name(patterns: Sequence[Mask], place: int, first: int, line: str) -> str:
-    """Words for the rows or columns that are in the same patterns (place,) as one of them."""
+    """Words for the rows or columns in the same patterns (place,) as a given one."""
     if not patterns:
         return ""
     own = np.flatnonzero(np.all([p == p[place] for p in patterns], axis=0))

@@ -121,7 +121,7 @@ def shot_share(
         times = 1 if own else 2
         share += times * (inverse @ right)[0]
         variance += times**2 * scatter * inverse[0, 0]
-    # Negative where levels are too alike to tell the noise of light from that of reading.
+    # Negative if levels are too similar to separate shot noise from read noise.
     if share <= 0.1 or not 0 <= variance < np.inf:
         return None
     floor = FLOOR * (share if share > _FAR_OFF else 1.0)

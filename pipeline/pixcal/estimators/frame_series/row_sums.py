@@ -198,7 +198,7 @@ class Settling:
 
 
 def steps_of(phi: F64, way: int, origin_rad: float | None) -> F64:
-    """Phase of the frame before (way -1) or after (1) less each's (t,), rad; 0 at the ends."""
+    """Phase (t,) of the previous (way -1) or next (1) frame less its own, rad; 0 at the ends."""
     place = phi if origin_rad is None else np.mod(phi - origin_rad, 2 * np.pi)
     step = np.zeros(len(phi))
     own = slice(1, None) if way < 0 else slice(None, -1)

@@ -137,7 +137,7 @@ class Description:
 
     @cached_property
     def staying(self) -> set[Key]:
-        """Curves that still deviate with all causes, and keep over `MAX_RESIDUAL_SHARE` of it."""
+        """Curves that still deviate with all causes, over `MAX_RESIDUAL_SHARE` of it before."""
         left, after = self.final.significant.left, self.final.after
         return {
             key

@@ -1,7 +1,7 @@
 """Frames to leave out: interrupted transfers, and frames that a camera or grabber delivered twice.
 
 An interrupted frame is constant, mostly zero, from some row to the end. A repeated frame has no
-noise of its own.
+independent noise.
 """
 
 from collections.abc import Mapping, Sequence
