@@ -2,7 +2,7 @@
 
 The limits are measured in the same run as the stages: every FITS file read once, the samples of the
 reduced cubes written once more by the same writer and flushed to the disk, and as many bytes copied
-in memory. Where two threads gain less than twice, their ratio tells what stands in the way.
+in memory. If two threads are not twice as fast, the ratios to these limits show the bottleneck.
 """
 
 import argparse
@@ -118,7 +118,7 @@ def write_again(work: Workload, threads: int) -> float:
 
 
 def share_out(work: Callable[[Any], object], items: Sequence[Any], threads: int) -> None:
-    """Do something with every item, in threads."""
+    """Apply a function to every item, in threads."""
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(work, items))
 

@@ -1,9 +1,9 @@
 """Ingest to maps on a cluster that loses a host, against one machine: ``make cluster``.
 
-Each host is a network namespace with an address of its own; where the system does not allow that,
-it is an address of the loopback range. The cubes lie in an S3 store (moto) on another address.
-Frames and run directory are on a disk that all see, as docs/how-to/clusters.md asks for. In the
-middle of the sweep one host loses its link and its processes.
+Each host is a network namespace with its own address or, if the system does not allow that, an
+address of the loopback range. The cubes are in an S3 store (moto) at another address. Frames and
+run directory are on a disk shared by all, as docs/how-to/clusters.md requires. In the middle of the
+sweep one host loses its link and its processes.
 """
 
 import argparse
@@ -46,7 +46,7 @@ class Host:
     processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     def start(self, *command: str, quiet: bool = True) -> subprocess.Popen[bytes]:
-        """Start one of the environment's programs, in a session of its own."""
+        """Start one of the environment's programs in a new session."""
         program, *arguments = command
         process = subprocess.Popen(
             [*self.prefix, PROGRAMS / program, *arguments],
@@ -58,14 +58,14 @@ class Host:
         return process
 
     def kill(self) -> None:
-        """End all that runs there."""
+        """End all processes of this host."""
         for process in self.processes:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
 
     def vanish(self) -> None:
-        """Lose the link, then the processes: nobody hears of their end."""
+        """Lose the link, then the processes, so that no other host is told that they ended."""
         self.unplug()
         self.kill()
 
@@ -106,7 +106,7 @@ def namespaces(names: Sequence[str]) -> Iterator[list[Host]]:
 
 @contextmanager
 def network(names: Sequence[str], *, loopback: bool) -> Iterator[list[Host]]:
-    """The store's host, and others of some names; what runs there ends with the context."""
+    """The store's host, and others with given names; their processes end with the context."""
     with ExitStack() as stack:
         try:
             if loopback:
@@ -147,7 +147,7 @@ def steps_done(run: Path) -> int:
 
 
 def products(run: Path) -> dict[str, Any]:
-    """Maps and figures of a run; not how often it read what, which depends on where it ran."""
+    """Maps and figures of a run, without counts of reads, which depend on where it ran."""
     folder = run / "products"
     maps = {file.name: file.read_bytes() for file in folder.glob("*.fits")}
     figures = {file.name: json.loads(file.read_bytes()) for file in folder.glob("*.json")}

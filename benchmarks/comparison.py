@@ -1,10 +1,10 @@
-"""``pixcal fit`` beside what a user would do instead, on the same data: ``make bench``.
+"""``pixcal fit`` and its alternatives on the same data: ``make bench``.
 
-One fringe set is simulated three times over: as the simplest simulation has it, with a laser and
-pixels as they are, and with fringes that move. Each is ingested and reduced once; each method then
-fits the same reduced cube, warm, in a process of its own. The errors are those of the phases
-against the simulated truth, over the Cramér-Rao bound for the same frames. The others take the
-fringes as straight: from some 400 pixels on (``--size``), their curvature adds to the errors.
+One fringe set is simulated in three ways: ideal, with realistic laser and pixels, and with moving
+fringes. Each is ingested and reduced once; each method then fits the same reduced cube, warm, in a
+separate process. The errors are those of the phases against the simulated truth, over the
+Cramér-Rao bound for the same frames. The alternatives assume straight fringes: above some 400
+pixels (``--size``), the curvature adds to their errors.
 """
 
 import argparse
@@ -71,7 +71,7 @@ def bench(folder: Path, scenario: str, size: int, frames: int) -> Path:
 def measure(
     method: str, folder: Path, truth: Truth, options: argparse.Namespace
 ) -> dict[str, float]:
-    """What a method costs, in a process of its own, and how far it is from the truth."""
+    """Time and memory of a method, in a separate process, and its error."""
     described, run = load_acquisition(folder / "acq"), folder / "run"
     vector, noise = nominal_vector(described, NAME), described.detector.read_noise_e
     cost, phase = cost_apart(method, Task(run, NAME, vector, noise, options.pixels), options.repeat)
@@ -87,7 +87,7 @@ def measure(
 
 
 def compare(scenario: str, options: argparse.Namespace) -> dict[str, Any]:
-    """All methods on one scenario: the bound in px, and what each costs and achieves."""
+    """All methods on one scenario: the bound in px, and the cost and error of each."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         source = load_bench(bench(folder, scenario, options.size, options.frames))
@@ -117,7 +117,7 @@ def table(found: dict[str, Any], samples: int) -> str:
 
 
 def notes(results: dict[str, Any], samples: int, repeat: int) -> str:
-    """What the columns mean, and what follows from them by arithmetic."""
+    """Meaning of the columns, and numbers derived from them."""
     rows = [found["methods"] for found in results.values()]
     each = min(r["memory_bytes"] for m in rows for name, r in m.items() if name != PIXCAL) / samples
     fewest = min(r["pixels"] for m in rows for r in m.values())

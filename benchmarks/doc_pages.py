@@ -1,10 +1,11 @@
-"""Write again what is generated in docs/: help texts, files, layers, pictures of the sample.
+"""Write the generated parts of docs/: help texts, files, layers, pictures of the sample.
 
 And ``pixcal/__init__.pyi``, from the options of the commands.
 
-A page names what follows: ``<!-- commands: run fit -->`` the help of commands, to its end;
+A page marks the generated parts: ``<!-- commands: run fit -->`` the help of commands, to its end;
 ``<!-- file: examples/glow.py -->`` a fenced block; ``<!-- keys: SimulatedOptics -->`` a table, of
-the parameters of an effect as well; ``<!-- effects -->`` that of all effects, as they act.
+the parameters of an effect as well; ``<!-- effects -->`` that of all effects, in the order in which
+they act.
 """
 
 import contextlib
@@ -106,7 +107,7 @@ def _parts(kind: object) -> str:
 
 
 def effect_table() -> str:
-    """All effects that have a page, by the stage at which they act, in their order."""
+    """All effects with a page, by stage and in the order in which they act."""
     lines = ["| where | effects, in the order in which they act |", "|---|---|"]
     told = [e for e in effects().values() if (DOCS / f"reference/effects/{e.name}.md").is_file()]
     for stage in Stage:
@@ -128,7 +129,7 @@ def _default(field: dataclasses.Field[typing.Any]) -> str:
 
 
 def filled(text: str) -> str:
-    """A page with its marked blocks and tables as they should be."""
+    """A page with its marked blocks and tables up to date."""
     text = COMMANDS.sub(lambda found: found[1] + help_of(found[2].split()), text)
     text = FILES.sub(lambda found: found[1] + _content(found[2]) + found[3], text)
     text = EFFECTS.sub(lambda found: found[1] + effect_table(), text)

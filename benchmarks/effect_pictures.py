@@ -1,8 +1,8 @@
-"""What every effect does to the offsets, for its page: ``make effect-pictures``.
+"""Change of the offsets by each effect, for its page: ``make effect-pictures``.
 
 The bench of ``configs/effects.yaml`` is simulated, reduced and fitted without and with each effect,
-with the same noise: the difference of the maps is the effect's. Drawn at the strength of its
-defaults, but for `STRONGER`; all numbers are measured in this run.
+with the same noise: the difference of the maps is due to the effect. Drawn at the default strength,
+except for `STRONGER`; all numbers are measured in this run.
 """
 
 import argparse
@@ -88,7 +88,7 @@ def draw(title: str, change: F64, sigma: F64, file: Path) -> None:
 
 
 def main() -> None:
-    """Draw all, or those that are named."""
+    """Draw all effects, or the named ones."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", help="effects; default: all")
     names = parser.parse_args().names or list(effects())

@@ -1,14 +1,12 @@
-"""Whether the errors of measured parameters are true: deviations from what was simulated.
+"""Whether the errors of measured parameters are right: deviations from the simulated values.
 
-Every acquisition is of another detector with one effect, at some times the strength that half of
-its frames show at about four sigma. All of its frames are looked at, as a diagnosis does after the
-search::
+Every acquisition has a different detector and one effect, several times as strong as needed for
+four sigma on half of its frames. All of its frames are used, as by a diagnosis after the search::
 
     python benchmarks/errors.py --draws 8 --out errors.jsonl [EFFECT ...]
 
-Prints by kind of effect how many parameters lie within one error (68 % of true ones), and the
-largest deviation. ``--out`` keeps a line of JSON for each acquisition; an interrupted study goes on
-where it stopped.
+Prints by kind of effect how many parameters are within one error (68 % expected), and the largest
+deviation. ``--out`` keeps a line of JSON for each acquisition; an interrupted study resumes.
 """
 
 import argparse
@@ -58,7 +56,7 @@ def examine(case: Case) -> dict[str, Any]:
 
 
 def deviation(name: str, true: float, estimate: float, error: float) -> float:
-    """Deviation of a parameter over its error; if a variance is zero, of it, not of its root."""
+    """Deviation of a parameter over its error; of the variance, not its root, if zero."""
     if true or not any(word in name for word in ROOTS):
         return (estimate - true) / error
     # The error is the longer side of the root of the variance's interval.
@@ -67,9 +65,9 @@ def deviation(name: str, true: float, estimate: float, error: float) -> float:
 
 
 def deviations(results: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
-    """Of all parameters, with their names; without those that are at zero and measured there.
+    """Of all parameters, by name, except those that are zero and were measured as zero.
 
-    Nor those that another law describes, whose own parameters differ from zero.
+    Parameters described by another law are excluded too.
     """
     return [
         (deviation(name, true, estimate, error), name)

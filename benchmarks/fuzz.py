@@ -80,7 +80,7 @@ def try_all(
 
 
 def split(cases: range) -> Sequence[range]:
-    """Parts of the cases of a kind, so that all cores have something to do to the end."""
+    """Parts of the cases of a kind, so that all cores are busy to the end."""
     return [cases[at : at + PART] for at in range(0, len(cases), PART)]
 
 
@@ -110,7 +110,7 @@ def write_table(tried: Mapping[str, Counter[str]]) -> None:
 
 
 def main() -> int:
-    """Run and print; 1 when a law was broken."""
+    """Run and print; 1 if a rule was broken."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kind", choices=list(KINDS), action="append")
     parser.add_argument("--case", type=int, help="this one only")

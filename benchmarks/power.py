@@ -1,13 +1,13 @@
 """Power of the diagnosis: how often each effect is named, by its strength, and false causes.
 
-Every acquisition is of another detector, with no effect or with one at 0.3 to 10 times its
-threshold: the strength that half of the frames show at about four sigma. All effects are
+Every acquisition has a different detector, with no effect or with one at 0.3 to 10 times its
+threshold: the strength that gives about four sigma on half of the frames. All effects are
 candidates::
 
     python benchmarks/power.py --draws 2 --nominal 40 --out power.jsonl [EFFECT ...]
 
-Each acquisition takes about a minute of processor time. ``--out`` keeps a line of JSON for each;
-an interrupted study goes on where it stopped.
+Each acquisition takes about a minute of processor time. ``--out`` keeps a line of JSON for each; an
+interrupted study resumes.
 """
 
 import argparse

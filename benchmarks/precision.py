@@ -1,7 +1,7 @@
 """Error of the offsets against the truth of a simulated bench: ``python benchmarks/precision.py``.
 
-Simulates a configuration frame by frame, takes it through the whole pipeline, and holds the maps
-against the truth, the modes that no data can tell from the bench removed from both.
+Simulates a configuration frame by frame, takes it through the whole pipeline, and compares the maps
+with the truth after removal of the degenerate modes from both.
 """
 
 import argparse

@@ -1,7 +1,7 @@
-"""The paper's figures made again: ``make reproduce``, or ``python benchmarks/reproduce.py``.
+"""Reproduction of the paper's figures: ``make reproduce``, or ``python benchmarks/reproduce.py``.
 
-Acquisitions and runs stay in a work folder and are taken up where they were cut short; so do the
-figures, so that ``--figure 9`` makes one again and the page keeps the others.
+Acquisitions, runs and figures are kept in a work folder and resume after an interruption:
+``--figure 9`` repeats one figure, and the page keeps the others.
 """
 
 import argparse
@@ -47,14 +47,14 @@ def kept(folder: Path, figure: str) -> Outcome | None:
 
 
 def keep(folder: Path, figure: str, outcome: Outcome) -> None:
-    """Leave a figure for later runs."""
+    """Keep a figure for later runs."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{figure}.png").write_bytes(outcome.picture)
     write_json(folder / f"{figure}.json", outcome.plain())
 
 
 def main() -> None:
-    """Make the figures that are wanted, and the page of all that there are."""
+    """Make the requested figures, and the page of all existing ones."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--full", action="store_true", help="the paper's own sizes: about an hour")
     parser.add_argument("--figure", action="append", choices=FIGURES, help="only this one; again")

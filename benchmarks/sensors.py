@@ -77,7 +77,7 @@ def mark(run: Path, truth: dict[str, Any]) -> dict[str, Any]:
 
 
 def _diagnosis(file: Path, causes: list[list[str]] | None) -> dict[str, Any]:
-    """Causes named, and whether they are one of each that is to be named; None: any is wrong."""
+    """Causes named, and whether they match the expected ones; None: any is wrong."""
     if not file.exists():
         return {"right": False}
     found = json.loads(file.read_text())

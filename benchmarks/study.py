@@ -1,4 +1,4 @@
-"""A study of many acquisitions of one bench, that goes on where it was interrupted."""
+"""A study of many acquisitions of one bench, which resumes after an interruption."""
 
 import json
 import tempfile

@@ -1,8 +1,8 @@
 """Speed of ingest, reduce and fit against the barest scan of the same data: ``make bench``.
 
-Scans and fits of one cube are interleaved in one run and told as ratios: machines differ and drift,
-ratios less. The scan decodes every chunk with the fit's own reader and adds its samples; a second
-one adds them with their weights, by the fit's own kernel: no fit can take less.
+Scans and fits of one cube are interleaved in one run and reported as ratios, which depend less on
+the machine. The scan decodes every chunk with the fit's own reader and adds its samples; a second
+one adds them with their weights, by the fit's own kernel, which is the least that a fit needs.
 ``--full`` is ``make bench-full``: the whole detector, 46 Mpix x 64 frames x 2 sets, and a band of
 it with 10,000 frames.
 """
@@ -87,7 +87,7 @@ def rates(work: Workload, repeat: int) -> None:
 
 
 def curve(scratch: Path, largest: Workload) -> None:
-    """Time of the fit against pixels and frames, and what a plane through it says of a night."""
+    """Time of the fit against pixels and frames, extrapolated to a night by a plane."""
     found = [(largest.shape, largest.frames, largest.fit(2))]
     for size, frames in ((256, 2000), (512, 200), (512, 2000), (1024, 200), (1024, 1000)):
         work = Workload(scratch / f"{size}-{frames}", (size, size), frames)

@@ -1,7 +1,7 @@
 """Faults survived: ``make torture`` does them all and writes docs/appendix/torture.md.
 
-``--only kill`` takes those whose name the expression finds, ``--share 0.1`` a tenth of each; the
-table is written when nothing was left out. The last line is "all survived", or what was not.
+``--only kill`` runs those whose name matches the expression, ``--share 0.1`` a tenth of each; the
+table is written only by a complete run. The last line is "all survived", or lists the failures.
 """
 
 import argparse
@@ -100,7 +100,7 @@ def _trials(folder: Path, share: float) -> dict[str, Trial]:
 
 
 def _tried(folder: Path, share: float, name: str) -> tuple[Outcome, float, str]:
-    """Outcome of a trial, its seconds, and what went wrong."""
+    """Outcome of a trial, its seconds, and its failure."""
     begun = time.monotonic()
     try:
         outcome, wrong = _trials(folder, share)[name](), ""

@@ -132,7 +132,7 @@ class Workload:
         return took
 
     def fit(self, threads: int) -> float:
-        """Seconds of a fit from the start; what an earlier one left is removed before."""
+        """Seconds of a fit from the start; results of an earlier one are removed first."""
         self.forget_fit()
         return seconds(lambda: fit.run(self.run, fit.Config(), Runtime(workers=threads)))
 
@@ -145,7 +145,7 @@ class Workload:
         """Seconds to decode all chunks and add their samples, shared among threads.
 
         The barest use of the fit's own reader. ``weighted``: add them as the fit does, each sample
-        with its weight, by the fit's own kernel: what no fit can do without.
+        with its weight, by the fit's own kernel: the least that any fit needs.
         """
 
         def part(number: int) -> None:

@@ -3,12 +3,11 @@
 Wang and Han 2004, Opt. Lett. 29, 1671. Two linear fits in turn: with the frames' phases known, each
 pixel gives its phase, and a background and modulation taken as the same in all frames; with the
 pixels' phases known, each frame gives its phase, and a background and modulation taken as the same
-in all pixels. They end when the frames' phases, relative to the first frame's, stand still.
+in all pixels. They end when the phases of the frames, relative to the first, no longer change.
 
-What it takes for granted: uniform light and response in the one step, a steady laser in the other,
-one fringe vector for all frames. All samples weigh the same. The algorithm starts from guessed
-shifts of the frames; nothing is known of them here, but the nominal fringes are, so the frames come
-first.
+It assumes uniform light and response in one step, a steady laser in the other, and one fringe
+vector for all frames. All samples have equal weight. The algorithm starts from guessed shifts of
+the frames; here the shifts are unknown but the nominal fringes are known, so the frames come first.
 """
 
 import numpy as np
@@ -31,8 +30,8 @@ def fit_phases(
 ) -> F64:
     """Phase (y, x) of every pixel: psi of ``a + b cos(psi + phi)``, rad, in ±pi.
 
-    That of the last iteration where the frames' never stand still. ``cube``: (t, y, x) frames, e-.
-    ``vector``: nominal fringe vector (kx, ky), rad/px.
+    That of the last iteration if the phases of the frames do not converge. ``cube``: (t, y, x)
+    frames, e-. ``vector``: nominal fringe vector (kx, ky), rad/px.
     """
     frames = cube.reshape(len(cube), -1)
     y, x = np.indices(cube.shape[1:])

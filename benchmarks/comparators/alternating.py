@@ -1,10 +1,10 @@
 """The paper's method in NumPy: frames and pixels in turn, five times.
 
-Rousset et al., sections 3.3 and 4.2, after Crouzier et al. 2016, A&A 595, A108. With the pixels'
-parameters held, every frame gives B, A, phi and the fringe vector; with the frames' held, every
-pixel gives iota, alpha and, from the second iteration on, its offset, which here is its phase psi.
-The fringe vector is the mean of all frames. B and A are set to their means from the second
-iteration on, without which the paper found no sure convergence, or are left free.
+Rousset et al., sections 3.3 and 4.2, after Crouzier et al. 2016, A&A 595, A108. With fixed
+parameters of the pixels, every frame gives B, A, phi and the fringe vector; with fixed parameters
+of the frames, every pixel gives iota, alpha and, from the second iteration on, its offset, which
+here is its phase psi. The fringe vector is the mean of all frames. B and A are set to their means
+from the second iteration on, without which the paper found no sure convergence, or are left free.
 
 Where the paper leaves a choice, the simplest is used: the weights of its equation 5 are 1. With A
 cos(phi) and A sin(phi) as unknowns, and the turn of the fringes to first order, both steps are

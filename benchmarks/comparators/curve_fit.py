@@ -1,13 +1,13 @@
 """`scipy.optimize.curve_fit` on one pixel after the other.
 
-What the fit of a pixel needs to know of the frames, B, A and phi, comes first, from the frames
-themselves by Fourier demodulation (Takeda, Ina and Kobayashi 1982, J. Opt. Soc. Am. 72, 156): the
-mean of a frame under a Hann window is B, its component at the nominal fringe vector A exp(i phi).
-Each pixel is then fitted for iota, alpha and psi, starting from the nominal fringes, the samples
-weighted by the errors that a user would give: read noise, and shot noise of the sample as measured.
+The fit of a pixel needs B, A and phi of the frames. They are measured first, by Fourier
+demodulation of the frames (Takeda, Ina and Kobayashi 1982, J. Opt. Soc. Am. 72, 156): the mean of a
+frame under a Hann window is B, its component at the nominal fringe vector A exp(i phi). Each pixel
+is then fitted for iota, alpha and psi, starting from the nominal fringes, the samples weighted by
+the errors that a user would give: read noise, and shot noise of the sample as measured.
 
-What it takes for granted: one fringe vector for all frames, and a window wide enough for the Hann
-window to keep the mean apart from the fringes and those from their mirror image.
+It assumes one fringe vector for all frames, and a window wide enough that the Hann window separates
+the mean, the fringes and their mirror image.
 """
 
 import numpy as np

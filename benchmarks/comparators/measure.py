@@ -1,4 +1,4 @@
-"""What a method costs on one reduced cube, in a process of its own."""
+"""Time and memory of a method on one reduced cube, in a separate process."""
 
 import re
 import shutil
@@ -26,7 +26,7 @@ PIXCAL = "pixcal fit"
 
 @dataclass(frozen=True)
 class Task:
-    """What a method is given."""
+    """Input of a method."""
 
     run: Path  # that has been reduced
     name: str  # of the fringe set
@@ -37,7 +37,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Result:
-    """One go of a method."""
+    """One run of a method."""
 
     seconds: float  # from the reduced cube on disk to the phases of all pixels
     # of it, until all frames are in memory as float64; 0 where a method reads as it goes
@@ -49,7 +49,7 @@ class Result:
 def read_cube(run: Path, name: str) -> F64:
     """Frames (t, y, x) of a set in electrons, as a user of zarr reads them.
 
-    Raises ValueError if samples are missing, which the comparators know nothing of.
+    Raises ValueError if samples are missing, which the comparators cannot handle.
     """
     stored = zarr.open_array(run / "reduce" / "reduced.zarr" / name / "signal", mode="r")
     codes, attrs = np.asarray(stored[:]), dict[str, Any](stored.attrs)
@@ -105,14 +105,14 @@ METHODS: dict[str, Callable[[Task], Result]] = {
 def memory(field: str) -> int:
     """Bytes of memory of this process: ``VmRSS`` now, ``VmHWM`` at most.
 
-    Not ru_maxrss, which begins at the peak of the process that started this one.
+    Not ru_maxrss, which starts at the peak of the parent process.
     """
     (kibibytes,) = re.findall(rf"{field}:\s+(\d+)", Path("/proc/self/status").read_text())
     return int(kibibytes) * 1024
 
 
 def cost(method: str, task: Task, repeat: int) -> tuple[dict[str, float], F64 | None]:
-    """What a method costs, and its map of phases where the run's products do not have it.
+    """Time and memory of a method, and its map of phases if the run's products lack it.
 
     It runs once for its memory and to warm up, then ``repeat`` times for its time.
     """

@@ -1,1 +1,1 @@
-"""What is generated in the documentation: see ``make doc-pages``."""
+"""Generated parts of the documentation: see ``make doc-pages``."""

@@ -1,4 +1,4 @@
-"""The picture of the layers: folders of the code, and who imports whom, read off the code."""
+"""The picture of the layers: folders of the code and their imports, read from the code."""
 
 import ast
 import graphlib

@@ -1,4 +1,4 @@
-"""What mkdocs does besides: formulas become MathML, links that leave docs/ become their words."""
+"""Additions to mkdocs: formulas become MathML, links that leave docs/ become plain text."""
 
 import posixpath
 import re
@@ -25,7 +25,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Called by mkdocs with the content of each page: browsers draw MathML by themselves."""
+    """Called by mkdocs with the content of each page: browsers draw MathML without help."""
 
     def formula(found: re.Match[str]) -> str:
         display = "block" if found[1] == "div" else "inline"

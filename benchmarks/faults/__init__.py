@@ -1,8 +1,8 @@
-"""Faults done to pixcal on purpose, and what must be true afterwards.
+"""Deliberate faults, and what must be true afterwards.
 
-Each module holds one kind of fault: a function that does it so many times and returns an `Outcome`
-of what happened, or raises AssertionError when something was lost or came out otherwise. The tests
-do each a few times (tests/torture), ``make torture`` many times (benchmarks/torture.py).
+Each module holds one kind of fault: a function that repeats it a given number of times and returns
+an `Outcome`, or raises AssertionError if something was lost or a result changed. The tests do each
+a few times (tests/torture), ``make torture`` many times (benchmarks/torture.py).
 """
 
 from collections import Counter
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Outcome:
-    """What came of one kind of fault."""
+    """Outcome of one kind of fault."""
 
     fault: str  # what was done, without the step or the artefact that it was done to
     ends: Counter[str] = field(default_factory=Counter)  # how often it ended how

@@ -1,4 +1,4 @@
-"""A small acquisition, what undisturbed commands make of it, and how runs are compared."""
+"""A small acquisition, its results by undisturbed commands, and the comparison of runs."""
 
 import hashlib
 import json
@@ -59,7 +59,7 @@ class Bench:
         return random.Random(" ".join([*names, str(self.seed)]))
 
     def assert_resumed(self, run: Path, stage: str) -> None:
-        """Run a stage again to its end: with all before it, it is that of the reference."""
+        """Run a stage again to its end; it and all earlier stages must equal the reference."""
         pixcal(*self.command(stage, run)).succeeded()
         self.assert_same(run, *STAGES[: STAGES.index(stage) + 1])
 

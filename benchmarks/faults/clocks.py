@@ -1,4 +1,4 @@
-"""Cameras whose clock jumps, stands still, or stamps two frames alike."""
+"""Cameras whose clock jumps, stops, or gives two frames the same time stamp."""
 
 import shutil
 from collections.abc import Callable, Sequence
@@ -40,7 +40,7 @@ def reset_to_1970(stamps: Stamps) -> list[datetime]:
 
 
 def in_pairs(stamps: Stamps) -> list[datetime]:
-    """Every other frame has the stamp of the one before."""
+    """Every other frame has the stamp of the previous one."""
     return [stamps[n - n % 2] for n in range(len(stamps))]
 
 
@@ -61,7 +61,7 @@ JUMPS = {
 
 
 def jump(bench: Bench, how: Jump) -> Outcome:
-    """Alter the stamps of a fringe set: it is said, and the offsets do not change."""
+    """Alter the stamps of a fringe set: a warning says so, and the offsets do not change."""
     outcome = Outcome(f"camera clock: {how.__name__.replace('_', ' ')}")
     acquisition = bench.folder / "clock"
     shutil.rmtree(acquisition, ignore_errors=True)

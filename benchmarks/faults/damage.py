@@ -1,4 +1,4 @@
-"""Bits flipped in what is stored, files that are gone, and half of a file."""
+"""Flipped bits in stored data, missing files, and truncated files."""
 
 import random
 import re
@@ -26,7 +26,7 @@ Trial = Callable[[Bench, str, Damage, int], Outcome]
 
 
 def flip_a_bit(file: Path, rng: random.Random) -> None:
-    """Turn over one bit of a file, wherever."""
+    """Flip a random bit of a file."""
     body = bytearray(file.read_bytes())
     at = rng.randrange(8 * len(body))
     body[at >> 3] ^= 1 << (at & 7)
@@ -45,7 +45,7 @@ def cut(file: Path, rng: random.Random) -> None:
 
 
 def zero(file: Path, rng: random.Random) -> None:
-    """A file of the same size without content, as a disk leaves it that lost power."""
+    """A file of the same size without content, as a power failure may leave it."""
     _replace(file, bytes(file.stat().st_size))
 
 
@@ -91,7 +91,7 @@ def metadata(bench: Bench, artefact: str, damage: Damage, times: int) -> Outcome
 
 
 def chunks(bench: Bench, artefact: str, damage: Damage, times: int) -> Outcome:
-    """Damage chunks: refused when they are read, never taken for anything else."""
+    """Damage chunks: they are refused when read, and never used."""
     outcome = Outcome(f"chunk: {WORDS[damage]}")
     rng = bench.rng(artefact, damage.__name__)
     for name in _some(bench, artefact, times, rng, chunks=True):
@@ -116,7 +116,7 @@ def chunks(bench: Bench, artefact: str, damage: Damage, times: int) -> Outcome:
 
 
 def products(bench: Bench, damage: Damage, times: int) -> Outcome:
-    """Damage the FITS maps: the fit, up to date as it is, writes them again."""
+    """Damage the FITS maps: the fit writes them again although it is up to date."""
     outcome = Outcome(f"FITS map: {WORDS[damage]}")
     rng = bench.rng("products", damage.__name__)
     for number in range(times):
@@ -129,7 +129,7 @@ def products(bench: Bench, damage: Damage, times: int) -> Outcome:
 
 
 def unfinished(bench: Bench, stage: str, damage: Damage, times: int) -> Outcome:
-    """Kill a command, damage what it has left half-done, and go on."""
+    """Kill a command, damage its unfinished build, and resume."""
     outcome = Outcome(f"file of an unfinished build: {WORDS[damage]}")
     rng = bench.rng("unfinished", stage, damage.__name__)
     while outcome.tried < times:
@@ -166,13 +166,13 @@ def _type(bench: Bench, line: str) -> None:
 
 
 def _ready(bench: Bench, artefact: str) -> Path:
-    """A run up to an artefact, but for what the next command makes."""
+    """A run up to an artefact, without that of the next command."""
     order = ["ingest", "reduce", "sweep", "fit"]
     return bench.copy("damaged", *order[: order.index(artefact) + 1])
 
 
 def _mended(bench: Bench, run: Path, artefact: str) -> None:
-    """Run the artefact's own command: all must be as without damage."""
+    """Run the command of the artefact: all results must be as without damage."""
     pixcal(*bench.command(OWNERS[artefact], run)).succeeded()
     bench.assert_same(run, OWNERS[artefact])
     assert not list(run.rglob("damage.json"))

@@ -1,7 +1,7 @@
-"""Commands of pixcal in processes of their own that begin at once.
+"""Commands of pixcal in separate processes that start immediately.
 
 They are forked from a server that has loaded all libraries and compiled all kernels, so that a
-fault at a random moment hits the work and not the imports.
+fault at a random moment hits the work, not the imports.
 """
 
 import multiprocessing

@@ -18,9 +18,9 @@ LONGER = 1.1
 
 
 def kill(bench: Bench, stage: str, times: int) -> Outcome:
-    """Kill a command at random moments, again and again until it ends by itself; begin anew.
+    """Kill a command at random moments, repeatedly until it completes; then start over.
 
-    All that is left, and what earlier stages left, must be as without a fault.
+    Its results, and those of earlier stages, must be as without a fault.
     """
     outcome = Outcome("kill -9 at a random moment")
     for again in _disturbed(bench, stage, times, signal.SIGKILL):
@@ -42,7 +42,7 @@ def interrupt(bench: Bench, stage: str, times: int) -> Outcome:
 def loading(bench: Bench, stage: str, times: int) -> Outcome:
     """Ctrl-C in the first second and a half of a new interpreter, while it loads its libraries.
 
-    Before it has come to pixcal, which takes some hundredths of a second, Python answers itself.
+    In the first hundredths of a second, before pixcal is reached, Python itself answers.
     """
     outcome = Outcome(f"Ctrl-C in the first {LOADING_S} s, while libraries load")
     rng = bench.rng("loading", stage)

@@ -26,7 +26,7 @@ NAMES = (
 
 
 def _as_nobody(home: Path) -> None:
-    """Root may write anywhere: be somebody else."""
+    """Root may write anywhere, so become another user."""
     os.environ["HOME"] = str(home)
     if os.getuid() == 0:
         os.setgroups([])

@@ -61,7 +61,7 @@ def cluster() -> Iterator[str]:
 
 
 def _starve(megabytes: int) -> None:
-    """Take memory and write to it, as a leak would; never given back."""
+    """Allocate memory and write to it, like a leak; it is never freed."""
     import threading
 
     # In a thread: who asks for it does not wait until the worker dies.
@@ -130,7 +130,7 @@ def _disturbed(
 
 
 def _wait_for_work(command: Command, run: Path) -> None:
-    """Until a step is noted as done: the tasks are on their way."""
+    """Wait until a step is noted as done, so that tasks are running."""
     while command.process.is_alive() and not any(run.glob(".partial/*/journal.jsonl")):
         time.sleep(0.001)
 

@@ -1,1 +1,1 @@
-"""Bad input for pixcal, made at random and judged without its code: `python benchmarks/fuzz.py`."""
+"""Random bad input for pixcal, judged without its code: `python benchmarks/fuzz.py`."""

@@ -242,7 +242,7 @@ def _option(case: Case) -> None:
 
 
 def _parse_only(command: click.Command, line: list[str]) -> None:
-    """Have a command line understood, and no more."""
+    """Parse a command line without running it."""
     try:
         command.make_context(str(command.name), line)
     except click.UsageError as error:

@@ -1,4 +1,4 @@
-"""What `pixcal diagnose` can be given: odd acquisitions, damaged runs, own effects, benches."""
+"""Bad input of `pixcal diagnose`: odd acquisitions, damaged runs, own effects, benches."""
 
 import json
 import os
@@ -24,7 +24,7 @@ VERDICTS = ("explained", "partly explained", "unexplained", "no gap")
 
 
 def diagnosed(run: Path, *more: str | Path, names: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Diagnose a run; the product, once it is found to be a diagnosis."""
+    """Diagnose a run; returns the product after checking that it is a diagnosis."""
     pixcal("diagnose", run, *ONLY, *more, *RUNTIME, names=names)
     told: dict[str, Any] = json.loads((run / "products" / "diagnosis.json").read_text())
     if told["verdict"] not in VERDICTS:
@@ -46,7 +46,7 @@ def reduced(night: Night, folder: Path, dtype: str = "uint16") -> Path:
 
 
 def _odd(case: Case) -> None:
-    """Frames with which a diagnosis has little or nothing to begin."""
+    """Frames that are of little or no use for a diagnosis."""
     what = str(
         case.pick(
             "few",
@@ -121,7 +121,7 @@ def _spoil(case: Case, file: Path) -> None:
 
 
 def _artefacts(case: Case) -> None:
-    """Files of RUN damaged or gone; stages missing, or those of another run."""
+    """Files of RUN damaged or missing; stages missing, or from another run."""
     whole, other, told = _runs()
     run = case.folder / "run"
     shutil.copytree(whole, run, copy_function=os.link)
@@ -265,7 +265,7 @@ EFFECTS: tuple[Any, ...] = (
 
 
 def _nominal(case: Case) -> None:
-    """A bench file for `--nominal` that is none, that does not fit the run, or that does."""
+    """A bench file for `--nominal` that is invalid, does not match the run, or is good."""
     whole, _, _ = _runs()
     run, file = case.folder / "run", case.folder / "bench.yaml"
     shutil.copytree(whole, run, copy_function=os.link, ignore=shutil.ignore_patterns("diagnose"))

@@ -1,4 +1,4 @@
-"""What `pixcal blind` can be given: folders of cases and sealed files, damaged or foreign."""
+"""Bad input of `pixcal blind`: folders of cases and sealed files, damaged or foreign."""
 
 import json
 import os
@@ -40,7 +40,7 @@ def _exams() -> tuple[Path, Path]:
 
 
 def _spoil_json(case: Case, file: Path) -> None:
-    """A key gone, doubled or of another type; bytes changed; something else altogether."""
+    """A key missing, doubled or of another type; bytes changed; unrelated content."""
     body = file.read_bytes()
     file.unlink()
     how = str(case.pick("key", "key", "value", "value", "cut", "flip", "junk", "gone", "folder"))
@@ -68,7 +68,7 @@ def _spoil_json(case: Case, file: Path) -> None:
 
 
 def _exam(case: Case) -> None:
-    """An examination, spoilt in one place, to be scored, or continued where nothing is left."""
+    """An examination with one fault, to be scored or continued."""
     first, second = _exams()
     exam, truth = case.folder / "exam", case.folder / "truth.json"
     shutil.copytree(first / "exam", exam, copy_function=os.link)

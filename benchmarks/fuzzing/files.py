@@ -114,7 +114,7 @@ def _value(case: Case, key: str) -> str:
 
 
 def _cards(case: Case, content: bytes) -> bytes:
-    """Cards changed, removed, doubled, added, or made of rubbish, in the header of some unit."""
+    """Cards changed, removed, doubled, added, or random, in the header of some unit."""
     plain, packed = _unpacked(content)
     text = bytearray(plain)
     starts = [m.start() for m in re.finditer(rb"(SIMPLE  |XTENSION)= ", plain)]
@@ -143,7 +143,7 @@ def _cards(case: Case, content: bytes) -> bytes:
 
 
 def _lie(case: Case, content: bytes) -> bytes:
-    """BITPIX, NAXIS or a length that is not that of the data."""
+    """A BITPIX, NAXIS or length that disagrees with the data."""
     plain, packed = _unpacked(content)
     found = list(re.finditer(rb"(Z?BITPIX|Z?NAXIS\d?|PCOUNT|GCOUNT) *= +(-?\d+)", plain))
     one = found[int(case.rng.integers(len(found)))]
@@ -178,7 +178,7 @@ def _rubbish(case: Case, _content: bytes) -> bytes:
 
 
 def _bomb(case: Case, _content: bytes) -> bytes:
-    """Headers that promise far more than there is, and streams that unpack to far more."""
+    """Headers that announce far more data than present, and streams that unpack to far more."""
     bitpix = int(str(case.pick(8, 16, -32, 32)))
     lengths = case.rng.integers(1, 10, 3)
     lengths[int(case.rng.integers(3))] = int(10 ** case.rng.uniform(4, 15))
@@ -202,7 +202,7 @@ def _bomb(case: Case, _content: bytes) -> bytes:
 
 
 def _ingested(case: Case, spoil: Any) -> None:
-    """One spoilt file, ingested alone or beside a good one of the same kind."""
+    """One bad file, ingested alone or with a good one of the same kind."""
     content = _file(case)
     acq, run = case.folder / "acq", case.folder / "run"
     acq.mkdir()

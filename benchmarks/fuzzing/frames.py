@@ -15,7 +15,7 @@ INTEGERS = ("uint16", "int32", "uint8", "int16")
 
 
 def _check(case: Case, night: Night, dtype: str = "uint16") -> None:
-    """Calibrate a night and hold its maps against the truth."""
+    """Calibrate an acquisition and compare its maps with the truth."""
     run = case.folder / "run"
     more = ["report"] if case.number % 50 == 49 else []
     calibrate(night.write(case.folder / "acq", dtype), run, ["acq"], *more)
@@ -70,7 +70,7 @@ def _saturated(case: Case) -> None:
 
 
 def _constant(case: Case) -> None:
-    """Frames without any difference, or the same frame again and again, in one array or in all."""
+    """Constant frames, or one frame repeated, in one array or in all."""
     night = Night(case.rng, _window(case))
     value = float(case.pick(0, 1, 300, 1000, 65534, 65535))
     names = list(night.frames) if case.rng.random() < 0.3 else [str(case.pick(*night.frames))]
@@ -141,7 +141,7 @@ def _small_window(case: Case) -> None:
 
 
 def _masked(case: Case) -> None:
-    """Calibration frames that condemn many pixels or all: hot, dead, noisy, without data."""
+    """Calibration frames that mask many pixels or all: hot, dead, noisy, without data."""
     night = Night(case.rng, _window(case))
     share = float(case.pick(0.1, 0.5, 0.9, 1.0))
     bad = case.rng.random(night.shape) < share
@@ -209,7 +209,7 @@ def _wrong_numbers(case: Case) -> None:
 
 
 def _unscanned(case: Case) -> None:
-    """Phases that stand still, alternate, creep, or repeat."""
+    """Phases that are constant, alternate, creep, or repeat."""
     count = int(case.pick(10, 40, 90))
     t = np.arange(count)
     phases = {
@@ -226,7 +226,7 @@ def _unscanned(case: Case) -> None:
 
 
 def _any_type(case: Case) -> None:
-    """Good frames in types that clip them, or that hold them in coarse steps."""
+    """Good frames in types that clip them or round them coarsely."""
     gain = float(case.pick(1.0, 10.0, 200.0, 2000.0))
     night = Night(case.rng, _window(case), gain=gain, bias=float(case.pick(0.0, 20.0, 300.0)))
     _check(case, night, str(case.pick(*INTEGERS, "float32")))

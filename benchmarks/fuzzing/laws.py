@@ -1,4 +1,4 @@
-"""What must hold whatever the input is: exit 2 with one line that helps, or a truthful result."""
+"""Rules for any input: exit 2 with one helpful line, or a truthful result."""
 
 import atexit
 import io
@@ -46,7 +46,7 @@ MENDS = re.compile(
 
 
 class Broken(AssertionError):
-    """A law is broken; the message says which."""
+    """A rule is broken; the message says which."""
 
 
 class Refused(Exception):
@@ -90,7 +90,7 @@ class Verdict:
 
 
 def judged(kind: Kind, number: int) -> Verdict:
-    """Make a case and hold what pixcal does with it against the laws."""
+    """Make a case, run pixcal on it, and check the rules."""
     rng = np.random.default_rng([zlib.crc32(kind.name.encode()), number])
     verdict = Verdict("truthful")
     with TemporaryDirectory(dir=SCRATCH, prefix="pixcal-fuzz-") as folder:
@@ -151,7 +151,7 @@ def _kib(status: Path, key: str) -> int:
 
 
 def pixcal(*args: str | Path, names: Sequence[str] = ()) -> None:
-    """Run a command in this process and hold its end against the laws.
+    """Run a command in this process and check how it ends.
 
     ``names``: a refusal must name one of these: the file, the key or the option that is bad. Raises
     Refused for exit code 2 with one line that helps; Broken for any other failure.
@@ -211,7 +211,7 @@ def told(stream: io.TextIOWrapper) -> str:
 
 
 def check_line(said: str, names: Sequence[str], where: str) -> None:
-    """Raise `Broken` unless a refusal is one line that names the thing and says what mends it."""
+    """Raise `Broken` unless a refusal is one line that names the fault and the remedy."""
     if not said.startswith("pixcal: ") or not said.endswith("\n") or len(said.splitlines()) != 1:
         raise Broken(f"{where}: not one line: {said[:300]!r}")
     if any(ord(c) < 32 or ord(c) == 127 for c in said[:-1]):
@@ -231,7 +231,7 @@ def _line(words: Sequence[str]) -> str:
 
 
 def calibrate(acquisition: Path, run: Path, names: Sequence[str] = (), *more: str) -> None:
-    """Take an acquisition through ingest, reduce, fit, allan and ``more``, as far as they go.
+    """Run ingest, reduce, fit, allan and ``more`` on an acquisition, as far as they get.
 
     ``names``: what a refusal of ingest must name one of; later steps name the set or the run.
     """

@@ -1,4 +1,4 @@
-"""A small acquisition whose truth is known, to be spoilt before it is written; plain NumPy."""
+"""A small acquisition with a known truth, to be damaged before it is written; plain NumPy."""
 
 import json
 from collections.abc import Mapping
@@ -117,10 +117,10 @@ class Night:
         return folder
 
     def check(self, run: Path) -> None:
-        """Hold the products of a run against the truth.
+        """Compare the products of a run with the truth.
 
-        Raises Broken where flags, NaN and SIGMA do not belong together, a pixel that is spoilt has
-        a value, or an error is beyond `WITHIN` of its SIGMA, the modes that no data tell removed.
+        Raises Broken if flags, NaN and SIGMA disagree, a damaged pixel has a value, or an error
+        exceeds `WITHIN` times its SIGMA after removal of the degenerate modes.
         """
         told = json.loads((run / "products" / "fit.json").read_text())
         for name in told["outputs"]:

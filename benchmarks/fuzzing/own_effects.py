@@ -1,4 +1,4 @@
-"""Files with effects of the user's own that are wrong in some way, given to simulate."""
+"""Faulty files with the user's own effects, given to simulate."""
 
 import numpy as np
 from astropy.io import fits

@@ -1,4 +1,4 @@
-"""Globs that lead out of an acquisition, and text with markup on its way into the report."""
+"""Globs that lead out of an acquisition, and markup in text for the report."""
 
 import json
 from html.parser import HTMLParser

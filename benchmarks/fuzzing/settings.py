@@ -192,7 +192,7 @@ def _bomb(depth: int) -> str:
 
 
 def _text(case: Case, good: str) -> bytes:
-    """Text that is spoilt in a way of its own."""
+    """Text damaged in a random way."""
     lines = good.splitlines(keepends=True)
     at = int(case.rng.integers(len(lines)))
     key = lines[at].partition(":")[0].strip(" -") or "x"
@@ -258,7 +258,7 @@ def _text(case: Case, good: str) -> bytes:
 
 
 def _spoilt_acquisition(case: Case) -> None:
-    """Text of acquisition.yaml that is no plain YAML, or other than it was."""
+    """Text of acquisition.yaml that is changed, or not plain YAML."""
     night, folder = _night()
     file = folder / f"text-{case.number}.yaml"
     file.write_bytes(_text(case, _dump(night.described)))
@@ -271,7 +271,7 @@ def _spoilt_acquisition(case: Case) -> None:
 
 
 def _spoilt_bench(case: Case) -> None:
-    """Text of a bench file that is no plain YAML, or other than it was."""
+    """Text of a bench file that is changed, or not plain YAML."""
     file = case.folder / "bench.yaml"
     file.write_bytes(_text(case, BENCH.read_text(encoding="utf-8")))
     pixcal("budget", file, "--precision", "1e-3", names=[file.name])

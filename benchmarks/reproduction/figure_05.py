@@ -42,7 +42,7 @@ def row_phases(frame: NDArray[Any], k: float) -> F64:
 
 
 def leading_bend(bench: Bench, x: float) -> F64:
-    """``-q_x (q² + B²/4) / (2 D²)`` (y,) at a column of the chip, px: where fringes seem to lie.
+    """``-q_x (q² + B²/4) / (2 D²)`` (y,) at a column of the chip, px: apparent shift of fringes.
 
     The path difference (paper, equation 3) to the order after the paraxial one (equation 4), q from
     the foot of the fibres' centre. The part with B² only makes the interfringe longer.

@@ -60,7 +60,7 @@ def true_light(scene: Scene) -> tuple[F64, F64, F64]:
 
 
 def measure(scene: Scene) -> Estimates:
-    """Fit the first set and hold everything against the truth."""
+    """Fit the first set and compare everything with the truth."""
     name = scene.bench.frames.fringes[0].name
     run, truth, told = scene.fit(), scene.truth(name), scene.truth_of_sets()[name]
     iota, alpha, delta, sigma = read_set(run, name, "iota", "alpha", "delta", "sigma")

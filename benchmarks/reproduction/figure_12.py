@@ -33,7 +33,7 @@ OFFSET = {"horizontal": "δy", "vertical": "δx"}
 
 
 def predicted_teeth(couplings: Sequence[Coupling], vector: tuple[float, float]) -> F64:
-    """Offset (row,) that couplings feign in each row of their period, px, less its mean.
+    """Apparent offset (row,) due to couplings in each row of their period, px, less its mean.
 
     The phase of a receiver moves by ``arg(sum_n k_n exp(i K n))``, n from the receiver to where
     its signal comes from (physics note, section 5). ``couplings`` do not depend on the column;

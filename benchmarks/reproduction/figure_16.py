@@ -15,7 +15,7 @@ from reproduction.outcome import Outcome, Row
 
 @dataclass(frozen=True)
 class Paths:
-    """What the crests of a set say of its fibres."""
+    """Fibre positions from the crests of a set."""
 
     facts: dict[str, Any]  # the set's part of ``crests.json``
     truth: Geometry

@@ -1,4 +1,4 @@
-"""Simulated acquisitions and their runs in a folder: made once, taken up where they were cut short.
+"""Simulated acquisitions and their runs in a folder: made once, resumed after an interruption.
 
 The stages themselves skip what is up to date, so a scene has no bookkeeping of its own.
 """
@@ -137,7 +137,7 @@ class Lab:
         return load_bench(CONFIGS / f"{name}.yaml")
 
     def sized(self, name: str, *, side: int | None = None, frames: int | None = None) -> Bench:
-        """The same, cut to a smaller size unless the paper's own is wanted."""
+        """The same, reduced to a smaller size unless that of the paper is requested."""
         bench = self.bench(name)
         return bench if self.full else resized(bench, side=side, frames=frames)
 

@@ -1,4 +1,4 @@
-"""What the figures look for in maps of offsets: modes, teeth, crests, chance patterns."""
+"""Patterns in maps of offsets that the figures measure: modes, teeth, crests, chance."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ F64 = NDArray[np.float64]
 def sloping_harmonics(shape: tuple[int, int], vector: tuple[float, float]) -> F64:
     """The same, and with strengths that grow along x and y (12, y, x).
 
-    A fringe vector that is held while it moves leaves the latter (physics note, section 2).
+    A moving fringe vector that is held constant leaves the latter (physics note, section 2).
     """
     waves, slopes = harmonics(shape, vector), plane(shape)
     return np.asarray((slopes[:, None] * waves).reshape(-1, *shape))
@@ -77,7 +77,7 @@ class Crest:
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Whether a map of errors is chance alone; each in units of its own chance deviation."""
+    """Whether a map of errors is due to chance alone; each in units of its chance scatter."""
 
     # neighbours_x, neighbours_y: correlation of neighbours
     neighbours_x: float

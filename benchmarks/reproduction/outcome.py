@@ -1,4 +1,4 @@
-"""What a figure leaves: a picture and measured numbers, told in words."""
+"""Outcome of a figure: a picture and measured numbers, described in words."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -15,7 +15,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A figure made again."""
+    """A reproduced figure."""
 
     figure: str  # number or numbers in the paper
     title: str

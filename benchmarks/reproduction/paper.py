@@ -1,4 +1,4 @@
-"""What the paper states, and where: the only numbers of the page that no run measured.
+"""Statements of the paper, with their place: the only numbers of the page not measured by a run.
 
 Rousset et al., "Pixel-Level Calibration for Space-Based High Precision Astrometry Using Young's
 Fringes".
