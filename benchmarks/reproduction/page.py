@@ -16,7 +16,10 @@ Young's Fringes", simulated and analysed with the benches in [`configs/paper`]({
 `{command}` ({version}) writes these pages. Numbers in the column "here" are measured in that run;
 [numbers.json](numbers.json) holds all of them. {size}
 """
-QUICK = "Windows and frames are smaller than the paper's; `make reproduce-full` uses those of the paper."
+QUICK = (
+    "Windows and frames are smaller than the paper's; `make reproduce-full` uses those of the "
+    "paper."
+)
 FULL = "Windows and frames are the paper's."
 
 
