@@ -102,7 +102,7 @@ def test_a_pattern_of_any_form_is_measured_mode_by_mode(
 
 
 def test_a_wave_has_four_numbers() -> None:
-    with pytest.raises(InputError, match="wave_cos, wave_sin: give as many numbers of each"):
+    with pytest.raises(InputError, match="wave_cos, wave_sin: give the same number of values"):
         FlatError(wave_x_rad_px=(0.1,), wave_y_rad_px=(0.2,), wave_cos=(0.01,))
 
 

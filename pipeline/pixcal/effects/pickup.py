@@ -70,7 +70,9 @@ class Pickup(Effect):
 
     def __post_init__(self) -> None:
         if not len(self.rms) == len(self.columns) == len(self.rows):
-            raise InputError("rms, columns and rows: give as many numbers of each, one for a tone")
+            raise InputError(
+                "rms, columns and rows: give the same number of values for each, one per tone"
+            )
 
     def read_variance(self, detector: SimulatedDetector) -> float:
         return float(np.square(self.rms).sum())
