@@ -40,9 +40,9 @@ FROM_ACQUISITION = (acquisition_argument, out_run_option)
 @command(options.Run, "pixcal run data_samples/demo --out demo", arguments=FROM_ACQUISITION)
 def run(acquisition: Path, run: Path, config: options.Run, runtime: "Runtime") -> None:
     """All steps."""
-    from pixcal.stages import chain  # here: for a fast `pixcal --help`
+    from pixcal.stages import whole_run  # here: for a fast `pixcal --help`
 
-    done = chain.run(acquisition, run, config, runtime, results.announce, click.echo)
+    done = whole_run.run(acquisition, run, config, runtime, results.announce, click.echo)
     results.show_run(run, *done)
 
 

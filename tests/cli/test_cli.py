@@ -149,8 +149,8 @@ def test_help_loads_no_heavy_library() -> None:
 
 @pytest.mark.long
 def test_a_run_loads_no_library_that_few_runs_need() -> None:
-    loaded = loaded_with("pixcal.stages.chain")
-    assert "pixcal.stages.chain" in loaded
+    loaded = loaded_with("pixcal.stages.whole_run")
+    assert "pixcal.stages.whole_run" in loaded
     assert not loaded & {"scipy.stats", "scipy.signal", "distributed", "pandas"}
 
 

@@ -13,8 +13,8 @@ from pixcal.estimators.detector.response import FALLOFFS_PX
 from pixcal.estimators.diagnosis.evidence import Evidence, central_crop
 from pixcal.kernels.boundaries import (
     REACH,
-    boundary_pushes,
     boundary_shifts,
+    mean_boundary_shifts,
     moved_charge,
     shared_noise,
 )
@@ -102,7 +102,7 @@ def test_the_covariance_of_flats_is_that_of_the_area_changes() -> None:
 
 def test_shared_noise_is_the_jacobian_of_the_moved_charge() -> None:
     shifts = STRONG * boundary_shifts(0.5)
-    pushes = boundary_pushes(SCENE[None], shifts)
+    pushes = mean_boundary_shifts(SCENE[None], shifts)
     y, x, by = 6, 7, np.float32(500)
     for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2)):
 

@@ -12,9 +12,9 @@ from pixcal.effects.lag import Lag
 from pixcal.estimators.detector.flat_ladder import warming
 from pixcal.estimators.detector.frame_lag import LagNonuniformity, lag_of_flats
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack, central_crop
+from pixcal.kernels.charge_release import without_lag
 from pixcal.kernels.normals import Key, pixel_normals
 from pixcal.kernels.scene import Rows
-from pixcal.kernels.transfer import without_lag
 from pixcal.model.arrays import F32
 from pixcal.model.bench import Bench
 from pixcal.simulation import exposure

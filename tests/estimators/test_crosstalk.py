@@ -13,7 +13,7 @@ from pixcal.estimators.crosstalk.kernel import best_period, coupling_of
 from pixcal.estimators.crosstalk.links import PixelClasses, class_sums, links, periods, sums_of
 from pixcal.estimators.crosstalk.maps import Maps
 from pixcal.estimators.crosstalk.sources import Sources
-from pixcal.estimators.crosstalk.support import INDEPENDENT, sigmas_of, standing_out
+from pixcal.estimators.crosstalk.support import INDEPENDENT, sigmas_of, significant_links
 from pixcal.estimators.fringe_fit.modes import solve_modes
 from pixcal.estimators.maps.corrected import (
     corrected_offsets,
@@ -111,10 +111,10 @@ def test_noise_that_far_pixels_share_is_refused_at_once():
     steps = links((24, 24))
     near = tuple(s for s in steps if max(map(abs, s)) < 3)
     shared = noise_shared(steps, near)
-    assert standing_out(shared)[0] == near
+    assert significant_links(shared)[0] == near
     assert best_period(shared.of(near)).count == 1
     with pytest.raises(InputError, match=r"^not decided: .* 48 of them beyond 2 pixels"):
-        standing_out(noise_shared(steps, steps))
+        significant_links(noise_shared(steps, steps))
 
 
 def test_less_is_enough_for_adjacent_pixels_that_couple_alike():
@@ -124,7 +124,7 @@ def test_less_is_enough_for_adjacent_pixels_that_couple_alike():
     def taken(alike, chi2):
         # Of the share there and back as one number: 2 × 576 pixels of weight 1e4.
         share = (chi2 / (2 * 576 * 1e4)) ** 0.5
-        return list(standing_out(noise_shared(steps, alike, share))[0])
+        return list(significant_links(noise_shared(steps, alike, share))[0])
 
     assert taken([(0, 1)], 15.0) == [(0, 1)]
     assert taken([(0, 2)], 15.0) == []

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pixcal.estimators.fringe_fit.fit_flags import excess_scatter, fit_flags, usual_chi2
+from pixcal.estimators.fringe_fit.fit_flags import excess_scatter, fit_flags, typical_chi2
 from pixcal.model.flags import PixelFlag
 
 SHAPE, FREEDOM = (97, 113), 497
@@ -30,7 +30,7 @@ def flagged(chi2: np.ndarray, noise: float, excess: float, limit: float = 1.1) -
 @pytest.mark.parametrize("freedom", [13, 97, FREEDOM])
 def test_pure_noise_is_usual_and_has_no_excess(freedom: int) -> None:
     values = np.random.default_rng(3).chisquare(freedom, 200_000) / freedom
-    assert usual_chi2(1.7 * values, freedom) == pytest.approx(1.7, rel=3e-3)
+    assert typical_chi2(1.7 * values, freedom) == pytest.approx(1.7, rel=3e-3)
     # the square root of what is left of a difference of squares
     assert excess_scatter(1.7 * values, freedom) < 0.2 * np.sqrt(2 / freedom)
 
@@ -50,7 +50,7 @@ def test_pixels_that_share_an_effect_are_no_defects() -> None:
     unlike = np.random.default_rng(5).standard_normal(SHAPE)
     chi2 = of_noise(1 + 0.3 * unlike**2)
     chi2[11, 13] = 20
-    usual = (usual_chi2(chi2.ravel(), FREEDOM), excess_scatter(chi2.ravel(), FREEDOM))
+    usual = (typical_chi2(chi2.ravel(), FREEDOM), excess_scatter(chi2.ravel(), FREEDOM))
     found = flagged(chi2, *usual)
     assert found[11, 13]
     assert found.mean() < 1e-3
@@ -58,5 +58,5 @@ def test_pixels_that_share_an_effect_are_no_defects() -> None:
 
 
 def test_without_pixels_nothing_is_unusual() -> None:
-    assert usual_chi2(np.empty(0), 7) == 1.0
+    assert typical_chi2(np.empty(0), 7) == 1.0
     assert excess_scatter(np.empty(0), 7) == 0.0

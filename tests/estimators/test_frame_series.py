@@ -14,7 +14,7 @@ from pixcal.estimators.frame_series.series import (
     motion_series,
     without,
 )
-from pixcal.estimators.frame_series.spectral_line import cleared_of_line, find_line
+from pixcal.estimators.frame_series.spectral_line import find_line, without_line
 from pixcal.estimators.frame_series.variance_components import walk_modes
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
 from pixcal.estimators.fringe_fit.tile_fit import Coding
@@ -187,7 +187,7 @@ def test_a_line_is_found_with_its_frequency_and_amplitude(frame: np.ndarray) -> 
     rng = np.random.default_rng(4)
     swing = np.sin(2 * np.pi * 1.7 * 0.14 * frame)[:, None] * [0.8, 0.4]
     every = [series_of(swing + rng.standard_normal(swing.shape), frame) for _ in range(2)]
-    line, cleared = cleared_of_line(every, white)
+    line, cleared = without_line(every, white)
     assert line is not None
     assert line.significant
     assert line.hz == pytest.approx(1.7, abs=4 * line.hz_error)
@@ -203,7 +203,7 @@ def test_a_strong_slow_line_leaves_no_power_behind(phase: float) -> None:
     frame = np.arange(298)
     swing = 12 * np.sin(2 * np.pi * 0.88 * 0.14 * frame + phase)[:, None] * [1.0, 1.0]
     series = series_of(swing + np.random.default_rng(8).standard_normal(swing.shape))
-    line, (cleared,) = cleared_of_line([series], white)
+    line, (cleared,) = without_line([series], white)
     assert line is not None
     assert line.significant
     # 298 values: their standard deviation is known to a twenty-fourth.

@@ -19,7 +19,7 @@ from pixcal.estimators.frame_series.variance_components import (
     trace_products,
     walk_modes,
 )
-from pixcal.kernels.processes import damped_walk
+from pixcal.kernels.processes import autoregression
 
 T = 199
 EVEN = walk_modes(np.arange(float(T)))
@@ -76,7 +76,7 @@ def damped_power(frames: int, keep: float) -> np.ndarray:
 def test_a_damped_walk_has_the_power_that_is_said() -> None:
     rng, modes = np.random.default_rng(3), walk_modes(np.arange(400.0))
     power = np.mean(
-        [modes.of(damped_walk(rng.standard_normal(400), 0.9)) ** 2 for _ in range(400)], axis=0
+        [modes.of(autoregression(rng.standard_normal(400), 0.9)) ** 2 for _ in range(400)], axis=0
     )
     ratio = power / damped_power(400, 0.9)
     blocks = ratio[: 19 * 21].reshape(19, 21).mean(axis=1)
@@ -205,7 +205,8 @@ def test_a_time_constant_is_found() -> None:
     rng = np.random.default_rng(9)
     pulls = []
     for _ in range(6):
-        series = rng.standard_normal(600) + 2 * damped_walk(rng.standard_normal(600), np.exp(-0.1))
+        slow = autoregression(rng.standard_normal(600), np.exp(-0.1))
+        series = rng.standard_normal(600) + 2 * slow
 
         def fit(
             value: float, start: Components | None, steps: int = 60, series: np.ndarray = series

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pixcal.kernels.sample_sums import (
-    calm_residuals,
+    clipped_residuals,
     count_beyond,
     count_remainders,
     frame_means,
@@ -42,7 +42,7 @@ def test_outliers_and_gaps_are_zero_and_counted() -> None:
     use = good & (np.abs(size) < 8)
     assert np.any(good & (np.abs(size) > 8))
     limits = np.array([2.0, 5.0, 9.0])
-    calm, kept, noise, beyond = calm_residuals(samples, model, shot, read, good, 8.0, limits)
+    calm, kept, noise, beyond = clipped_residuals(samples, model, shot, read, good, 8.0, limits)
     np.testing.assert_allclose(calm, np.where(use, size, 0), rtol=1e-5)
     np.testing.assert_array_equal(kept, np.where(use, rest, 0))
     np.testing.assert_allclose(noise, variance[:, good].mean(axis=1), rtol=1e-5)

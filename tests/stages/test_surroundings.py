@@ -7,7 +7,7 @@ from pixcal.effects.ipc import Ipc
 from pixcal.kernels.crosstalk import couple_fringes, uncouple_fringes
 from pixcal.model.flags import PixelFlag
 from pixcal.simulation.effect import FringeMaps
-from pixcal.stages.correct.correct_maps import border_misfit, decided, disturbed
+from pixcal.stages.correct.correct_maps import border_misfit, open_sides, perturbed
 from pixcal.stages.correct.sweep_to_correct import usable
 
 K = (2 * np.pi / 9, 0.02)
@@ -47,7 +47,7 @@ def test_the_maps_tell_whether_the_detector_goes_on_at_a_side(is_open):
 
 def test_a_side_that_does_not_tell_goes_by_the_others():
     misfits = np.array([[100.0, 3.0], [2.0, 3.0], [40.0, 90.0], [5.0, 4.0]])
-    assert decided(misfits) == (True, True, False, True)
+    assert open_sides(misfits) == (True, True, False, True)
 
 
 def test_errors_of_neighbours_add_up_in_squares():
@@ -56,7 +56,7 @@ def test_errors_of_neighbours_add_up_in_squares():
     theta = np.stack([np.full(shape, 2e4), 2e4 * np.sin(psi), 2e4 * np.cos(psi)])
     unknown = np.zeros(shape, bool)
     unknown[4, 3] = unknown[3, 4] = True
-    moved = disturbed(
+    moved = perturbed(
         FringeMaps(theta, K, (5, 7)), unknown, np.zeros_like(unknown), np.zeros(shape)
     )
     z = np.array([m.theta[2] + 1j * m.theta[1] for m in moved]) - (theta[2] + 1j * theta[1])

@@ -47,7 +47,7 @@ def _call(stage: str, *args: Any, **values: Any) -> Any:
 
 def _all_steps(acquisition: StrPath, out: StrPath, options: of.Run, runtime: Runtime) -> Run:
     notes: list[str] = []
-    _call("chain", Path(acquisition), Path(out), options, runtime, note=notes.append)
+    _call("whole_run", Path(acquisition), Path(out), options, runtime, note=notes.append)
     for note in notes:
         warnings.warn(note, stacklevel=3)
     return open_run(out)

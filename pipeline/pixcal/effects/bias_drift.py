@@ -8,10 +8,10 @@ import numpy as np
 
 from pixcal.estimators.detector.noiseless_charge import noiseless_level
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.light import LIGHT_PARTS, fringe_courses, light_of
+from pixcal.estimators.frame_series.light import LIGHT_PARTS, fringe_offset_series, light_of
 from pixcal.estimators.frame_series.offset import (
     OffsetSeries,
-    dark_courses,
+    dark_offset_series,
     dark_offsets,
     fringe_offsets,
     offset_modes,
@@ -135,9 +135,9 @@ class BiasDrift(Effect):
     def replayed(self, evidence: Evidence) -> Self | None:
         """As in `Effect.replayed`: slow offsets and jitter of fringes; all offsets of darks."""
         light = light_of(evidence)
-        lit, jitter = ([], self.jitter_rms) if light is None else fringe_courses(light)
+        lit, jitter = ([], self.jitter_rms) if light is None else fringe_offset_series(light)
         tracks = [_with_level(Track.of(name, time, e), evidence) for name, time, e in lit]
-        tracks += [Track.of(name, time, e) for name, time, e in dark_courses(evidence)]
+        tracks += [Track.of(name, time, e) for name, time, e in dark_offset_series(evidence)]
         return replace(self, tracks=tuple(tracks), jitter_rms=jitter) if tracks else None
 
     def undo(self, maps: FringeMaps) -> FringeMaps | None:

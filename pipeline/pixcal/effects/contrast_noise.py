@@ -6,8 +6,8 @@ from typing import Self
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.light import light_courses
-from pixcal.kernels.processes import damped_walk
+from pixcal.estimators.frame_series.light import light_changes
+from pixcal.kernels.processes import autoregression
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Stage
@@ -54,12 +54,12 @@ class ContrastNoise(Effect):
         drawn = recording.rng(self.name, 1).standard_normal(recording.count)
         keep = np.exp(-recording.period_s / self.polarisation_s) if self.polarisation_s else 0.0
         factor = np.exp(-energy * self.vibration_rad**2 / 2)
-        factor *= np.maximum(1 + self.polarisation * damped_walk(drawn, keep), 0.0)
+        factor *= np.maximum(1 + self.polarisation * autoregression(drawn, keep), 0.0)
         factor *= np.maximum(1 + at(self.tracks, recording.set_name, recording.times_s), 0.0)
         most = states.level / recording.bench.optics_of(recording.number).visibility
         return replace(states, amplitude=np.minimum(states.amplitude * factor, most))
 
     def replayed(self, evidence: Evidence) -> Self | None:
-        courses = light_courses(evidence)
+        courses = light_changes(evidence)
         tracks = tuple(Track.of(name, time, change) for name, time, _, change in courses)
         return replace(self, vibration_rad=0.0, polarisation=0.0, tracks=tracks)

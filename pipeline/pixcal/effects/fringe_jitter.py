@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.kernels.processes import swing
+from pixcal.kernels.processes import mean_sine
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Stage
@@ -53,7 +53,7 @@ class FringeJitter(Effect):
         drawn = recording.rng(self.name).standard_normal((recording.count, 2))
         time = recording.times_s
         phase = 2 * np.pi * recording.rng(self.name, 1).random()
-        swung = swing(time, self.vibration_hz, phase, recording.exptime_s)
+        swung = mean_sine(time, self.vibration_hz, phase, recording.exptime_s)
         change = drawn * np.array(self.rms) + np.outer(swung, self.vibration)
         return moved(states, recording, change, self.along_x, self.along_y)
 

@@ -6,8 +6,8 @@ from typing import Self
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.light import ambient_shares, light_courses, separate_powers
-from pixcal.kernels.processes import damped_walk, swing
+from pixcal.estimators.frame_series.light import ambient_shares, light_changes, separate_powers
+from pixcal.kernels.processes import autoregression, mean_sine
 from pixcal.kernels.scene import FrameStates
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.config import quantity
@@ -77,8 +77,8 @@ class IntensityNoise(Effect):
         keep = np.exp(-recording.period_s / self.correlation_s) if self.correlation_s else 0.0
         time = recording.times_s
         phase = 2 * np.pi * recording.rng(self.name, 1).random()
-        change = self.rms * damped_walk(drawn, keep)
-        change += self.line * swing(time, self.line_hz, phase, recording.exptime_s)
+        change = self.rms * autoregression(drawn, keep)
+        change += self.line * mean_sine(time, self.line_hz, phase, recording.exptime_s)
         change += at(self.tracks, recording.set_name, time)
         level = np.maximum(1 + (1 - self._ambient(recording.number)) * change, 0.0)
         contrast = self.separate * recording.rng(self.name, 2).standard_normal(recording.count)
@@ -87,7 +87,7 @@ class IntensityNoise(Effect):
         return replace(states, level=states.level * level, amplitude=states.amplitude * fringe)
 
     def replayed(self, evidence: Evidence) -> Self | None:
-        courses = light_courses(evidence)
+        courses = light_changes(evidence)
         share = {name: self._ambient(n) for n, name in enumerate(evidence.fringes)}
         tracks = tuple(
             Track.of(name, time, level / (1 - share[name])) for name, time, level, _ in courses

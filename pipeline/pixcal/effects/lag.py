@@ -17,9 +17,9 @@ from pixcal.estimators.detector.lag_by_level import BANDS, by_level, in_bands
 from pixcal.estimators.detector.noiseless_charge import missing_noise
 from pixcal.estimators.detector.persistence import LONGEST, persistence
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, central_crop
+from pixcal.kernels.charge_release import fill_traps, left_behind, released_by_frame
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import sigmas_of_best
-from pixcal.kernels.transfer import fill_traps, left_behind, released_by_frame
 from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench, SimulatedDetector
 from pixcal.model.config import quantity

@@ -16,7 +16,7 @@ from pixcal.estimators.frame_series.row_sums import (
     settling_sigmas,
     steps_of,
 )
-from pixcal.estimators.maps.corrected import imprint, left_in_samples
+from pixcal.estimators.maps.corrected import absorbed_map_change, unabsorbed_power
 from pixcal.kernels.synthesis import illuminate
 from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench
@@ -160,7 +160,7 @@ class RollingShutter(Effect):
         rows = np.clip(maps.origin[0] - first + np.arange(theta.shape[1]), 0, count - 1)
         g, noise = maps.frames.g, maps.frames.read_noise_e
         for share, change in self._changes(maps.frames):
-            theta = theta - share[rows, None] * imprint(theta, g, change, noise)
+            theta = theta - share[rows, None] * absorbed_map_change(theta, g, change, noise)
         return replace(maps, theta=theta / flat)
 
     def noise_factor(self, charge: float, read_noise: float, maps: FringeMaps) -> F64:
@@ -169,7 +169,7 @@ class RollingShutter(Effect):
         if maps.frames is not None:
             g, noise = maps.frames.g, maps.frames.read_noise_e
             for share, change in self._changes(maps.frames):
-                left = left + share**2 * left_in_samples(maps.theta, g, change, noise)
+                left = left + share**2 * unabsorbed_power(maps.theta, g, change, noise)
         return np.full(maps.theta.shape[1:], (1 + np.median(left)) ** -0.5)
 
     def _changes(self, frames: FittedFrames) -> Iterator[tuple[F64, F64]]:

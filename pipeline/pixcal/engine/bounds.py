@@ -95,7 +95,7 @@ class Bound:
         return f"{self.seconds:g} s of processor time{memory}"
 
 
-def held_by_others() -> int:
+def other_memory() -> int:
     """Bytes that this process now holds for work other than pixcal's."""
     return max(0, _resident() - OWN)
 

@@ -8,14 +8,14 @@ from contextlib import suppress
 # mapped separately; number of arenas.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 
-OF_THE_NANNY = "65536"  # MALLOC_TRIM_THRESHOLD_ that Dask's nanny sets for its workers
+NANNY_THRESHOLD = "65536"  # MALLOC_TRIM_THRESHOLD_ that Dask's nanny sets for its workers
 
 
 def keep_freed_memory() -> None:
     """Let glibc's malloc reuse buffers in a worker of a Dask nanny."""
     # The nanny sets MALLOC_TRIM_THRESHOLD_, which stops malloc from adapting: fresh pages for each
     # chunk make a sweep 3 to 4 times slower. The limits here are those that malloc would adapt to.
-    if os.environ.get("MALLOC_TRIM_THRESHOLD_") == OF_THE_NANNY:
+    if os.environ.get("MALLOC_TRIM_THRESHOLD_") == NANNY_THRESHOLD:
         _mallopt({_MMAP_THRESHOLD: 32 << 20, _TRIM_THRESHOLD: 64 << 20})
 
 

@@ -26,7 +26,7 @@ from rich.progress import (
 )
 from threadpoolctl import ThreadpoolController
 
-from pixcal.engine.bounds import held_by_others
+from pixcal.engine.bounds import other_memory
 from pixcal.engine.remote_task import Job, RemoteTask, pack
 from pixcal.model.errors import ClusterError, InputError
 from pixcal.model.options import Running
@@ -56,7 +56,7 @@ class Runtime(Running):
         Bytes that this process held for other work when this began, which ``memory`` leaves out.
     """
 
-    excluded_bytes: int = field(default_factory=held_by_others, compare=False, repr=False)
+    excluded_bytes: int = field(default_factory=other_memory, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         known = ("threads", "processes", "sync")

@@ -88,7 +88,7 @@ def moved_charge(charge: F32, shifts: F64, along_y: float = 1.0, light: F32 | No
     return out
 
 
-def boundary_pushes(charge: F32, shifts: F64) -> tuple[F32, F32]:
+def mean_boundary_shifts(charge: F32, shifts: F64) -> tuple[F32, F32]:
     """Mean shift (px) of the boundaries to the right of and below each pixel, in frames (t, y, x).
 
     The charge is in e-; shifts are as in `moved_charge`.
@@ -112,8 +112,8 @@ def shared_noise(
 
     To first order in the shift, for any scene; zero where either lies within `REACH` of the edges.
 
-    ``charge``: (t, y, x) mean charge, e-; ``pushes``: from `boundary_pushes`; ``shifts``: as in
-    `moved_charge`; ``step``: rows and columns; ``axes``: factors of the shifts of boundaries
+    ``charge``: (t, y, x) mean charge, e-; ``pushes``: from `mean_boundary_shifts`; ``shifts``: as
+    in `moved_charge`; ``step``: rows and columns; ``axes``: factors of the shifts of boundaries
     between columns and between rows.
     """
     out = np.zeros_like(charge)

@@ -34,7 +34,7 @@ def since_gap(numbers: Indices, steps: int) -> Mask:
     return np.asarray(place - begins[np.searchsorted(begins, place, "right") - 1] < steps)
 
 
-def slow_courses(frame: Indices) -> F32:
+def slow_trends(frame: Indices) -> F32:
     """Orthonormal functions (t, k) of the frame number for drifting light, a constant first."""
     past = (frame - frame[0]) / max(int(frame[-1] - frame[0]), 1)
     courses = legvander(2 * past - 1, min(3, (len(frame) - 1) // 8))

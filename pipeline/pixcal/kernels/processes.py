@@ -49,7 +49,7 @@ def _variance(period: int) -> F64:
 HORIZON, LEVELS = 2.0**24, 30
 
 
-def damped_walk(normals: F64, keep: float) -> F64:
+def autoregression(normals: F64, keep: float) -> F64:
     """First-order autoregression of unit variance: a random walk with a restoring force to zero.
 
     From independent standard normals (t,); ``keep`` is the correlation of neighbours, 0 to below 1.
@@ -70,7 +70,7 @@ def _walk(normals: F64, keep: float, step: float, walk: F64) -> None:
         at = keep * walk[n]
 
 
-def swing(time_s: F64, hz: float, phase: float, exptime_s: float = 0.0) -> F64:
+def mean_sine(time_s: F64, hz: float, phase: float, exptime_s: float = 0.0) -> F64:
     """Mean of a sine over exposures starting at times (t,), s; ``phase`` (rad) at time 0."""
     middle = 2 * np.pi * hz * (time_s + exptime_s / 2) + phase
     return np.asarray(np.sinc(hz * exptime_s) * np.sin(middle))

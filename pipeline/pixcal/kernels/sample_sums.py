@@ -8,7 +8,7 @@ from pixcal.kernels import kernel
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 
-def calm_residuals(
+def clipped_residuals(
     samples: F32, model: F32, shot: F32, read: F32, good: Mask, most: float, limits: F64
 ) -> tuple[F32, F32, F64, F64]:
     """Residuals with and without division by their noise, and sums from the same sweep.

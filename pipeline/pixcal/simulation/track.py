@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.fringe_motion import vector_courses
+from pixcal.estimators.frame_series.fringe_motion import vector_changes
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
@@ -45,7 +45,7 @@ def at(tracks: Iterable[Track], name: str, time_s: F64 | float) -> F64:
 
 def vector_tracks(evidence: Evidence, *, slow: bool) -> list[tuple[Track, ...]]:
     """Slow or fast change of the fringe vectors along x and along y, rad/px, as measured."""
-    courses = vector_courses(evidence)
+    courses = vector_changes(evidence)
     changes = [(name, time, slowly if slow else fast) for name, time, slowly, fast in courses]
     return [tuple(Track.of(name, time, c[:, axis]) for name, time, c in changes) for axis in (0, 1)]
 

@@ -19,7 +19,7 @@ from scipy.special import chdtrc
 
 from pixcal.estimators.crosstalk.links import PixelClasses, Place, links
 from pixcal.estimators.crosstalk.sources import Sources, sources_of, total
-from pixcal.estimators.crosstalk.support import standing_out
+from pixcal.estimators.crosstalk.support import significant_links
 from pixcal.estimators.crosstalk.trails import SURE, trailing
 from pixcal.estimators.diagnosis.evidence import Evidence, central_crop
 from pixcal.kernels.crosstalk import Coupling, largest_outflow
@@ -69,7 +69,7 @@ class Kernel:
 def significance(evidence: Evidence) -> float | None:
     """Of the strongest coupling, in sigmas, corrected for the number of trials."""
     sources = _examined(evidence)[1]
-    return None if sources is None else standing_out(sources)[1]
+    return None if sources is None else significant_links(sources)[1]
 
 
 def measure(evidence: Evidence) -> tuple[Kernel | None, float] | None:
@@ -81,7 +81,7 @@ def measure(evidence: Evidence) -> tuple[Kernel | None, float] | None:
     evidence, sources = _examined(evidence)
     if sources is None:
         return None
-    there, sigmas = standing_out(sources)
+    there, sigmas = significant_links(sources)
     if not there:
         return None, sigmas
     near, classes = within(sources.shape, there), best_period(sources.of(there))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.distortions import TwoWay
+from pixcal.estimators.diagnosis.distortions import FramesByPixels
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.crosstalk import Coupling, filled, uncouple, uncouple_fringes
@@ -113,9 +113,9 @@ def _noise(
     """Residuals (t, n) of the good pixels without the parts common to pixels or to frames."""
     variance = charge + read
     weight = np.where(rest**2 < CLIP**2 * variance, 1 / variance, np.float32(0))
-    freedom = TwoWay(weight, of_time, of_place)
+    freedom = FramesByPixels(weight, of_time, of_place)
     rest = freedom.left_over(rest)
-    rest /= np.sqrt(np.maximum(1 - freedom.taken_by_pixels(), np.float32(MIN_NOISE_SHARE)))
+    rest /= np.sqrt(np.maximum(1 - freedom.absorbed_by_pixels(), np.float32(MIN_NOISE_SHARE)))
     # Excess noise lowers the weight of every product.
     excess = (rest**2 * weight).sum(dtype=float) / max(np.count_nonzero(weight), 1)
     weight = weight / np.float32(max(1.0, excess))

@@ -38,7 +38,7 @@ def sigmas_of(*families: tuple[float, int]) -> float:
     return float(max(sigmas))
 
 
-def standing_out(sources: Sources) -> tuple[tuple[Place, ...], float]:
+def significant_links(sources: Sources) -> tuple[tuple[Place, ...], float]:
     """Links that stand out, and the significance of the best.
 
     Raises InputError if so many are far apart that it is no kernel.

@@ -9,10 +9,10 @@ from scipy.optimize import minimize_scalar
 from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker, level_before, warming
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
+from pixcal.kernels.charge_release import without_lag
 from pixcal.kernels.frame_order import follows
 from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.significance import root_with_error
-from pixcal.kernels.transfer import without_lag
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 # of the phase, free in each pixel so that a nonlinear response is not taken for lag

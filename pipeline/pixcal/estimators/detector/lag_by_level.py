@@ -16,10 +16,10 @@ import numpy as np
 from pixcal.estimators.detector.frame_lag import MAX_DECAY, CommonLag
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import MAX_SAMPLES, Evidence, FringeEvidence, central_crop
+from pixcal.kernels.charge_release import fill_traps, released_by_frame
 from pixcal.kernels.frame_order import since_gap
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.robust import robust_sigma
-from pixcal.kernels.transfer import fill_traps, released_by_frame
 from pixcal.model.arrays import F32, F64
 
 BANDS = (0.0, 0.125, 0.25, 0.5)  # where bands of the level begin, over the full scale

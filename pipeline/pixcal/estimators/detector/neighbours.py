@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.distortions import Freedom, TwoWay
+from pixcal.estimators.diagnosis.distortions import FramesByPixels, Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, cached_on_evidence
-from pixcal.kernels.boundaries import REACH, boundary_pushes, shared_noise
-from pixcal.kernels.frame_order import slow_courses
+from pixcal.kernels.boundaries import REACH, mean_boundary_shifts, shared_noise
+from pixcal.kernels.frame_order import slow_trends
 from pixcal.kernels.line_means import without_line_means
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F32, F64
@@ -67,7 +67,7 @@ def shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
     n = 2 * len(DIRECTIONS) + 2
     normal, right = np.zeros((n, n)), np.zeros(n)
     for noise in _noises(evidence):
-        pushes = boundary_pushes(noise.charge, shifts)
+        pushes = mean_boundary_shifts(noise.charge, shifts)
         for d, step in enumerate(DIRECTIONS):
             at = [2 * d, 2 * d + 1, n - 2, n - 1]
             given = noise.charge, pushes, shifts, step
@@ -155,8 +155,8 @@ def _of_flats(stack: Stack, evidence: Evidence) -> Iterator[NoiseBlock]:
     # Copies, not views: for views the kernels would be compiled a second time.
     variance = np.repeat((charge + np.float32(evidence.read_noise**2))[None], len(frames), 0)
     weight = np.where(good, 1 / variance, np.float32(0)).reshape(len(frames), -1)
-    courses = np.ascontiguousarray(slow_courses(stack.frame).T)
-    freedom = TwoWay(weight, courses, light.reshape(1, -1).astype(np.float32))
+    courses = np.ascontiguousarray(slow_trends(stack.frame).T)
+    freedom = FramesByPixels(weight, courses, light.reshape(1, -1).astype(np.float32))
     noise = without_line_means(frames - charge, good)
     residual = freedom.left_over(noise.reshape(weight.shape))
     residual[np.abs(residual) * np.sqrt(weight) > _CLIP] = 0

@@ -46,7 +46,7 @@ def _last_of(
         variance = fringes.variance[:, fringes.good] * flat**2
         # The fit of a pixel takes most of the variance of dark samples, which weigh most: an offset
         # of the signal by 3 / t of its harmonic mean would change the variances alike.
-        left = np.maximum(1 - Freedom(fringes).taken_by_pixels(), _LEAST_LEFT)
+        left = np.maximum(1 - Freedom(fringes).absorbed_by_pixels(), _LEAST_LEFT)
         square = (fringes.residual[:, fringes.good] * flat) ** 2 / left
         kept = square < _CLIP * variance
         square, weight = np.where(kept, square, 0), np.where(kept, 0.5 / variance**2, 0)

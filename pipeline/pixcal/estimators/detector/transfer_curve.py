@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack, cached_on_evidence
-from pixcal.kernels.frame_order import slow_courses
+from pixcal.kernels.frame_order import slow_trends
 from pixcal.kernels.line_means import without_line_means
 from pixcal.kernels.residual_sums import residual_sums
 from pixcal.kernels.robust import robust_sigma
@@ -183,7 +183,7 @@ def _of_stack(evidence: Evidence, stack: Stack) -> F64 | None:
     # Noise that every second row shares does not average out over few frames.
     residual = without_line_means(frames - brighter, good)
     # A lamp that drifts, with its shape, is no noise either.
-    slow = slow_courses(stack.frame)
+    slow = slow_trends(stack.frame)
     residual -= np.tensordot(slow, np.tensordot(slow, residual, (0, 0)), 1)
     residual /= np.sqrt(1 - (slow**2).sum(axis=1))[:, None, None]
     nothing = np.zeros((len(frames), 1))

@@ -39,7 +39,7 @@ _ROUNDS_OF_FIRST = 4
 MAX_DISAGREEMENT = 0.25
 
 
-class TwoWay:
+class FramesByPixels:
     """A table of frames by pixels, with free functions of time and of place.
 
     weight : (t, n) one over the variance; zero where a sample has no weight
@@ -95,7 +95,7 @@ class TwoWay:
         rest[self.weight == 0] = 0
         return rest
 
-    def taken_by_pixels(self) -> F32:
+    def absorbed_by_pixels(self) -> F32:
         """Share (t, n) of the variance that the pixels' free parameters absorb."""
         k, count = self.of_time.shape
         products = (self.of_time[:, None] * self.of_time).reshape(k * k, count)
@@ -103,7 +103,7 @@ class TwoWay:
         return np.asarray(products.T @ inverse.T * self.weight)
 
 
-class Freedom(TwoWay):
+class Freedom(FramesByPixels):
     """The directions in which a fit of a fringe set is free.
 
     Frames are free in (B, A cos phi, A sin phi) and the fringe vector; pixels in the three maps, in

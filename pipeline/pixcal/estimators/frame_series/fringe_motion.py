@@ -12,7 +12,7 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, cached_on_evidence
 from pixcal.estimators.frame_series.series import MEDIAN, FrameSeries, mode_variance, motion_series
-from pixcal.estimators.frame_series.spectral_line import Line, cleared_of_line
+from pixcal.estimators.frame_series.spectral_line import Line, without_line
 from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F64
 
@@ -57,7 +57,7 @@ def motion_of(evidence: Evidence) -> Motion | None:
     hops = {s.name: find_hops(s) for s in found}
     # A hop affects all modes, so shapes that follow the phase are fitted after its removal.
     still = [_with_hops(s, hops[s.name], -1.0).cleaned() for s in found]
-    line, cleared = cleared_of_line(still, _level)
+    line, cleared = without_line(still, _level)
     angles = [np.arctan2(s.k[1], s.k[0]) for s in found]
     return Motion(
         series=cleared,
@@ -68,7 +68,7 @@ def motion_of(evidence: Evidence) -> Motion | None:
     )
 
 
-def vector_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
+def vector_changes(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
     """Of every set: name, times (t,), slow and fast change (t, 2) of the fringe vector, rad/px.
 
     Walk modes, each reduced by its share of noise (Wiener); the fast part keeps its power.

@@ -14,14 +14,14 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, cached_on_evidence
 from pixcal.estimators.frame_series.offset import dark_offsets
 from pixcal.estimators.frame_series.series import (
-    Course,
     FrameSeries,
+    TimedValues,
     assemble,
     light_series,
     mode_variance,
     wiener,
 )
-from pixcal.estimators.frame_series.spectral_line import Line, cleared_of_line
+from pixcal.estimators.frame_series.spectral_line import Line, without_line
 from pixcal.estimators.frame_series.variance_components import Modes, estimate_components
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
@@ -79,7 +79,7 @@ class FrameLight:
         return np.asarray(power[:, None, None] * pattern)
 
 
-def light_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
+def light_changes(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
     """Of every set: name, times (t,), relative intensity and contrast (t,), Wiener-filtered."""
     found = []
     for f in evidence.fringes.values():
@@ -103,7 +103,7 @@ def _levels(found: FringeEvidence) -> tuple[F64, F64]:
 def ambient_shares(evidence: Evidence) -> list[tuple[float, float]]:
     """Share of each set's mean light that does not follow the laser, and its error."""
     found = dict.fromkeys(evidence.fringes, (0.0, 1.0))
-    for name, _, level, contrast in light_courses(evidence):
+    for name, _, level, contrast in light_changes(evidence):
         square = float(level @ level)
         if square > 0:
             slope = float(level @ contrast) / square
@@ -151,7 +151,7 @@ def light_of(evidence: Evidence) -> FrameLight | None:
     def variance(series: FrameSeries) -> F64:
         return mode_variance(series, np.stack([light.part(name, series) for name in parts]))
 
-    line, cleared = cleared_of_line(sets, variance, channels=(0,))
+    line, cleared = without_line(sets, variance, channels=(0,))
     return replace(light, sets=cleared, line=line)
 
 
@@ -175,7 +175,7 @@ def _dark_series(stack: Stack, number: int, evidence: Evidence) -> FrameSeries |
     )
 
 
-def fringe_courses(light: FrameLight) -> tuple[list[Course], float]:
+def fringe_offset_series(light: FrameLight) -> tuple[list[TimedValues], float]:
     """Slow offsets of every set, from changes of B but not A; then the remainder, e- rms."""
     light = replace(light, dark=())
     drifts, every = ("offset_walk", "offset_smooth"), (*LIGHT_PARTS, "offset_smooth")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, stripe_half
-from pixcal.estimators.frame_series.series import Course, wiener
+from pixcal.estimators.frame_series.series import TimedValues, wiener
 from pixcal.estimators.frame_series.variance_components import (
     Modes,
     estimate_components,
@@ -166,7 +166,7 @@ def unlit_stacks(evidence: Evidence, *kinds: str) -> list[Stack]:
     return [s for s in evidence.stacks if s.kind in kinds and not evidence.soon_after_light(s)]
 
 
-def dark_courses(evidence: Evidence) -> list[Course]:
+def dark_offset_series(evidence: Evidence) -> list[TimedValues]:
     """Changes of the level of bias and dark frames, where these have one exposure time."""
     found = []
     for kind in ("bias", "dark"):

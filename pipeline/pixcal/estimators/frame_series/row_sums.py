@@ -255,7 +255,7 @@ def _fit(sets: Sequence[RowSums], way: int, origin: float | None) -> tuple[float
     for sums in sets:
         f = sums.found
         _, cosine, sine = f.g.T
-        step = beside_own_phase(steps_of(f.phi, way, origin), f.phi)
+        step = without_own_harmonics(steps_of(f.phi, way, origin), f.phi)
         # Derivative of B, A cos phi and A sin phi by the phase, times the step.
         other = step[:, None] * np.stack([np.zeros(len(step)), -sine, cosine], axis=1)
         own, vector = sums.share(other[sums.inside])
@@ -279,7 +279,7 @@ def _fit(sets: Sequence[RowSums], way: int, origin: float | None) -> tuple[float
     return gain, share, np.sqrt(variance)
 
 
-def beside_own_phase(step: F64, phi: F64) -> F64:
+def without_own_harmonics(step: F64, phi: F64) -> F64:
     """Steps (t,) without harmonics of the frames' own phases."""
     turns = np.outer(phi, np.arange(OWN_ORDERS + 1))
     own = np.hstack([np.cos(turns), np.sin(turns[:, 1:])])

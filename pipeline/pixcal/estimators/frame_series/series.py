@@ -33,7 +33,7 @@ MIN_NOISE = 0.05  # lowest size of the noise, over the prediction
 BELOW = 0.15  # how negative a size may be, over the noise
 
 
-Course = tuple[str, F64, F64]
+TimedValues = tuple[str, F64, F64]
 """Fringe set or e.g. ``bias frames``; times (t,) from its first frame, s; offsets (t,), e-."""
 
 

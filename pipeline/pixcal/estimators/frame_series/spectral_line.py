@@ -66,7 +66,7 @@ def find_line(
     return Line(hz, sharpness, amplitude, error, min(float(chance), 0.0))
 
 
-def cleared_of_line(
+def without_line(
     every: Sequence[FrameSeries],
     level: Callable[[FrameSeries], F64],
     channels: Sequence[int] = (0, 1),

@@ -40,7 +40,7 @@ def fit_flags(mask: U8, maps: TileMaps, noise: float, excess: float, chi2_limit:
     return flags
 
 
-def usual_chi2(values: NDArray[np.floating], freedom: int) -> float:
+def typical_chi2(values: NDArray[np.floating], freedom: int) -> float:
     """Median of reduced chi-squares over that of pure noise."""
     return float(np.median(values) / _noise_chi2(0.0, freedom)) if len(values) else 1.0
 

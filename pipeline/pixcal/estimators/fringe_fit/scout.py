@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from pixcal.estimators.fringe_fit import fringes, tile_fit
-from pixcal.estimators.fringe_fit.fit_flags import excess_scatter, usual_chi2
+from pixcal.estimators.fringe_fit.fit_flags import excess_scatter, typical_chi2
 from pixcal.estimators.fringe_fit.fringes import MIN_FRINGES_FOR_MAPS, FrameParameters
 from pixcal.estimators.fringe_fit.gauge import gauge_matrix
 from pixcal.estimators.fringe_fit.tile_fit import Coding, Tile
@@ -100,7 +100,7 @@ class Scout:
         if self.moving:
             frames = self._settled(codes, frames, ITERATIONS_MOVING)
             chi2 = self._chi2(codes, frames)
-        self.noise = usual_chi2(chi2, n_frames - 3)
+        self.noise = typical_chi2(chi2, n_frames - 3)
         self.excess_scatter = excess_scatter(chi2, n_frames - 3)
         return frames
 

@@ -59,16 +59,16 @@ def corrected_offsets(delta: F64, sigma: F64, change: F64, modes: F64, k: float)
 # Change of the maps of pixels whose frame parameters differ from those of the fit
 
 
-def usual_fringe(theta: F64, count: int) -> tuple[F64, F64]:
+def median_fringe(theta: F64, count: int) -> tuple[F64, F64]:
     """Phases (count,) over a fringe, and maps (3, count) at median mean and amplitude."""
     psi = np.linspace(0, 2 * np.pi, count, endpoint=False)
     mean, amplitude = np.median(theta[0]), np.median(np.hypot(theta[1], theta[2]))
     return psi, np.stack([np.full(count, mean), amplitude * np.sin(psi), amplitude * np.cos(psi)])
 
 
-def imprint(theta: F64, g: F64, change: F64, read_noise_e: float) -> F64:
+def absorbed_map_change(theta: F64, g: F64, change: F64, read_noise_e: float) -> F64:
     """Change (3, y, x) of maps, e-, for a change (t, 3) of the frames' parameters ``g``."""
-    psi, usual = usual_fringe(theta, PHASES)
+    psi, usual = median_fringe(theta, PHASES)
     taken = _taken(g, change, _weight(g @ usual, read_noise_e))
     at = np.arctan2(theta[1], theta[2])
     moved = np.empty_like(theta)
@@ -78,9 +78,9 @@ def imprint(theta: F64, g: F64, change: F64, read_noise_e: float) -> F64:
     return moved
 
 
-def left_in_samples(theta: F64, g: F64, change: F64, read_noise_e: float) -> float:
-    """Mean square over the noise variance of changes that maps do not absorb; see `imprint`."""
-    _, usual = usual_fringe(theta, PHASES)
+def unabsorbed_power(theta: F64, g: F64, change: F64, read_noise_e: float) -> float:
+    """Mean square over the noise variance of changes beyond `absorbed_map_change`."""
+    _, usual = median_fringe(theta, PHASES)
     weight = _weight(g @ usual, read_noise_e)
     taken = _taken(g, change, weight)
     rest = change @ usual - g @ np.einsum("pij,jp->ip", taken, usual)

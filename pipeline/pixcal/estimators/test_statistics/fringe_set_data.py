@@ -18,7 +18,7 @@ from pixcal.estimators.maps.structure import (
     without_outliers,
 )
 from pixcal.kernels.sample_sums import (
-    calm_residuals,
+    clipped_residuals,
     count_remainders,
     level_sums,
     neighbour_products,
@@ -48,7 +48,7 @@ class FringeSetData:
         fringes, maps = self.fringes, (self.fringes.shot_factor, self.fringes.read_variance)
         shot, read = (noise.astype(np.float32) for noise in maps)
         limits = np.array(OUTLIERS)
-        return calm_residuals(
+        return clipped_residuals(
             fringes.electrons, fringes.model, shot, read, self.good, OUTLIER_SIGMA, limits
         )
 
@@ -153,7 +153,7 @@ class FringeSetData:
         return np.stack([np.cos(psi), np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)])
 
     @cached_property
-    def maps_beside_fringes(self) -> dict[str, F64]:
+    def maps_without_fringes(self) -> dict[str, F64]:
         """The flat maps less fringes, whose power varies widely with errors of four phases."""
         return {
             name: values - np.tensordot(fit_terms(values, self.fringe_terms), self.fringe_terms, 1)

@@ -85,7 +85,7 @@ MAP_LINES = tuple((f"{m[0]}_{lines}", *m, lines) for m in MAPS for lines in AXES
 def repeats_of_lines(of: str, data: FringeSetData) -> Curve:
     """Size of patterns that repeat over rows or columns."""
     name, lines = of.split("_")
-    size = np.abs(repeats(data.maps_beside_fringes[name], AXES[lines]))
+    size = np.abs(repeats(data.maps_without_fringes[name], AXES[lines]))
     return Curve(np.array(PERIODS, float), size)
 
 
@@ -96,7 +96,7 @@ def repeats_of_lines(of: str, data: FringeSetData) -> Curve:
 def profiles_of_lines(of: str, data: FringeSetData) -> Curve:
     """Power of the means of rows or columns."""
     name, lines = of.split("_")
-    along = profile(data.maps_beside_fringes[name], AXES[lines])
+    along = profile(data.maps_without_fringes[name], AXES[lines])
     power = np.abs(np.fft.rfft(along)[1:]) ** 2 * 2 / len(along) ** 2
     return _binned(np.arange(1, len(power) + 1) / len(along), power)
 
@@ -145,7 +145,7 @@ def _power_beside_lines(values: F64) -> tuple[F64, F64, F64, Mask]:
 )  # fmt: skip
 def scales(name: str, data: FringeSetData) -> Curve:
     """Power in bins of spatial frequency."""
-    values = data.maps_beside_fringes[name]
+    values = data.maps_without_fringes[name]
     power, fy, fx, apart = _power_beside_lines(values)
     power = power / values.size**2
     return _binned(np.hypot(fy, fx)[apart], power[apart] * values.size)
@@ -157,7 +157,7 @@ def scales(name: str, data: FringeSetData) -> Curve:
 )  # fmt: skip
 def peak(name: str, data: FringeSetData) -> Curve:
     """Highest power of a single frequency."""
-    values = data.maps_beside_fringes[name]
+    values = data.maps_without_fringes[name]
     power, fy, fx, apart = _power_beside_lines(values)
     at = np.unravel_index(int(np.argmax(np.where(apart, power, 0))), power.shape)
     highest = float(power[at]) / values.size**2 * 4
@@ -170,7 +170,7 @@ def peak(name: str, data: FringeSetData) -> Curve:
 )  # fmt: skip
 def by_place(name: str, data: FringeSetData) -> Curve:
     """Mean square in cells of the window."""
-    squares = data.maps_beside_fringes[name] ** 2
+    squares = data.maps_without_fringes[name] ** 2
     return Curve.numbered(by_cell(squares, np.isfinite(squares)))
 
 

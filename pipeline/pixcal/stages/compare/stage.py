@@ -49,10 +49,10 @@ STRAY = 0.05  # expected number of pixels of a window left out by chance
 FEWEST = 50  # fewest common pixels
 PARALLEL_DEG = 10.0  # largest angle between axes of single sets that can be compared
 NOTED_DEG = 0.5  # angle between axes above which the difference is reported
-CLAIM = 1e-3  # false-alarm rate of differences, over all tests together
+FALSE_ALARM_RATE = 1e-3  # false-alarm rate of differences, over all tests together
 # kinds of evidence: scales, columns, rows, means of blocks, scatter in blocks, single pixels
 FAMILIES = 6
-SHARE = CLAIM / FAMILIES
+SHARE = FALSE_ALARM_RATE / FAMILIES
 LISTED = 10  # most blocks, and most pixels, that are listed
 
 
@@ -251,7 +251,7 @@ def describe(
 
 
 def _evidence(facts: dict[str, Any]) -> list[str]:
-    """Significant differences in words; the false-alarm rate of the whole list is `CLAIM`."""
+    """Significant differences in words; `FALSE_ALARM_RATE` is that of the whole list."""
     evidence, scales = [], facts["scales"]
     limit = -ndtri(SHARE / max(1, len(scales)))
     sides = [str(s["side_px"]) for s in scales if s["significance"] > limit]
@@ -277,7 +277,7 @@ def _evidence(facts: dict[str, Any]) -> list[str]:
 
 def _suspicion(scales: list[dict[str, Any]]) -> str | None:
     """Warning on maps that agree better than their errors allow."""
-    limit = ndtri(CLAIM / max(1, len(scales)))
+    limit = ndtri(FALSE_ALARM_RATE / max(1, len(scales)))
     close = [str(s["side_px"]) for s in scales if s["significance"] < limit]
     if not close:
         return None

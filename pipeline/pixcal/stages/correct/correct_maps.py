@@ -30,9 +30,9 @@ from pixcal.stages.correct.sweep_to_correct import (
     Swept,
     border_change,
     corrected,
-    free_of_samples,
     maps_of,
     padded,
+    without_sample_effects,
 )
 from pixcal.stages.correct.uncertainty import parameter_variance, task_bytes
 from pixcal.stages.fit.sweep import BATCH_MAPS
@@ -170,7 +170,7 @@ def _of_neighbours(
         return np.zeros(known.shape)
     within = padded(np.ones([b - a for a, b in swept.within(part)], bool), swept, part, False)
     phase = ArrayReader(swept.folder / "phase").read(*swept.within(part)).astype(float)
-    others = disturbed(maps, within & ~known, ~within, phase)
+    others = perturbed(maps, within & ~known, ~within, phase)
     steps = [phase_change(after.theta, corrected(o, swept.effects)[0].theta) for o in others]
     error = np.sqrt(np.mean(np.square(steps), axis=0))
     return np.asarray(np.where(known, error, 0.0))
@@ -199,7 +199,7 @@ def _sums(
 # Surroundings of the pixels of a tile: flagged pixels, and pixels beyond the window
 
 
-def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, phase: F64) -> list[FringeMaps]:
+def perturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, phase: F64) -> list[FringeMaps]:
     """The maps with unknown pixels perturbed by their errors, with the signs of `SIGNS`.
 
     ``unknown``: pixels with any light up to twice that around them; ``beyond``: pixels outside the
@@ -224,7 +224,7 @@ def sides_of(sets: Sequence[Swept]) -> Sides:
         if swept.passes_borders and min(swept.source.shape) >= 2 * DEPTH:
             for side in range(4):
                 misfits[side] += [_misfit(swept, side, is_open) for is_open in (False, True)]
-    return decided(misfits)
+    return open_sides(misfits)
 
 
 def _misfit(swept: Swept, side: int, is_open: bool) -> float:
@@ -239,7 +239,7 @@ def _misfit(swept: Swept, side: int, is_open: bool) -> float:
     top, bottom, left, right = (is_open and n == side for n in range(4))
     one = replace(swept, open_sides=(top, bottom, left, right))
     inside = one.inside(y, x)
-    maps, good = free_of_samples(one, one.around(y, x))
+    maps, good = without_sample_effects(one, one.around(y, x))
     theta, good = corrected(maps, swept.effects)[0].theta[(slice(None), *inside)], good[inside]
     if axis:
         theta, good, kx, ky = theta.swapaxes(1, 2), good.T, ky, kx
@@ -276,7 +276,7 @@ def border_misfit(theta: F64, k: tuple[float, float], good: Mask) -> float:
     return total
 
 
-def decided(misfits: F64) -> Sides:
+def open_sides(misfits: F64) -> Sides:
     """Which sides are open, from the chi-squares (side, closed or open)."""
     gain = misfits[:, 0] - misfits[:, 1]
     top, bottom, left, right = np.where(np.abs(gain) > CLEAR, gain > 0, gain.sum() > 0).tolist()

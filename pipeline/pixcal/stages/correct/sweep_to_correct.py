@@ -136,7 +136,7 @@ def maps_of(swept: Swept, part: Part) -> tuple[FringeMaps, Mask, Mask]:
     return maps, padded(good, swept, part, False), padded(known, swept, part, False)
 
 
-def free_of_samples(swept: Swept, part: Part) -> tuple[FringeMaps, Mask]:
+def without_sample_effects(swept: Swept, part: Part) -> tuple[FringeMaps, Mask]:
     """Maps of a part as fitted without effects on samples; pixels (y, x) with an offset."""
     maps, good, _ = maps_of(replace(swept, folder=swept.raw or swept.folder), part)
     for effect in swept.samples:
@@ -150,9 +150,9 @@ def border_change(swept: Swept, part: Part) -> F64:
     if there == part or not any(effect.undo_halo for effect in swept.samples):
         return np.zeros([b - a for a, b in part])
     y0, x0 = (t[0] - p[0] for t, p in zip(there, part, strict=True))
-    closed = free_of_samples(replace(swept, open_sides=CLOSED), there)[0].theta
+    closed = without_sample_effects(replace(swept, open_sides=CLOSED), there)[0].theta
     at = np.s_[:, y0 : y0 + closed.shape[1], x0 : x0 + closed.shape[2]]
-    change = phase_change(closed, free_of_samples(swept, part)[0].theta[at])
+    change = phase_change(closed, without_sample_effects(swept, part)[0].theta[at])
     return np.asarray(padded(change, swept, part, 0.0))
 
 

@@ -31,7 +31,7 @@ MAX_SIGMA = 0.2  # phase error (rad) above which a window counts as without frin
 MIN_COVERAGE = 0.5  # least share of a window's pixels that exist and are good
 MIN_POINTS = 12  # fewest windows with fringes: as many again as the geometry has parameters
 # relative distance from the nominal vector above which a vector is the beam's, not the fringes'
-MAX_AWAY = 0.5
+MAX_DEVIATION = 0.5
 SEED_PIXELS = 256  # side of the patch where the fringe vector is first sought
 # passes over the first frame: curvature left by the second moves points by some 1e-6 rad
 SETTLING = 2
@@ -95,7 +95,7 @@ def seed_vector(patch: NDArray[Any], good: Mask, nominal: Vector) -> Vector:
         raise InputError("no fringes found: the frame is dark; check which files the set lists")
     maps = np.where(good, patch, level).astype(np.float64)[None] / level - 1
     k = find_fringe_vector(maps, good, nominal)
-    if np.hypot(k[0] - nominal[0], k[1] - nominal[1]) > MAX_AWAY * np.hypot(*nominal):
+    if np.hypot(k[0] - nominal[0], k[1] - nominal[1]) > MAX_DEVIATION * np.hypot(*nominal):
         measured, expected = interfringe(k), interfringe(nominal)
         raise InputError(
             f"no fringes found near the nominal ones: the strongest period is {measured:.1f} px, "

@@ -10,9 +10,9 @@ import numpy as np
 from pixcal.estimators.maps.corrected import (
     MIN_SIGNAL,
     corrected_offsets,
+    median_fringe,
     phase_change,
     straight_modes,
-    usual_fringe,
 )
 from pixcal.estimators.maps.structure import OffsetModel, true_offsets
 from pixcal.estimators.maps.two_beams import contrast_surface, light_surface
@@ -119,7 +119,7 @@ def _between(phase: F64) -> F64:
 
 def _taken_by_frames(g: F64, light: F64) -> F64:
     """Part of a change at each phase (MAP_PHASES) that parameters (t, 3) of frames absorb."""
-    psi, usual = usual_fringe(light, 2 * MAP_PHASES)
+    psi, usual = median_fringe(light, 2 * MAP_PHASES)
     weight = 1 / np.maximum(g @ usual, MIN_SIGNAL)
     of_pixels = np.einsum("tp,ti,tj->pij", weight, g, g)
     of_frames = np.einsum("tp,ip,jp->tij", weight, usual, usual)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, one_blas_thread, run_tasks
-from pixcal.estimators.fringe_fit.fit_flags import fit_flags, usual_chi2
+from pixcal.estimators.fringe_fit.fit_flags import fit_flags, typical_chi2
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
 from pixcal.estimators.fringe_fit.scout import Scout, serial_map
 from pixcal.estimators.fringe_fit.sweep import (
@@ -62,10 +62,10 @@ SCOUT_TILES = 5  # tiles that the scout reads if they can be kept in memory
 CACHE_BYTES = 384 << 20
 PRIME_BYTES = 48 << 20  # memory for the codes of the scout's first look
 # chunks along time from which the first look takes frames: one may hold little of a slow scan
-LOOKS = 16
-# most frames of the first look: the three unknowns per pixel add a fraction 3 / `LOOK_FRAMES` to
+SCOUT_BLOCKS = 16
+# most frames of the first fit: three unknowns per pixel add a fraction 3 / `FIRST_FIT_FRAMES` to
 # the variance of the frames' parameters; the time of the rank-three search grows with the square
-LOOK_FRAMES = 128
+FIRST_FIT_FRAMES = 128
 
 
 def load_run(run_dir: Path, command: str = "") -> Acquisition:
@@ -167,7 +167,7 @@ def sweep_set(
         "chunks": source.signal.n_chunks,
         "chunks_read": int(facts["chunks_read"] + table[..., 0].sum()),
         "bound_rad": float(np.nanmedian(bounds)) if np.isfinite(bounds).any() else None,
-        "chi2_reduced": usual_chi2(chi2, source.n_frames - 3),
+        "chi2_reduced": typical_chi2(chi2, source.n_frames - 3),
         "batch_frames": batches.frames,
         "batch_period_s": batches.period_s,
         "batch_note": batches.note,
@@ -348,9 +348,9 @@ def _solve_block(codes: Callable[[int], list[U16]], scout: Scout, block: int) ->
 
 def _first_look(source: ReducedSet, blocks: int) -> list[tuple[int, Indices]]:
     """Blocks spread over the run and frames of each, as many in total as in ``blocks`` blocks."""
-    wanted = min(source.n_blocks, max(blocks, LOOKS))
+    wanted = min(source.n_blocks, max(blocks, SCOUT_BLOCKS))
     each = max(1, source.block * max(1, min(blocks, wanted)) // wanted)
-    each = min(each, -(-LOOK_FRAMES // wanted))
+    each = min(each, -(-FIRST_FIT_FRAMES // wanted))
     # At random: evenly spaced frames may all have the same phase.
     rng = np.random.default_rng(0)
     looks = []

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.kernels.transfer import left_behind
+from pixcal.kernels.charge_release import left_behind
 
 SHAPE = (211, 307)
 
