@@ -1,4 +1,4 @@
-"""No room: at the n-th write of a command, and on a real file system that is too small."""
+"""Full disk: at the n-th write of a command, and on a real file system that is too small."""
 
 import builtins
 import errno

@@ -145,7 +145,8 @@ def make(lab: Lab) -> Outcome:
             ),
         ),
         difference="The shape agrees. The distance in pixels hardly depends on the baseline. "
-        f"The paper gives 7 px for the shortest period, its equation 4 gives {number(period, 2)} "
+        "The paper gives 7 px for the shortest period, but its equation 4 gives "
+        f"{number(period, 2)} "
         "px.",
         numbers={
             "bend_edge_px": middle,

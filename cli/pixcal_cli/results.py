@@ -165,7 +165,7 @@ def show_allan(run: Path) -> None:
         for region, curve in ({"all": curves} | curves["regions"]).items():
             rows.append((name, region, *_allan_row(curve)))
         notes += [f"{name}: {sentence}" for sentence in curves["warnings"]]
-    show_table(("set", "region", "slope", "knee", "frames", "deviation px", "if white px"), rows)
+    show_table(("set", "region", "slope", "knee", "frames", "deviation px", "white noise px"), rows)
     show_notes(notes)
 
 

@@ -72,13 +72,13 @@ class Nonlinearity(Effect):
         -0.015,
         low=-0.3,
         high=0.3,
-        doc="relative deviation at level_e that is proportional to the signal",
+        doc="relative deviation at level_e, of the term proportional to the signal",
     )
     cubic: float = quantity(
         -0.005,
         low=-0.3,
         high=0.3,
-        doc="relative deviation at level_e that is proportional to the square of the signal",
+        doc="relative deviation at level_e, of the term proportional to its square",
     )
     level_e: float = quantity(
         50_000.0,

@@ -185,7 +185,7 @@ def worst_of_each_domain(curves: Sequence[Facts]) -> tuple[list[Facts], list[Fac
 
 def statistics(title: str, curves: Sequence[Facts], causes: Any) -> Table:
     """A row for each statistic: its worst value, measured and simulated."""
-    after = ["with causes", "significance (σ)", "residual"] if causes else []
+    after = ["with causes", "its significance (σ)", "residual"] if causes else []
     header = ["domain", "statistic", "where", "measured", "nominal", "difference / scatter"]
     header += ["significance (σ)", *after]
     return Table(title, header, [_row(c, bool(causes)) for c in curves])
