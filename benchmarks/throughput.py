@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def rates(work: Workload, repeat: int) -> None:
-    """Rates of the stages, and the fit's time over the scan's."""
+    """Rates of the stages, and the ratio of fit to scan time."""
     gb = work.gigabytes
     work.simulate()
     print(f"{gb:.2f} GB of raw samples: {work.shape[1]} x {work.shape[0]} px, {work.frames} frames")

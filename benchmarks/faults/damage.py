@@ -73,7 +73,7 @@ def _some(
 
 
 def metadata(bench: Bench, artefact: str, damage: Damage, times: int) -> Outcome:
-    """Damage files beside the chunks: the next command names them; their own makes them again."""
+    """Damage files beside the chunks: the next command names them; their own repairs them."""
     outcome = Outcome(f"metadata file: {WORDS[damage]}")
     rng = bench.rng(artefact, damage.__name__)
     for name in _some(bench, artefact, times, rng, chunks=False):

@@ -250,7 +250,7 @@ class FringeSet:
     mask : (y, x) uint8
         Bits of `pixcal.PixelFlag`.
     batch_delta, batch_sigma : (batch, y, x) float32
-        Offsets from each batch of frames alone, relative to the whole run's, and their errors, px.
+        Offsets from each batch of frames, relative to those of the whole run, and errors, px.
     """
 
     name: str

@@ -69,5 +69,10 @@ class ExcessNoise(Effect):
             (share - 1) / error,
             f"noise that grows with the level has {share:.3g} times the variance of the light, and "
             "the third moment of multiplied electrons",
-            size={"value": share, "error": error, "unit": "", "of": "= F², variance over light's"},
+            size={
+                "value": share,
+                "error": error,
+                "unit": "",
+                "of": "= F², variance over shot-noise variance",
+            },
         )

@@ -107,7 +107,7 @@ class GhostFringes(Effect):
     waves: tuple[GhostWave, ...] = quantity((), doc="measured ghosts, in addition to the one above")
 
     def _ghosts(self, of: str) -> list[tuple[Beat, complex, Parent]]:
-        """Beat, amplitude over the parent's, and parent of all ghosts in a set."""
+        """Beat, amplitude relative to the parent beam, and parent of all ghosts in a set."""
         own = self.share * np.exp(1j * self.phase_rad)
         ghosts = [(self.beat_rad_px, own, parent) for parent in PARENTS[self.parent]]
         for wave in self.waves:

@@ -107,7 +107,7 @@ class IntensityNoise(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """As of `Effect`, with what ambient light or separate powers do to the contrast."""
+        """As by `Effect`, with the change of contrast by ambient light or separate powers."""
         found = super().estimate(evidence)
         if found is None:
             return None

@@ -195,7 +195,7 @@ class Ipc(Effect):
         )
 
     def phase_slopes(self, maps: FringeMaps) -> F64:
-        """As in `Effect.phase_slopes`: a receiver's fringe contains a share of its source's."""
+        """As in `Effect.phase_slopes`: the source's fringe is added to that of the receiver."""
         flat = 1.0 if maps.flat is None else maps.flat
         z = (maps.theta[2] + 1j * maps.theta[1]) * flat
         found = np.zeros((len(self.couplings), *z.shape))

@@ -96,7 +96,7 @@ class Bound:
 
 
 def other_memory() -> int:
-    """Bytes that this process now holds for work other than pixcal's."""
+    """Bytes that this process now holds for work outside pixcal."""
     return max(0, _resident() - OWN)
 
 

@@ -298,7 +298,7 @@ def _fringe(
     n00: float, n01: float, n02: float, n11: float, n12: float, n22: float,
     b0: float, b1: float, b2: float, m1: float, m2: float,
 ) -> Any:  # fmt: skip
-    """Fringe phasor of a pixel across and along the model's, and the variance of its phase."""
+    """Fringe phasor of a pixel across and along that of the model; variance of its phase."""
     _, i01, i02, i11, i12, i22, det = _adjugate(n00, n01, n02, n11, n12, n22)
     inverse = 1.0 / det if det > SINGULAR * n00 * n11 * n22 else np.nan
     s = m1 + (i01 * b0 + i11 * b1 + i12 * b2) * inverse
@@ -353,7 +353,7 @@ def sweep_batches(
     turn: F32,
     sigma: F32,
 ) -> None:
-    """Add a block of frames to the sums of batches, and those of full batches to the run's.
+    """Add a block of frames to the sums of batches, and full batches to the sums of the run.
 
     Row by row, so that a row's sums stay in the first-level cache for any number of batches. The
     sums are: normal 00, 01, 02, 11, 12, 22; right-hand 0 to 2 (of the residual from the start

@@ -17,7 +17,7 @@ from pixcal.report.drawing import TITLE, WIDE, axes_grid
 CELLS = "cell of 4 × 4"  # `x_label` of curves whose values are cells of the window
 ASIDE = 3.0  # standard deviations below which a map is not shown
 LARGEST = 12.0  # standard deviations at the end of the colour scale
-# least side of a drawn window, share of the detector's: true windows would be dots
+# least side of a drawn window as a share of the detector: true windows would be dots
 SMALLEST = 0.17
 
 

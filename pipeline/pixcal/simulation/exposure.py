@@ -37,7 +37,8 @@ K = TypeVar("K", tuple[int, int], tuple[int, str])
 class Camera:
     """A range of rows (first, one after the last) of a bench with its effects.
 
-    Samples do not depend on the range. ``maps``: of the whole window, instead of the bench's.
+    Samples do not depend on the range. ``maps``: of the whole window, instead of those of the
+    bench.
     """
 
     def __init__(

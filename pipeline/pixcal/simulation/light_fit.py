@@ -173,7 +173,7 @@ class _Lit:
 
 
 def _shared(light: F64, visibility: F64, good: Mask) -> float:
-    """Slope of the light's noise against the visibility's, from neighbouring pixels."""
+    """Slope of the noise of light against that of visibility, from neighbouring pixels."""
     used = good[:, 1:] & good[:, :-1]
     steps = [np.diff(own, axis=1)[used] for own in (light, visibility)]
     kept = np.all([abs(own) < CLIP * np.median(abs(own)) for own in steps], axis=0)

@@ -1,4 +1,4 @@
-"""Which map to use, what limits it, and what each cause does to it: for the terminal and report."""
+"""Which map to use, what limits it, and how each cause affects it: for terminal and report."""
 
 import math
 import re

@@ -41,7 +41,7 @@ def damage_noted(*runs: Path) -> Iterator[None]:
 
 
 def _note_damage(run: Path, error: DamagedError) -> None:
-    """Note damaged data, so that the next run of the stage makes them again."""
+    """Note damaged data, so that the next run of the stage repairs them."""
     if _name_within(run / "products", error.path) is not None:
         error.advice = f"write it again with '{STAGES['fit'].typed(run)}'"
         return

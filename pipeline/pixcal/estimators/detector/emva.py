@@ -112,7 +112,8 @@ def spectrogram(a: F64, b: F64, *, axis: int) -> tuple[F64, F64, float]:
     """Spectrum of the mean of two averages (y, x), as for `nonuniformity`, along an axis (1: rows).
 
     Returns the frequencies (n,), cycles per pixel without zero; the roots (n,) of the mean power of
-    all rows or columns, which white noise of rms s makes s everywhere; the same of the map's noise.
+    all rows or columns, which are s everywhere for white noise of rms s; and the same for the noise
+    of the map.
     """
     n = a.shape[axis]
     scale = 1 / math.sqrt(n)

@@ -74,7 +74,7 @@ class PixelNoise:
         return cls(binned, np.cumsum(posterior, axis=1), log - np.log(mean), rounding)
 
     def drawn(self, rng: np.random.Generator) -> F32:
-        """Read noise (y, x) before rounding of every pixel over the detector's."""
+        """Read noise (y, x) of every pixel before rounding, over that of the detector."""
         known = self.bin >= 0
         own, n = self.bin[known], len(self.log)
         chance, within = rng.random((2, *self.bin.shape))

@@ -208,8 +208,8 @@ def distortion_sums(
 ) -> tuple[F64, F64]:
     """Normal matrix (count, count) and right-hand side (count,) of sizes that all sets share.
 
-    Parameters as in `fit_distortions`. Rows and columns of the sums serve for a subset of sizes.
-    The distortion is linearised about what its ``first`` size alone explains in each set.
+    Parameters as in `fit_distortions`. A subset of sizes uses the same rows and columns of the
+    sums. The distortion is linearised about what its ``first`` size alone explains in each set.
     """
     normal, right = np.zeros((count, count)), np.zeros(count)
     for fringes in sets:

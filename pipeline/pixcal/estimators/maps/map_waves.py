@@ -212,7 +212,7 @@ def _common(power: Mapping[str, F64]) -> F64:
 
 
 def _allowed(f: FringeEvidence) -> Mask:
-    """Frequencies at which waves of a set are sought: a grid twice as fine as the window's."""
+    """Frequencies at which waves of a set are sought, on a grid of half the window's step."""
     shape = f.good.shape
     fy, fx = np.meshgrid(*(np.fft.fftfreq(2 * n) for n in shape), indexing="ij")
     allowed = ~_of_lines(fx, fy, shape) & ((fy > 0) | ((fy == 0) & (fx > 0)))

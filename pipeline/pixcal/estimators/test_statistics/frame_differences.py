@@ -116,7 +116,7 @@ def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
     sets=False,
 )
 def bias_change(evidence: Evidence) -> Curve | None:
-    """Power of the change from the first to the second half of the frames, over the noise's."""
+    """Power of the change from the first to the second half of the frames, over that of noise."""
     stacks = [s for s in repeated(evidence, "bias") if len(s.adu) >= 4]
     if not stacks:
         return None

@@ -109,7 +109,7 @@ def _mean_product(sums: F64, count: F64) -> F64:
 
 
 def line_power(rest: F32, good: Mask) -> F64:
-    """Mean squares (4,) of means of lines over white noise's, rows before columns; bad pixels zero.
+    """Mean squares (4,) of means of lines over those of white noise, rows first; bad pixels zero.
 
     Of sums, then of differences of adjacent lines: noise that is white from line to line adds as
     much to both, a pattern does not.
@@ -190,7 +190,7 @@ def pixel_peakedness(data: FringeSetData) -> Curve:
     sets=False,
 )
 def read_noise(evidence: Evidence) -> Curve | None:
-    """Quantiles over the pixels of variance over the read noise's, hits by particles left out."""
+    """Quantiles over the pixels of variance over squared read noise, without particle hits."""
     # Masked pixels count if they jump.
     stacks = [s for s in evidence.of_kind("bias") if len(s.adu) >= FEWEST]
     if not stacks or not evidence.dithered:

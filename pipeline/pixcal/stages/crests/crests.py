@@ -30,7 +30,7 @@ from pixcal.stages.crests.windows import (
 MAX_SIGMA = 0.2  # phase error (rad) above which a window counts as without fringes
 MIN_COVERAGE = 0.5  # least share of a window's pixels that exist and are good
 MIN_POINTS = 12  # fewest windows with fringes: as many again as the geometry has parameters
-# relative distance from the nominal vector above which a vector is the beam's, not the fringes'
+# relative distance from the nominal vector above which a peak is due to the beam, not the fringes
 MAX_DEVIATION = 0.5
 SEED_PIXELS = 256  # side of the patch where the fringe vector is first sought
 # passes over the first frame: curvature left by the second moves points by some 1e-6 rad
@@ -85,7 +85,7 @@ class CrestPaths:
 
 
 def seed_vector(patch: NDArray[Any], good: Mask, nominal: Vector) -> Vector:
-    """Fringe vector (kx, ky), rad/px, of a patch (y, x) of a frame; its sign is the nominal's."""
+    """Fringe vector (kx, ky), rad/px, of a patch (y, x) of a frame; its sign is nominal."""
     if good.sum() < MIN_POINTS**2:
         raise InputError(
             "no fringes found: too few good samples in the centre of the frame; see its mask"

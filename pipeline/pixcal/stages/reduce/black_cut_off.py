@@ -64,7 +64,7 @@ class CutOff:
 
 
 class Black(NamedTuple):
-    """What a camera does to frames without light, as found on whole frames.
+    """How a camera treats frames without light, as measured on whole frames.
 
     Parts of the frames, and simulations of them, are reduced like the whole.
     """

@@ -86,7 +86,7 @@ def on_grid(
 
 
 def usual(job: Measuring, folder: Place, light: F64) -> Usual:
-    """Medians of the maps that `measure` wrote; ``light``: of each tile over the detector's."""
+    """Medians of the maps that `measure` wrote; ``light``: of each tile, relative to all."""
     names = ("response", "response_error", "dark_rate", "dark_variance", "dark_dof", "bias")
     response, error, rate, variance, dof, bias = on_grid(folder, job.shape, names, light)
     freedom = int(np.median(dof))

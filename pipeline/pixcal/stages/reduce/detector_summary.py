@@ -279,7 +279,7 @@ def _wells(
 
 
 def _light(tables: F64, levels: F64, usable: Mask, job: Measuring) -> F64:
-    """Light of each tile over the detector's, from usable steps or those losing fewest samples."""
+    """Light of each tile over the mean, from usable steps or those losing fewest samples."""
     if not job.flat:
         return np.ones(grid(job.shape))
     lost = tables[..., 2].sum(axis=(0, 1))
