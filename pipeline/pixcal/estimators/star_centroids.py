@@ -204,7 +204,7 @@ def correct_centroids(
 
 
 def correction_map(offsets: NDArray[np.floating], star: Star | None) -> F32:
-    """Correction (2, y, x) of the centroid of a star (None: a pixel), px; NaN offsets count as 0."""
+    """Correction (2, y, x) of a star's (None: pixel's) centroid, px; NaN offsets count as 0."""
     known = np.nan_to_num(offsets.astype(np.float32))
     if star is None:
         return known

@@ -106,7 +106,7 @@ def _main_domain(gap: Mapping[str, Any], *, residual: bool) -> str:
 
 
 def worst(curve: Mapping[str, Any]) -> int:
-    """Index of the value that differs most; with effects, if it differs only with them."""
+    """Index of the value that differs most, or of one that differs only with effects."""
     sigmas = curve["z"] if curve["in_gap"] else curve["z_after"]
     return max(range(len(sigmas)), key=lambda n: abs(sigmas[n]))
 

@@ -51,7 +51,7 @@ class Deviation:
 
 
 def weighed(maps: F64) -> Deviation:
-    """Maps less their smooth surfaces, weighted by differences of neighbours; NaN: weight 0."""
+    """Maps less smooth surfaces, with weights from differences of neighbours; NaN: weight 0."""
     flat, weight = without_smooth(maps), np.zeros(maps.shape)
     for own, out in zip(maps, weight, strict=True):
         steps = np.diff(own, axis=1)

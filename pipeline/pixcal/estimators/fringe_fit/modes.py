@@ -48,7 +48,7 @@ class ModeBasis:
         return modes, phase
 
     def sums(self, tiles: TileSums) -> tuple[F64, F64, float]:
-        """Normal matrix, right sides (mode, 1 + batch), square of phases less those of the shape."""
+        """Normal matrix, right sides (mode, 1 + batch), square of phases less the shape."""
         size = len(self.names)
         normal, rights = np.zeros((size, size)), np.zeros((size, tiles.right.shape[2]))
         square = 0.0

@@ -181,7 +181,7 @@ def _samples(source: Ingested, group: Group, window: Part, pixels: Mask) -> Iter
 
 
 def middle_rows(middle: Part) -> slice:
-    """Rows of a chunk in the middle of a window, from its first row on."""
+    """Rows of the central chunk of a window, counted from its first row."""
     height = middle[0][1] - middle[0][0]
     first = height // CHUNK[1] // 2 * CHUNK[1]
     return slice(first, min(first + CHUNK[1], height))
