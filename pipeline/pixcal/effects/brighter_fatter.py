@@ -16,7 +16,7 @@ from pixcal.simulation.shot import Shot
 
 _FITTED = ("shift_px_per_e", "along_y", "falloff_px")
 _DISAGREE = 4.0
-_LAW_ERROR = 0.1  # of the shift: what one falloff leaves between near noise and far harmonics
+_LAW_ERROR = 0.1  # relative, of the shift: near noise and far harmonics may differ by it
 # significance, with a free response, above which it may explain all harmonics
 _HINTED = 1.5
 _NEEDED = 12.0  # chi-square of three terms above which they are needed: one in 130 by chance

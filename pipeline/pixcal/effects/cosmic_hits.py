@@ -185,7 +185,7 @@ def _rates(counts: F64, chances: F64, exposures: F64) -> tuple[list[float], list
     gain = 2 * float((counts * np.log(both / one) - both + one).sum())
     used = 1 + (gain > SIGNIFICANT**2) if len(exposures) > 1 else 1
     rates, expected = found[used - 1]
-    # The posterior of a rate, without prior, has one hit more: few hits do not tell it well.
+    # The posterior of a rate, without prior, has one hit more: few hits constrain it poorly.
     normal = exposures[:used] @ (exposures[:used] / (expected + 1 / len(counts))).T
     errors = np.sqrt(np.diag(np.linalg.inv(normal)))
     return [*rates.tolist(), 0.0][: len(exposures)], errors.tolist()
@@ -339,7 +339,7 @@ class _Drawn:
         """Noise (track, pixel), e-, at random places; infinite for excluded samples."""
         t, y, x = (rng.integers(0, n, (_DRAWN, 1)) for n in sigma.shape)
         dy, dx = np.divmod(self._pixels, _TILE)
-        # Periodic window: tracks that leave it stand for tracks that enter from outside.
+        # Periodic window: tracks that leave it replace tracks that enter from outside.
         own = sigma[t, (y + dy) % sigma.shape[1], (x + dx) % sigma.shape[2]]
         return np.where(np.isfinite(own), own, np.inf)
 

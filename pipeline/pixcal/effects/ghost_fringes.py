@@ -35,7 +35,7 @@ LAWS = {
 # least chi-square per wave for a second ghost
 TWO_GHOSTS = 25.0
 # largest misfit of the law of a beam over that of unrelated amplitudes, per degree of freedom;
-# ghosts of both fibres, taken only where they fit far better, always pass
+# ghosts of both fibres, accepted only if they fit far better, always pass
 UNTIED = 0.75
 # largest differences between sets, relative and in errors, of a pattern of the flat,
 ALIKE, ALIKE_SIGMAS = 0.1, 5.0

@@ -29,7 +29,7 @@ from pixcal.simulation.memory import Memory
 from pixcal.simulation.shot import Shot
 
 TAIL = 1e-4  # share of the charge left whose release is neglected
-MOST_BACK = 256  # preceding frames that count if the release is over seconds
+MOST_BACK = 256  # preceding frames that count if the release follows seconds
 _TELL_LAMP = 3  # fewest flats per level to distinguish a warming lamp from lag
 
 

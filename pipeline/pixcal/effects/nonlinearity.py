@@ -268,7 +268,7 @@ def _size_of_curve(
     factor, offset = np.polyfit(low, curve.response(low.astype(np.float32)), 1)
     top = factor * levels[-1] + offset
     unit = 10.0 ** (np.floor(np.log10(top)) - 1)
-    top = np.floor(top / unit) * unit  # as it is told
+    top = np.floor(top / unit) * unit  # as reported
     signal = float(curve.response(np.array([(top - offset) / factor], np.float32))[0])
     error = np.hypot(by_law_error * top, errors[len(levels)])
     return _size(top, signal - top, error)

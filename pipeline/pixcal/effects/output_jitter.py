@@ -277,6 +277,6 @@ def _noise(rest: F32, mask: Mask) -> float:
     own = own - own.sum(axis=(1, 2), keepdims=True) / used
     pixels = float(np.square(own, dtype=float).sum()) / len(own) / used
     lines = [own.sum(axis=a) / np.maximum(mask[cut].sum(axis=a - 1), 1) for a in (2, 1)]
-    # Neighbours: what rows share over long distances is no less than between them.
+    # Neighbours: noise shared by distant rows is shared by neighbouring ones too.
     of_rows, of_columns = (float(np.square(line, dtype=float).mean()) for line in lines)
     return float(max(of_rows / ny + of_columns / nx - pixels / used, 0.0))

@@ -24,7 +24,7 @@ from pixcal.simulation.shot import Shot
 _SIDE = 512  # most rows and columns that are searched
 _LEAST = 32  # fewest rows and columns
 _FRAMES = 8  # most differences of frames that are searched
-_WILD = 8.0  # standard deviations above which a sample is no noise
+_WILD = 8.0  # standard deviations above which a sample is not noise
 _MOST = 48  # tones
 _AT_ONCE, _NEARLY = 8, 0.25  # tones found in one search, and their least power over the strongest
 _DISTINCT = 0.7  # least distance of two tones, modes
@@ -34,7 +34,7 @@ _AROUND, _AROUND_SLOW = (8, 8), (32, 1)
 _SLOW = 8  # modes along rows that are low
 # Mains hum hardly changes along a row, and a tone whose period divides that of rows not along a
 # column. Noise of rows or columns has a spectrum of its own, with harmonics of steps between
-# outputs: a tone stands out of all modes within an octave, but for one other tone.
+# outputs: a tone exceeds all modes within an octave, except for one other tone.
 _FIRST, _STANDS_OUT = 6, 3.0  # least cycles; least power over the next highest
 # Fewer cycles along columns are drifts; or, with few along rows, steps between outputs.
 _DRIFTS, _STEPS = 4, 24
@@ -205,7 +205,7 @@ def _over_next_highest(power: F64) -> F64:
     found, end = np.zeros(len(power)), len(power) - 2
     for k in range(_FIRST, end):
         about = np.concatenate([power[k // 2 : k - 1], power[k + 2 : min(2 * k, end) + 1]])
-        # But one: hum has a harmonic.
+        # All but one: hum has a harmonic.
         top = int(about.argmax())
         others = np.delete(about, range(max(top - 1, 0), min(top + 2, len(about))))
         if power[k] > _STANDS_OUT * others.max():

@@ -132,7 +132,7 @@ def _hops(
     # Hops may scatter by more than the noise.
     excess = float(weight @ (size - hop) ** 2) / max(len(jumps) - 1, 1)
     own_error = float(np.sqrt(max(excess, 1.0) / weight.sum()))
-    # The posterior of a rate, without prior: few jumps do not tell it well.
+    # The posterior of a rate, without prior: few jumps constrain it poorly.
     found = Hopping(hop, own_error, rate, float(np.sqrt(len(jumps) + 1)) / seconds)
     colours, bases = [colour_of(s) for s in motion.raw], [colour_of(s) for s in motion.series]
     times = [s.time_s for s in motion.raw]

@@ -103,7 +103,7 @@ class Star:
         """Error of the centroid (x, y) per displacement of each pixel (2, 2, side, side).
 
         For a star at ``place`` (x, y), px from the centre of its pixel, fitted with all or the good
-        pixels, assumed to lie on a perfect grid.
+        pixels, assumed to be on a perfect grid.
         """
         jacobian, weight, slopes = self._of_pixels(place, good)
         covariance = np.linalg.inv(np.einsum("iyx,jyx,yx->ij", jacobian, jacobian, weight))

@@ -23,7 +23,7 @@ from pixcal.model.arrays import F32, F64, I64
 # sums kept for each pixel: 6 normal, 3 right-hand, weighted square of the residual, samples
 N_SUMS = 11
 GAP, GOES_ON = -1, -2  # no batch; see `sweep_batches`
-# least determinant over the product of the diagonal; without three phases it is zero but rounding
+# least determinant over the product of the diagonal; without three phases it is zero up to rounding
 SINGULAR = 1e-9
 FAST = {"reassoc", "contract", "nsz", "arcp", "afn"}
 

@@ -17,7 +17,7 @@ from pixcal.kernels import inner, kernel
 from pixcal.model.arrays import F32, F64
 
 # Pixels on either side of a boundary whose charge acts on it. With two, the shift under broad
-# fringes comes out a quarter too small, and harmonics contradict the noise of neighbours.
+# fringes would be a quarter too small, and harmonics contradict the noise of neighbours.
 REACH = 4
 
 

@@ -50,7 +50,9 @@ class GainFit:
     error: float
     chi2_reduced: float  # of the points about the curve
     levels: tuple[float, float]  # lowest and highest level used, ADU
-    read_variance: tuple[float, float]  # at level zero, where the curve meets what was known; error
+    read_variance: tuple[
+        float, float
+    ]  # at level zero, from the curve and the measurement together; error
     # slope at the highest level (variance over level) relative to that at zero, less one; zero
     # where a straight line fits
     curved: float = 0.0
@@ -107,7 +109,7 @@ def fit_gain(
     def up_to(highest: float) -> GainFit | None:
         found = _fit_range(*given, highest, without_dark)
         if found and found.without_dark and not found.chance > _OFF_CURVE:
-            # Flats that are on no curve tell nothing of what is on it.
+            # Flats that lie on no curve cannot show which points belong to it.
             found = _fit_range(*given, highest, bool(without_dark))
         return found and replace(found, error=math.hypot(found.error, common * found.gain))
 

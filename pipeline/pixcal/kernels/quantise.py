@@ -47,7 +47,7 @@ def choose_scale(low: float, high: float, smallest_variance: float, share: float
     return Scale(step, math.floor(low / step) * step)
 
 
-# Loops of their own: one loop that also counts takes twice as long.
+# Separate loops: one loop that also counts takes twice as long.
 
 
 @inner(fastmath={"contract"})

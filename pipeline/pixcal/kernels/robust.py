@@ -235,8 +235,9 @@ class Combination:
         seen = lit(self._reference) if self._lamp else np.ones(sigma.shape, np.bool_)
         self._sigma = finite_median(sigma[seen])
         if len(frames) == 2:
-            # Two samples cannot tell which is wrong, nor their own noise: the tile's noise decides,
-            # and of two that disagree the lower one is right, since particles only add charge.
+            # Two samples show neither which is wrong nor their own noise: the noise of the tile
+            # decides, and of two that disagree the lower one is right, because particles only add
+            # charge.
             usual = math.sqrt(2) * math.hypot(self._sigma, self._quantum)
             apart = np.ptp(level, axis=0) > self._clip * usual + self._quantum
             self._reference = np.where(apart, level.min(axis=0), self._reference)

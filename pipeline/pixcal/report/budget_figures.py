@@ -64,7 +64,7 @@ def _precision(axes: Axes, result: Mapping[str, Any], period: float) -> None:
     wanted, given = result["precision_px"], result["frames"]
     frames = _span([*sets.values()], every, result)
     for order, ((name, facts), colour) in enumerate(zip(sets.items(), cycle(COLOURS))):
-        # Sets are often alike: later ones are thinner, so that none is hidden.
+        # Sets are often similar: later ones are thinner, so that none is hidden.
         before = len(sets) - 1 - order
         median, planned = facts["frame_px"]["median"], facts["planned"]["frames"]
         if "interfringe_px" in facts:

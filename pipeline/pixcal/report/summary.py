@@ -14,7 +14,7 @@ TARGET_PX = 5e-5  # target precision of a calibration (paper, section 4.2)
 # offset of the fibres that a laboratory would notice: twice its 2 cm (paper, section 5.2)
 FAR_MM = 40.0
 
-_OFF = 0.05  # relative difference of a measured value from the declared one that is told at once
+_OFF = 0.05  # relative difference of a measured value from the declared one that is shown at once
 
 GOOD, CHECK, BAD = SEVERITY = ("good", "check", "bad")
 

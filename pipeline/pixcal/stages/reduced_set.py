@@ -27,7 +27,7 @@ class ReducedSet:
 
     @cached_property
     def place(self) -> Place:
-        """Where the set's arrays are: ``folder``, unless reduce was told to put cubes elsewhere."""
+        """Where the set's arrays are: ``folder``, or elsewhere if reduce was asked to."""
         store = self.folder.parent
         return cubes_of(store.parent) / store.name / self.folder.name
 

@@ -139,7 +139,7 @@ def _write_frames(
 ) -> None:
     batches: list[list[Span]] = [[]]
     ready: list[Callable[[], Path]] = []
-    # A task computes the memory of its first frame anew.
+    # A task recomputes the memory of its first frame.
     most = max([FRAMES_PER_TASK, *(e.memory.block for e in effects if e.memory)])
     for recording in recorded:
         files = _create_files(bench, recording, folder)

@@ -115,7 +115,7 @@ def build(
 ) -> Iterator[Build]:
     """Build an artefact aside and move it into place when the block ends without an exception.
 
-    If it raises, the next build with the same key resumes, or begins anew if a chunk is not as it
+    If it raises, the next build with the same key resumes, or starts over if a chunk is not as it
     was written. An artefact with another key stays until the new one is complete. ``cubes``: folder
     below which to make one for the cubes, instead of ``RUN/<stage>``; no part of the key. Raises
     InputError if ``cubes`` cannot be written.

@@ -87,7 +87,7 @@ def create_map(
     )
 
 
-# Cached: many arrays are alike, and zarr-python takes a millisecond for each.
+# Cached: many arrays have the same metadata, and zarr-python takes a millisecond for each.
 @lru_cache(maxsize=512)
 def _array_metadata(
     shape: Ints, chunks: Ints, dtype: str, fill_value: Any, dims: tuple[str, ...], attrs: str

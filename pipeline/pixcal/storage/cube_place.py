@@ -107,7 +107,7 @@ def _read(artefact: Local) -> Mapping[str, Any] | None:
 
 def _damaged(file: Local, reason: str) -> DamagedError:
     error = DamagedError(file, f"damaged{reason}")
-    error.advice = "give --cubes again to write the cubes anew (--cubes RUN keeps them in RUN)"
+    error.advice = "give --cubes again to rewrite the cubes (--cubes RUN keeps them in RUN)"
     return error
 
 

@@ -36,7 +36,7 @@ STAGES = {
         ArtefactKind("corrected", 3, "fit RUN --with-diagnosis"),
         ArtefactKind("astrometry", 1, "astrometry RUN", products="astrometry.*"),
         ArtefactKind("report", 2, "report RUN", of_fringes=False, products="report.html"),
-        # In directories of their own.
+        # In separate directories.
         ArtefactKind("compare", 1, "compare RUN --out DIR"),
         ArtefactKind("simulate", 1, "simulate BENCH.yaml --out ACQ"),
         ArtefactKind("simulate-truth", 1, "simulate BENCH.yaml --out ACQ"),

@@ -46,7 +46,7 @@ class UrlPath:
     def filesystem(self) -> tuple[Any, str]:
         """File system of fsspec that the URL belongs to, and its path there."""
         # fsspec keeps its file systems, one for each thread and process that asks.
-        from fsspec.core import url_to_fs  # here: cubes of this machine do without
+        from fsspec.core import url_to_fs  # here: cubes on this machine do not need it
 
         with explained(self.url):
             found: tuple[Any, str] = url_to_fs(self.url)
@@ -85,7 +85,7 @@ def explained(url: str) -> Iterator[None]:
         raise RemoteError(
             f"{url}: a package is missing ({error}); pip install '{package}'"
         ) from error
-    except Exception as error:  # each driver has errors of its own
+    except Exception as error:  # each driver has its own errors
         raise RemoteError(
             f"{url}: {reason_of(error):.300}; check the URL, the endpoint, the credentials "
             "(AWS_…, FSSPEC_…) and the network, and run again"

@@ -1,9 +1,8 @@
 """Couplings from the neighbours of hot pixels in darks, the method of the paper.
 
-A hot pixel has dark signal without light, and its neighbours have little of their own: their signal
-is a share of it. Each direction is measured separately, so this method separates a coupling from
-its opposite. A neighbour may itself be warm, so a share counts only if several hot pixels of a
-class agree.
+A hot pixel has dark signal without light, and its neighbours have little: their signal is a share
+of it. Each direction is measured separately, so this method separates a coupling from its opposite.
+A neighbour may itself be warm, so a share counts only if several hot pixels of a class agree.
 """
 
 from collections.abc import Sequence

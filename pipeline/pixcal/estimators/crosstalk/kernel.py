@@ -34,7 +34,7 @@ FEW = 20  # the same for a comparison of periods
 USUAL, PATTERN = 4e-4, 1e-4
 START = (1e-2, 1e-3)  # start values of these sizes
 STEPS = 6  # most steps of least squares
-STILL = 0.3  # standard errors by which a step that is not the last moves
+STILL = 0.3  # standard errors of a step below which the iteration ends
 # sigmas beyond which a coupling is reported: with a hundred tested, one false in twenty kernels
 THERE = 3.5
 # most pixels of flats: their sums of pairs up to `links.REACH` apart fill 400 MB
@@ -53,7 +53,7 @@ class Kernel:
     log_evidence: float
     # relative change of the shares with the source's signal, 1/ke-, and its error
     per_ke: tuple[float, float] = (0.0, np.inf)
-    either: bool = False  # a rise may as well be that of noise shared by shifted boundaries
+    either: bool = False  # a rise may also be due to noise shared through shifted boundaries
 
     @property
     def shares(self) -> F64:

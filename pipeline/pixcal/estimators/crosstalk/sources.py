@@ -138,7 +138,7 @@ class Sources:
         self, classes: PixelClasses, right: F64, normal: F64, doubted: bool, per_ke: float = 0.0
     ) -> Information:
         found = {}
-        # What the frames would be less of, did the known shares change by this.
+        # The change of the frames if the known shares changed by this.
         more = self._by_link(self.known, True) - per_ke * self._by_link(self.known)
         if self.noise is not None:
             squares = symmetric(np.moveaxis(normal, 1, -1))[..., -1]

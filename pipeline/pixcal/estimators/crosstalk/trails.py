@@ -17,7 +17,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence, cached_on_evidence
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best
 from pixcal.model.arrays import F64, Indices
 
-LEAST = 10  # hot pixels that tell
+LEAST = 10  # least number of hot pixels
 SURE = 5.0  # significance beyond which trails are no crosstalk
 
 LINKS = (*((n, 0) for n in range(1, REACH + 1)), *((0, n) for n in range(1, REACH + 1)))

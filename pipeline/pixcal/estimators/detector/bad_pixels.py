@@ -97,7 +97,7 @@ def _below_rings(flat: F64, where: Mask, factor: float) -> Mask:
 
 def _around(values: F64) -> tuple[F64, F64]:
     """Median and upper quartile of each pixel's block of `NEIGHBOURS` by `NEIGHBOURS`."""
-    # Each colour of a filter mosaic (every second row and column) by itself; maps start at a block
+    # Each colour of a filter mosaic (every second row and column) separately; maps start at a block
     # boundary, as chunks do. A pixel with an empty block keeps its value.
     maps = np.stack([values, values])
     for y, x in np.ndindex(2, 2):

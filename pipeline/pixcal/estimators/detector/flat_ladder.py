@@ -108,8 +108,8 @@ def rise_of(series: Sequence[F64]) -> tuple[float, float]:
 
 def flicker(evidence: Evidence) -> tuple[float, float]:
     """Relative rms change of the lamp from frame to frame, and its degrees of freedom."""
-    # By lag the first frame of a series may lack a share of its charge and gain one of the frame
-    # before: the common dependence of first steps on both levels is removed.
+    # By lag the first frame of a series may lack a share of its charge and gain one of the previous
+    # frame: the common dependence of first steps on both levels is removed.
     rise, _ = warming(evidence)
     steps: list[float] = []
     firsts: list[float] = []

@@ -15,9 +15,9 @@ from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.significance import root_with_error
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
-# of the phase, free in each pixel so that a nonlinear response is not taken for lag
+# of the phase, free in each pixel so that a nonlinear response is not mistaken for lag
 HARMONICS = 5
-CONTROLS = 8  # later frames that serve as controls for the frame before
+CONTROLS = 8  # later frames that serve as controls for the previous frame
 PIXEL_CLIP = 7.0  # standard deviations beyond which a pixel's share is clipped (particles)
 MIN_FRAMES = 20
 CLIP = 5.0  # standard deviations of a frame's contrast
@@ -102,7 +102,7 @@ def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
     if len(fringes.g) < MIN_FRAMES + CONTROLS:
         return None
     before = _squares_of_shares(fringes, Freedom(fringes, HARMONICS), (1,))[0]
-    # Frames are only nearly independent: what the frame before explains is removed.
+    # Frames are only nearly independent: the part explained by the previous frame is removed.
     free = Freedom(fringes, HARMONICS, before=True)
     after = _squares_of_shares(fringes, free, range(-1, -CONTROLS - 1, -1))
     value, error = np.array(after).T

@@ -84,7 +84,7 @@ def fit_levels(curve: TransferCurve, times: F64, flat: F64) -> LadderCurve | Non
     above = max(2 * curve.levels[-1] - curve.levels[-2], float(signal.max()))
     knots = np.concatenate([[0.0], curve.levels, [above]])
     # Signals up to the second level are straight: a line through two levels is known by the gain
-    # and the offset of exposure times, and no curve that is a line beyond them is told from it.
+    # and the offset of exposure times, and no curve that is a line beyond them differs from it.
     unit = LOOSE * knots[3:]
 
     def rest(sizes: F64) -> F64:

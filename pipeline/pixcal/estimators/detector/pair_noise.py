@@ -22,7 +22,7 @@ _SHARED = 5.0  # significance (errors) from which the noise shared by lines coun
 _OUT = 5.0  # standard deviations of outlying samples
 _PAIR_LAMP_CHANGE = 0.05
 _NEARLY = 5.0  # standard deviations below saturation from which a pixel's noise is clipped
-_ROUNDS = 12  # each leaves less than a third of what block means are yet to give back
+_ROUNDS = 12  # each leaves less than a third of the part that block means removed
 _FAR = BLOCK // 2  # pixels over which no filter of a camera reaches
 _NO_BLOCKS = np.zeros((0, COLUMNS))
 

@@ -19,7 +19,7 @@ from pixcal.model.arrays import F64, Mask
 LAMP = 1e-3  # least relative error of the light of a flat, exposure time included
 RATES = 1.3  # largest ratio of light per second among levels of one lamp
 _BENT = 0.02  # largest deviation from a line with an offset in exposure time that one lamp gives
-SURE = 5.0  # errors from which a lamp or a response is told
+SURE = 5.0  # errors above which a lamp or a response is reported
 _BY_CHANCE = float(ndtr(-SURE))
 # least deviation from a line of which it is said that a lamp may cause it: below, the linearity and
 # its error say enough
@@ -29,9 +29,9 @@ _DETERMINED = 1e10  # condition of its normal equations
 # least width of the residuals of rounded times, over that of their distribution, and least share of
 # it that no curve in level explains
 _FILLED, _ROUGH = 0.2, 0.3
-# Scatter in proportion to the time, as of a lamp that is set anew for each level, over scatter that
-# is alike for all times, and over that expected of the step: from here times are told as rounded.
-# A lamp has the size of the step by chance only.
+# Scatter in proportion to the time, as of a lamp reset for each level, over scatter that is equal
+# for all times, and over that expected of the step: above this, times are reported as rounded. A
+# lamp has the size of the step by chance only.
 _LIKELIER = 0.95
 _NOISE = 5e-3  # least relative error of the noise of a level
 _ORDERED = 0.9  # correlation of exposure time and time of recording that a drift can mimic

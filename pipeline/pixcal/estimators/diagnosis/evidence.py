@@ -169,7 +169,7 @@ class Evidence:
     # lags (rows, columns) whose covariance that gain includes
     neighbours: tuple[tuple[int, int], ...] = ()
     subtracted_dark: float = 0.0  # dark signal that the camera subtracts, e-/s
-    lowest_adu: float | None = None  # code at which noise is cut off; None: it is not
+    lowest_adu: float | None = None  # code at which noise is cut off; None without a cut-off
     # whether the gain of `photon_transfer` leaves out noise without light, which is not that of
     # flats
     without_dark: bool = False

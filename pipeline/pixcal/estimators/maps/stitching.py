@@ -29,7 +29,7 @@ Lines = tuple[tuple[int, ...], tuple[int, ...]]  # first row, and first column, 
 
 
 def fields(maps: Sequence[F64], free: Sequence[F64]) -> Indices:
-    """Number (y, x) of the field in which each pixel lies; all zeros without significant steps.
+    """Number (y, x) of the field of each pixel; all zeros without significant steps.
 
     ``maps``: (y, x) each, with white noise and steps along the same lines; NaN where masked.
     ``free``: (term, y, x) free smooth patterns of each map, without the constant.

@@ -30,8 +30,8 @@ _LEFT = 0.01
 
 def contrast_surface(theta: F64, good: Mask) -> F64:
     """Contrast (y, x) of two Gaussian beams, fitted to the maps (3, y, x) of a set."""
-    # Where beams are alike its logarithm is quadratic, and fitted as such. Beams that differ more
-    # are tried where that does not fit, and taken if they do fit.
+    # If beams are similar its logarithm is quadratic, and fitted as such. If that does not fit,
+    # different beams are tried, and used if they fit.
     alpha = np.hypot(*theta[1:])
     used = good & (alpha > 0) & (theta[0] > 0)
     log = np.log(np.divide(alpha, theta[0], out=np.ones_like(alpha), where=used))

@@ -243,11 +243,11 @@ def hot_neighbours(evidence: Evidence) -> Curve | None:
     """Dark current beside hot pixels over theirs."""
     dark = evidence.dark_rate - np.median(evidence.dark_rate)
     spread = robust_sigma(dark)
-    # Only the brightest about: what it gave to its neighbours does not make them hot.
+    # Only the brightest in its surroundings: charge from it does not make its neighbours hot.
     hot = (dark > max(40 * spread, 1e-9)) & (dark >= maximum_filter(dark, size=5))
     hot[[0, -1]] = hot[:, [0, -1]] = False
     y, x = np.nonzero(hot)
-    # A neighbour may be warm by itself, or the rows differ: medians over alike rows.
+    # A neighbour may be warm itself, or rows may differ: medians over equivalent rows.
     classes = [own for row in range(4) if (own := (y + evidence.origin[0]) % 4 == row).sum() >= 3]
     if not classes:
         return None

@@ -149,7 +149,7 @@ def observe_star(
 
 @dataclass(frozen=True)
 class ErrorMaps:
-    """Error of a star at the centre of every pixel whose window lies on the detector."""
+    """Error of a star at the centre of every pixel whose window is on the detector."""
 
     # (grid, component, y, x) sum of squares over blocks, px², with pixels assumed on a perfect
     # grid, or at mapped positions

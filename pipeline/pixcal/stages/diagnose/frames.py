@@ -31,7 +31,7 @@ MOST_FRAMES = 1500
 # number of blocks, and least number of frames for it: with long blocks, few frames lack the
 # preceding one; with short ones, both halves have the same drifts
 BLOCKS = ((16, 384), (8, 192), (4, 32), (2, FEWEST))
-TURN = (False, True, True, False)  # which blocks are held out: a steady drift is alike in both
+TURN = (False, True, True, False)  # which blocks are held out: a steady drift is the same in both
 # first frame, last frame and count, by array
 Frames = dict[str, tuple[int, int, int]]
 LADDER = 3  # exposure times of flats for a linearity curve

@@ -2,9 +2,9 @@
 
 It has straight fringes with one fringe vector per set, two beams, constant intensity and
 visibility, the measured phases, and a linear detector without coupling. All else is as measured
-(docs/explanation/diagnosis.md). Each simulation draws uncertain quantities anew within their
-errors. Fringes, repeating rows or columns, and curvature are removed from the offsets, because no
-foundry makes them: only an effect may produce them in a simulation.
+(docs/explanation/diagnosis.md). Each simulation draws uncertain quantities within their errors.
+Fringes, repeating rows or columns, and curvature are removed from the offsets, because no foundry
+makes them: only an effect may produce them in a simulation.
 """
 
 from collections.abc import Iterator, Sequence

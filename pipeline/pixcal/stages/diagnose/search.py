@@ -376,8 +376,8 @@ class Search:
             trial = self.comparison.allowing_for_laws(trial, self._current)
             gain = trial.log_likelihood - start.log_likelihood
             if candidates[name].in_maps_alone:
-                # Chance acts alike on all statistics of a pattern: together they are no less likely
-                # than one of them.
+                # Chance acts equally on all statistics of a pattern: together they are no less
+                # likely than one of them.
                 own = signature_key(effect.name, effect.domains[0])
                 gain = min(gain, self.comparison.gain_where_differing(start, trial, own))
             made.append(Addition(name, effect, trial, gain))

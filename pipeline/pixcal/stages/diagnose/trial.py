@@ -48,7 +48,7 @@ class Window:
     test: FrameSubset
     whole: tuple[int, int]  # rows and columns of the detector's window
     # added to the seeds of simulations: each acquisition is compared with different random numbers,
-    # so that chance does not act alike on all of them
+    # so that chance does not act equally on all of them
     seed: int = 0
     full: frozenset[Level] = frozenset()  # flats that saturate
 

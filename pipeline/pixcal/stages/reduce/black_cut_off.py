@@ -70,7 +70,7 @@ class Black(NamedTuple):
     """
 
     cut_off: Mapping[str, CutOff]  # arrays whose noise is cut off at their lowest code
-    # `GainFit.without_dark`; None: found anew in each part
+    # `GainFit.without_dark`; None: measured again in each part
     without_dark: bool | None = None
     # dark signal (ADU/s) that the camera subtracts: see `subtracted_dark`
     subtracted: float = 0.0

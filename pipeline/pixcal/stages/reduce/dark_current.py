@@ -194,7 +194,7 @@ class LateRate:
     rate: float  # e-/s, or e-/exposure
     error: float  # of the dark signal without it
     lag: Persistence
-    sure: bool  # whether it is told from a drift of the bias
+    sure: bool  # whether it is distinguished from a drift of the bias
 
     def warning(self, unit: str) -> str:
         """Its consequence for the map of the dark signal; ``unit``: of the rates."""

@@ -229,7 +229,7 @@ def _measure_level(job: Measuring, column: _Column, number: int, found: Combined
     frames = len(group.frames)
     signal = np.where(found.seen == frames, found.mean, np.nan)
     column.levels[number, 1:3] = signal.size, (frames - found.seen).sum()
-    # Few frames give a poor estimate of one pixel's noise, and most pixels are alike.
+    # Few frames give a poor estimate of one pixel's noise, and most pixels are similar.
     seen = lit(signal)
     level = finite_median(signal[seen])
     usual = calibration.usual_variance(found.variance[seen], frames - 1)

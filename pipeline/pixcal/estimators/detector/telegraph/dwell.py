@@ -153,7 +153,7 @@ def _expected(series: Sequence[PixelSeries], seen: Moments, most: float, stays: 
 
 def _products(series: PixelSeries, trust: F64) -> tuple[Indices, F64, F64]:
     """Which lags have pairs of frames, the weighted mean products, and what whitens these."""
-    # A few pixels that jump far would outweigh all others.
+    # A few pixels with large jumps would outweigh all others.
     root = np.sqrt(series.weight)
     noise = series.charge * root
     # The fit makes residuals of white noise anticorrelated between frames: their weighted

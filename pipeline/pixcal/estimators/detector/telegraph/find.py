@@ -24,7 +24,7 @@ TWO_LEVELS = 8.0
 _OVERFLOW = np.float32(80.0)  # logarithm below which float32 numbers do not overflow
 # log-likelihood by which a common share must be likelier than one half: in all, and per pixel
 CLEAR, CLEAR_A_PIXEL = 10.0, 0.1
-# least excess of pixels that are rarely, or mostly, in the upper level, over all that tell
+# least excess of pixels that are rarely, or mostly, in the upper level, over all measured ones
 MOST = 0.5
 Lit = Callable[[Indices], Sequence[PixelSeries]]
 
