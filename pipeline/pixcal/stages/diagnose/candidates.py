@@ -157,7 +157,7 @@ def marginal_candidates(
 ) -> tuple[Signature, ...]:
     """Candidates significant in the fitted frames; a slow one only if it is the strongest."""
     # With fringes only if it is weak, as a strong one shows in other statistics; without them only
-    # if it is strong, as a weak one is slow to confirm. A score test that is faint beside the
+    # if it is strong, as a weak one is slow to confirm. A score test that is weak compared with the
     # strongest candidate is left out.
     seen = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
     most = max((e.significance for e in seen.values()), default=0.0)

@@ -54,7 +54,7 @@ class FlatLight:
     off: frozenset[float] = frozenset()  # exposure times (s) of levels from another lamp
     freedom: float = math.inf  # degrees of freedom of ``flicker``
     # by the number of a recording, the light (t,) of each frame over the mean; NaN for frames that
-    # are drawn: the first, which may lack what stayed behind, and those not looked at
+    # are drawn: the first, which may lack charge left behind, and those not analysed
     frames: Mapping[int, F64] = field(default_factory=dict)
     # for the same recordings, the light of the first frame that the next ones let expect, and its
     # scatter over the flicker

@@ -60,8 +60,8 @@ SCOUT_SHARE = 0.01  # share of the tiles that the scout reads (of large windows)
 SCOUT_TILES = 5  # tiles that the scout reads if they can be kept in memory
 # memory for the scout's tiles; fixed, so that results do not depend on ``--memory``
 CACHE_BYTES = 384 << 20
-PRIME_BYTES = 48 << 20  # memory for the codes of the scout's first look
-# chunks along time from which the first look takes frames: one may hold little of a slow scan
+PRIME_BYTES = 48 << 20  # memory for the codes of the first fit of the scout
+# chunks along time from which the first fit takes frames: one may hold little of a slow scan
 SCOUT_BLOCKS = 16
 # most frames of the first fit: three unknowns per pixel add a fraction 3 / `FIRST_FIT_FRAMES` to
 # the variance of the frames' parameters; the time of the rank-three search grows with the square
@@ -293,7 +293,7 @@ def scout_set(
     here = replace(runtime.here, quiet=True)
     if runtime.remote:
         here = here.with_workers(0)
-    # Kept chunks; codes of the first look, copies of a tile's share, and its Gram matrix; for each
+    # Kept chunks; codes of the first fit, copies of a tile's share, and its Gram matrix; for each
     # task the sums of a tile, or chunks that are not kept.
     kept = len(places) * tile_bytes if keep else 0
     what = f"the frame phases of {name}"

@@ -28,8 +28,8 @@ _SURE, _LATE, _CURVED = 5.0, 0.005, 20.0
 _FEWEST, _DRIFT, _SCATTER = 4, 0.01, 0.02
 # least declared over measured gain that an electron-multiplying register explains
 _MULTIPLIED = 3.0
-# of trails of hot pixels: longest side of the middle of the detector that is looked at, and share
-# of the converter's range that a hot pixel may fill
+# of trails of hot pixels: longest side of the central part of the detector that is examined, and
+# share of the converter's range that a hot pixel may fill
 _TRAILS_SIDE, _HOT_FULL = 512, 0.9
 _OF_STEP = 0.1  # relative tolerance to recognise a gain declared per step of the converter
 

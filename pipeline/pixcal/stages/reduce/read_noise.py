@@ -23,7 +23,7 @@ from pixcal.storage.place import Place
 
 # Relative error of noise that is cut off at the lowest code: a constant, and a factor on the cube
 # of step over noise. It is the largest error if pixels that differ by 10 % rms are treated as
-# alike.
+# equal.
 _CUT_OFF, _COARSE_CUT_OFF = 0.006, 0.004
 _LEAST = 0.05  # smallest measurable noise, in steps
 _FILTERED = 0.1  # least correlation of neighbours in filtered samples
