@@ -69,7 +69,7 @@ def ticks(low: float, high: float, length: float, *, upwards: bool, log: bool = 
 
 
 def _image(classes: U8, colours: Sequence[str]) -> str:
-    """Numbers of colours (y upwards) as a picture."""
+    """Picture of the colours with these numbers, y upwards."""
     picture = Image.fromarray(np.ascontiguousarray(classes[::-1]))
     picture.putpalette([round(255 * v) for c in colours for v in to_rgb(c)])
     # A picture as a PNG that is part of the page.

@@ -281,7 +281,7 @@ def _sums_task(batches: Batches, expected: Path, square: Part) -> tuple[I64, lis
 def quantiles_of_region(
     path: Path, region: Region, usable: Sequence[int], runtime: Runtime
 ) -> tuple[dict[int, tuple[float, float, float]], int]:
-    """Central 68 % and median over a region by number of the length, and count of pixels."""
+    """Central 68 % and median over a region, by index of the length, and count of pixels."""
     quiet = replace(runtime, quiet=True)
     found = run_tasks(partial(_quantiles, path, region), usable, quiet, label="quantiles")
     quantiles = {
