@@ -167,7 +167,7 @@ def photon_transfer_change(
     neighbours: Sequence[tuple[int, int]] = (),
     maps: DetectorMaps | None = None,
 ) -> float:
-    """Factor by which effects change the variance over mean of flats, lags included; 1 without any."""
+    """Factor by which effects change variance over mean of flats, lags included; 1 without any."""
     # The photon-transfer gain is off by the inverse; a simulation with the effects must not apply
     # it twice.
     flats = [r for r in recordings if r.kind == "flat" and r.electrons > 0 and r.count > 1]
