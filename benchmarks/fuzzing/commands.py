@@ -22,6 +22,7 @@ from fuzzing.laws import (
 )
 from fuzzing.night import Night
 from fuzzing.settings import small_bench
+from pixcal.model.errors import InputError
 from pixcal_cli.main import cli, explain, one_line
 
 VALUES = (
@@ -193,6 +194,7 @@ def choices() -> list[tuple[Words, click.Command, click.Parameter, str]]:
 def _line(words: Words, command: click.Command, bad: click.Parameter, value: str) -> list[str]:
     """A command line that is good but for one value."""
     good = {"acquisition": "acq", "run": "run", "runs": "run", "bench": "bench.yaml"}
+    good |= {"out": "new.fits", "fwhm_px": "2.5", "table": "stars.csv"}
     if words[0] in ("run", "ingest"):
         good["run"] = "out"
     if words[0] == "simulate":
@@ -220,6 +222,7 @@ def _option(case: Case) -> None:
     shutil.copytree(_good(), here)
     (here / "file").write_text("kept")
     (here / "rubbish.json").write_text("{")
+    (here / "stars.csv").write_text("x,y\n10.5,12.25\n")
     (here / "loop").symlink_to("loop")
     (here / "full").mkdir()
     (here / "full" / "mine.txt").write_text("kept")
@@ -245,7 +248,7 @@ def _parse_only(command: click.Command, line: list[str]) -> None:
     """Parse a command line without running it."""
     try:
         command.make_context(str(command.name), line)
-    except click.UsageError as error:
+    except (click.UsageError, InputError) as error:
         check_line(f"pixcal: {one_line(explain(error)[1])}\n", (), str(command.name))
 
 

@@ -161,7 +161,7 @@ def _samples(bench: dict[str, Any]) -> float:
     frames = bench["frames"]
     counts = [frames.get("bias", 0)]
     counts += [f["count"] for key in ("darks", "flats", "fringes") for f in frames.get(key, [])]
-    return float(np.prod(bench["detector"]["shape"]) * sum(counts))
+    return float(np.prod(bench["detector"]["shape"]) * sum(map(float, counts)))
 
 
 def _bench_key(case: Case) -> None:

@@ -47,7 +47,16 @@ def examples(*lines: str) -> str:
     return "\n".join(["\b", title, *(f"  {line}" for line in lines)])
 
 
-PATH = click.Path(path_type=Path)
+class _Path(click.Path):
+    """A path that is not empty, as that of a shell variable without a value is."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if not str(value):
+            self.fail("empty; give a path", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+PATH = _Path(path_type=Path)
 acquisition_argument = click.argument("acquisition", metavar="ACQ", type=PATH)
 run_argument = click.argument("run", metavar="RUN", type=PATH)
 bench_argument = click.argument("bench", metavar="BENCH.yaml", type=PATH)

@@ -88,7 +88,9 @@ def explain(error: BaseException) -> tuple[int, str]:
         case OSError(errno=errno.ENOSPC | errno.EDQUOT):
             place = f"{error.filename}: " if error.filename else ""
             return 1, f"{place}disk full; complete results are kept: free some space and {again}"
-        case OSError(errno=errno.ENAMETOOLONG | errno.ELOOP, filename=str() | os.PathLike()):
+        case OSError(
+            errno=errno.ENAMETOOLONG | errno.ELOOP | errno.ENOTDIR, filename=str() | os.PathLike()
+        ):
             return 2, f"{error.filename}: cannot be used ({error.strerror}); choose another path"
         case PermissionError(filename=str() | os.PathLike()):
             return 2, f"{error.filename}: no permission; change its owner or mode"

@@ -117,7 +117,7 @@ def test_maps_are_ccddata(run: pixcal.Run) -> None:
         ({"--fwhm": "0.1"}, "'--fwhm': 0.1 is not in the range 0.5<=x<=50"),
         ({"--electrons": "-1"}, "'--electrons': -1.0 is not in the range x>0"),
         ({"--x": "name"}, "--x: column 'name'"),
-        ({"--out": "out.doc"}, "write a name that ends in"),
+        ({"--out": "out.doc"}, "must be one of .csv"),
     ],
 )
 def test_mistakes_are_named(

@@ -65,3 +65,8 @@ def test_hits_by_particles_do_not_count() -> None:
     codes[rng.integers(6, size=300), rng.integers(PIXELS, size=300)] += rng.integers(5, 200, 300)
     found, error, _ = told(codes)
     assert found == pytest.approx(true, abs=max(3 * error, 0.01 * true))
+
+
+def test_pixels_that_span_too_many_codes_tell_no_noise() -> None:
+    wide = np.array([[0], [1000]]) * np.ones((1, PIXELS), np.int64)
+    assert noise_of_codes(wide) == (None, None)

@@ -1,12 +1,15 @@
 """What bad input once broke, each by itself."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
+from astropy.io import fits
 
-from fuzzing.laws import Refused, calibrate
+from fuzzing.laws import Refused, calibrate, pixcal
 from fuzzing.night import Night
 from pixcal.model.acquisition import Frames
 from pixcal.model.errors import InputError
@@ -107,3 +110,61 @@ def test_an_effect_that_leaves_the_interpreter_is_refused(tmp_path: Path) -> Non
     file.write_text("raise SystemExit(0)")
     with pytest.raises(InputError, match=r"own\.py: cannot be imported \(SystemExit: 0\)"):
         effect_of_file(file)
+
+
+def test_a_name_with_a_line_break_is_refused(tmp_path: Path) -> None:
+    made = night()
+    made.described["detector"]["name"] = "a\nb"
+    assert "name: 'a\\nb' must be text" in refused(made, tmp_path)
+
+
+def test_the_maps_of_a_detector_with_an_umlaut_are_written(tmp_path: Path) -> None:
+    made = night()
+    made.described["detector"]["name"] = "Kühlkamera 💥"
+    calibrated(made, tmp_path)
+    header = fits.getheader(tmp_path / "run" / "products" / "delta_fringe.fits")
+    assert header["DETECTOR"] == "K?hlkamera ?"
+
+
+@pytest.mark.parametrize("level", [3e9, -3e18])
+def test_a_wild_sample_among_bias_frames_of_whole_numbers_is_an_outlier(
+    level: float, tmp_path: Path
+) -> None:
+    # Codes were counted from the least to the largest: gigabytes, or beyond an integer.
+    made = night()
+    for frames in made.frames.values():
+        frames[:] = np.rint(frames)
+    made.frames["bias"][3, 11, 14] = level
+    calibrated(made, tmp_path, "float32")
+
+
+def test_bias_frames_with_an_exposure_time_need_no_darks(tmp_path: Path) -> None:
+    # The dark current was then sought in darks that do not exist.
+    made = night()
+    seconds = np.repeat([0.0, 2.0], 6)
+    bias = made.frames["bias"]
+    bias += made.rng.poisson(30 * seconds[:, None, None], bias.shape)
+    acq = made.write(tmp_path / "acq")
+    (acq / "bias.fits").unlink()
+    for number, (frame, time) in enumerate(zip(bias, seconds, strict=True)):
+        header = fits.Header({"EXPTIME": time})
+        fits.writeto(acq / f"b{number}.fits", frame.round().astype(np.uint16), header)
+    made.described["frames"]["bias"] = ["b*.fits"]
+    (acq / "acquisition.yaml").write_text(yaml.safe_dump(made.described), encoding="utf-8")
+    calibrate(acq, tmp_path / "run")
+    figure = json.loads((tmp_path / "run/reduce/reduce.json").read_text())["figures_of_merit"]
+    assert figure["dark_current"]["unit"] == "e-/s"
+
+
+def test_a_damaged_list_of_frames_is_named(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    calibrate(night().write(tmp_path / "acq"), run)
+    (run / "ingest" / "frames.json").write_text("[]")
+    with pytest.raises(Refused, match="ingest"):
+        pixcal("reduce", run)
+
+
+@pytest.mark.parametrize("line", [("fit", ""), ("wcs", "run", "--out", "")])
+def test_an_empty_path_is_not_the_current_directory(line: tuple[str, ...]) -> None:
+    with pytest.raises(Refused, match="empty; give a path"):
+        pixcal(*line)

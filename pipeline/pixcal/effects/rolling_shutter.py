@@ -84,20 +84,19 @@ class RollingShutter(Effect):
     def check(self, bench: Bench) -> None:
         if 0 < len(self.settling) < FEWEST:
             raise InputError(
-                f"effects.rolling_shutter: settling: {len(self.settling)} values; give none, or "
-                f"at least {FEWEST}"
+                f"settling: {len(self.settling)} values; give none, or at least {FEWEST}"
             )
         frames = bench.frames
         last = self.line_time_us * (bench.detector.shape[0] - 1) * 1e-6
         if last > frames.period_s:
             raise InputError(
-                f"effects.rolling_shutter: line_time_us: the last row starts {last:g} s after the "
+                f"line_time_us: the last row starts {last:g} s after the "
                 f"first, later than the next frame (frames.period_s: {frames.period_s:g} s)"
             )
         if self.delay_us * 1e-6 > frames.period_s:
             raise InputError(
-                "effects.rolling_shutter: delay_us: longer than frames.period_s "
-                f"({frames.period_s:g} s)"
+                f"delay_us: must be at most frames.period_s ({frames.period_s:g} s), not "
+                f"{self.delay_us * 1e-6:g} s"
             )
 
     def shares(self, rows: F64, exptime_s: float, period_s: float) -> tuple[F64, F64]:

@@ -33,6 +33,9 @@ class Detector:
         None, unit="ADU", above=0, high=1e12, doc="samples at or above this level are saturated"
     )
 
+    def __post_init__(self) -> None:
+        check_printable(self.name)
+
 
 @dataclass(frozen=True)
 class Optics:
@@ -43,6 +46,14 @@ class Optics:
     frame_period_s: float | None = quantity(
         None, unit="s", low=1e-9, high=1e9, doc="used where the headers hold no time stamps"
     )
+
+
+def check_printable(name: str) -> None:
+    """Raise InputError if a name cannot be printed."""
+    if not name.isprintable():
+        raise InputError(
+            f"name: {name!r:.80} must be text without line breaks and control characters"
+        )
 
 
 def _check_globs(key: str, globs: tuple[str, ...]) -> None:

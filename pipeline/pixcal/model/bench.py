@@ -5,7 +5,14 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pixcal.model.acquisition import Detector, FringeSet, Optics, check_names, check_set
+from pixcal.model.acquisition import (
+    Detector,
+    FringeSet,
+    Optics,
+    check_names,
+    check_printable,
+    check_set,
+)
 from pixcal.model.config import as_in, parse, quantity
 from pixcal.model.errors import InputError
 from pixcal.model.yaml_file import read_yaml
@@ -92,8 +99,7 @@ class SimulatedDetector:
     temperature_c: float = quantity(35.0, unit="C", low=-273.15, high=200, doc="for the headers")
 
     def __post_init__(self) -> None:
-        if not self.name.isprintable():
-            raise InputError(f"name: {self.name!r:.80} holds characters that cannot be printed")
+        check_printable(self.name)
         for axis, name in enumerate(("rows", "columns")):
             first, size, whole = self.origin[axis], self.shape[axis], self.chip_shape[axis]
             if first < 0 or first + size > whole:

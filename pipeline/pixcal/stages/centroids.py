@@ -78,7 +78,7 @@ def correct_table(run_dir: Path, file: Path, config: Centroids) -> Corrected:
         raise InputError(f"{out}: exists; choose another --out, or add --overwrite")
     kinds = {".csv": "ascii.csv", ".ecsv": "ascii.ecsv", ".fits": "fits", ".vot": "votable"}
     if out.suffix.lower() not in kinds:
-        raise InputError(f"{out}: write a name that ends in {', '.join(kinds)}")
+        raise InputError(f"{out}: the ending of the name must be one of {', '.join(kinds)}")
     table.write(out, format=kinds[out.suffix.lower()], overwrite=config.overwrite)
     return corrected
 

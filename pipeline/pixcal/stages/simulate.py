@@ -46,7 +46,7 @@ from pixcal.storage.manifest import (
     write_json,
     write_manifest,
 )
-from pixcal.storage.products import COMPRESSED, FrameWriter
+from pixcal.storage.products import COMPRESSED, FrameWriter, ascii_text
 
 STAGE, TRUTH = STAGES["simulate"], STAGES["simulate-truth"]
 FRAMES_PER_TASK = 128  # frames for which the maps of a block of rows are computed once
@@ -184,7 +184,7 @@ def _cards(bench: Bench, recording: Recording, frame: int) -> dict[str, Any]:
         "CCD-TEMP": (bench.detector.temperature_c, "[C] detector temperature"),
         "IMAGETYP": recording.kind,
         "OBJECT": recording.folder,
-        "INSTRUME": bench.detector.name.encode("ascii", "replace").decode()[:60],
+        "INSTRUME": ascii_text(bench.detector.name),
         "ORIGIN": "pixcal simulate",
     }
 

@@ -94,7 +94,12 @@ class LocalFolder:
 def written_aside(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """Temporary name to write a file; renamed at the end, and flushed to disk if ``durable``."""
     aside = aside_of(path)
-    yield aside
+    try:
+        yield aside
+    except OSError as error:
+        if error.filename == str(aside):
+            error.filename = str(path)  # the name that the user gave
+        raise
     if durable:
         with aside.open("rb") as file:
             os.fsync(file.fileno())

@@ -273,6 +273,11 @@ class FrameWriter:
         return packed
 
 
+def ascii_text(text: str) -> str:
+    """Text as a header can hold it: ASCII, at most 60 characters."""
+    return text.encode("ascii", "replace").decode()[:60]
+
+
 def _header(shape: tuple[int, ...], dtype: str, cards: Cards) -> fits.Header:
     header = fits.Header()
     header["SIMPLE"] = (True, "conforms to FITS standard")

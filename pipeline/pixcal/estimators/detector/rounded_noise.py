@@ -36,10 +36,10 @@ _MARKS = 6  # points about which the grid is refined
 _KNOWN = 0.2  # largest relative error
 
 
-def noise_of_codes(codes: I64, shot: float = 0.0) -> tuple[Measure | None, float]:
+def noise_of_codes(codes: I64, shot: float = 0.0) -> tuple[Measure | None, float | None]:
     """Noise without rounding, rms over pixels, and its error; steps; None where undetermined.
 
-    Also the standard deviation of its logarithm over the pixels.
+    Also the standard deviation of its logarithm over the pixels; None without usable pixels.
 
     ``codes``: (t, n) of at least two frames, in steps. ``shot``: variance (square steps) to
     subtract; so is that common to all pixels of a frame.
@@ -50,6 +50,8 @@ def noise_of_codes(codes: I64, shot: float = 0.0) -> tuple[Measure | None, float
     usual = max(usual_variance(variance, dof), 0.25 + SHEPPARD)
     quiet = variance <= _LOUD**2 * certainly_noisy(dof) * usual
     codes = codes[:, quiet & (np.ptp(codes, axis=0) <= _WIDEST)]
+    if not codes.size:
+        return None, None
     wander = codes.mean(axis=1).var(ddof=1) - codes.var(axis=0, ddof=1).mean() / codes.shape[1]
     law = _Codes(codes)
 

@@ -19,7 +19,7 @@ from pixcal.storage.cube import ArrayReader
 from pixcal.storage.formats import STAGES
 from pixcal.storage.header_values import date_of
 from pixcal.storage.manifest import Manifest, read_json, write_json
-from pixcal.storage.products import Card, is_whole, write_map
+from pixcal.storage.products import Card, ascii_text, is_whole, write_map
 from pixcal.storage.stage import make, require, working
 
 
@@ -116,7 +116,7 @@ def _detector_cards(run_dir: Path) -> list[Card]:
     """Cards on the detector, and on when its fringes were recorded (if the frames state it)."""
     detector = load_run(run_dir).detector
     cards: list[Card] = [
-        ("DETECTOR", detector.name, "name of the detector"),
+        ("DETECTOR", ascii_text(detector.name), "name of the detector"),
         ("PIXSIZE1", detector.pitch_um, "[um] pixel pitch along x"),
         ("PIXSIZE2", detector.pitch_um, "[um] pixel pitch along y"),
     ]

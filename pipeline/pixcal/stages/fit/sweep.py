@@ -74,7 +74,8 @@ def load_run(run_dir: Path, command: str = "") -> Acquisition:
     acquisition = read_acquisition(run_dir)
     if command and not acquisition.frames.fringes:
         raise InputError(
-            f"{run_dir}: its acquisition.yaml lists no frames.fringes, which {command} needs"
+            f"{run_dir}: its acquisition.yaml lists no frames.fringes, which {command} needs; add "
+            f"them there and run 'pixcal ingest' again"
         )
     return acquisition
 

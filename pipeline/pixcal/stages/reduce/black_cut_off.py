@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from pixcal.model.arrays import I64, Mask
+from pixcal.model.arrays import F64, I64, Mask
 from pixcal.stages.reduce.flat_survey import middle_rows, of_whole_numbers
 from pixcal.storage.frame_reader import Reader
 
@@ -80,19 +80,16 @@ class Black(NamedTuple):
 class _Counts(NamedTuple):
     """Samples of some frames (t, y, x) by code."""
 
-    code: I64  # (n,) ascending
+    code: F64  # (n,) ascending
     number: I64  # (n,) samples
     below: I64  # (n,) samples of lower codes, without pixels that never change: these are broken
 
     @classmethod
     def of(cls, samples: NDArray[Any]) -> "_Counts":
-        first = int(samples.min())
-        codes = samples.astype(np.int64) - first
         changing = samples.min(axis=0) != samples.max(axis=0)
-        every, moving = (np.bincount(c.ravel()) for c in (codes, codes[:, changing]))
-        there = np.flatnonzero(every)
-        below = np.concatenate([[0], np.cumsum(moving)])[np.minimum(there, len(moving))]
-        return cls(there + first, every[there], below)
+        code, number = np.unique(samples, return_counts=True)
+        moving = np.sort(samples[:, changing], axis=None)
+        return cls(code.astype(float), number, np.searchsorted(moving, code))
 
     def many(self) -> Mask:
         """Whether a code has enough samples to compare with those below."""

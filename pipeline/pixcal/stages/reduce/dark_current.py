@@ -71,7 +71,8 @@ def dark_current(
     levels = DarkLevels.of(source, middle, good)
     slope = emva.dark_slope(levels.times, levels.means)
     error = gain * slope[1] if slope is not None and slope[1] > _NO_ERROR else None
-    timed = any(source.tables["dark"]["exptime_s"])
+    arrays = {group.array for group in source.exposures.dark}
+    timed = any(any(source.tables[array]["exptime_s"]) for array in arrays)
     unit = "e-/s" if timed else "e-/exposure"
     notes = []
     if error is not None and slope is not None:

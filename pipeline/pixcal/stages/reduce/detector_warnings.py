@@ -248,15 +248,16 @@ def _declared_gain_warnings(fit: GainFit, summary: Summary, used: float) -> list
 
 def trail_warnings(calibration: Place, source: Ingested, gain: float) -> list[str]:
     """That hot pixels have trails of charge, which grow with the distance from an output."""
-    seconds = max((group.exptime for group in source.exposures.dark), default=0.0)
-    if not (source.exposures.has_rate and seconds > 0):
+    longest = max(source.exposures.dark, key=lambda group: group.exptime, default=None)
+    if longest is None or not (source.exposures.has_rate and longest.exptime > 0):
         return []
+    seconds = longest.exptime
     (y0, y1), (x0, x1) = centred(source.shape, _TRAILS_SIDE)
     rate, bias = (
         ArrayReader(calibration / name).read((y0, y1), (x0, x1)).astype(float)
         for name in ("dark_rate", "bias")
     )
-    usable = bias + rate * seconds / gain < _HOT_FULL * source.saturation("dark")
+    usable = bias + rate * seconds / gain < _HOT_FULL * source.saturation(longest.array)
     found = hot_pixels_of(rate * seconds, usable, LINKS)
     trails = None if found is None else trails_of(found, rate.shape, (y0, x0))
     middle = (y0 + y1) / 2, (x0 + x1) / 2

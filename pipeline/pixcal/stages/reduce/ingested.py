@@ -11,7 +11,7 @@ import numpy as np
 
 from pixcal.model.acquisition import Detector
 from pixcal.model.arrays import Mask
-from pixcal.model.errors import InputError
+from pixcal.model.errors import DamagedError, InputError
 from pixcal.stages.reduce import flat_survey
 from pixcal.stages.reduce.black_cut_off import Black, CutOff, cut_offs
 from pixcal.stages.reduce.exposures import Exposures, group_exposures
@@ -53,7 +53,10 @@ class Ingested:
 
     @cached_property
     def _catalogue(self) -> dict[str, dict[str, list[Any]]]:
-        catalogue: dict[str, dict[str, list[Any]]] = read_json(self.folder / "frames.json")
+        file = self.folder / "frames.json"
+        catalogue: dict[str, dict[str, list[Any]]] = read_json(file)
+        if not isinstance(catalogue, dict):
+            raise DamagedError(file, "damaged (not a table of frames)")
         return catalogue
 
     @cached_property

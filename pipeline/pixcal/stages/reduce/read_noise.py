@@ -29,6 +29,7 @@ _LEAST = 0.05  # smallest measurable noise, in steps
 _FILTERED = 0.1  # least correlation of neighbours in filtered samples
 _LINE_ERRORS = 3.0  # errors by which noise common to lines may be larger than it appears
 _CODES = 1 << 17  # pixels whose codes tell noise below a step
+_MOST_CODES = 1 << 20  # most codes of a converter
 _PAIRS, _SAMPLES = 16, 1 << 20  # pairs, and samples of each frame, that measure block noise
 
 
@@ -177,7 +178,8 @@ def code_counts(groups: Sequence[Group], job: Measuring) -> F64:
         for n in group.frames:
             rows = middle_rows(reader, n, n + 1)
             codes = np.maximum(rows[np.isfinite(rows)], 0) // job.quantum
-            own = np.bincount(codes.astype(np.int64), minlength=len(found)).astype(float)
+            codes = codes[codes < _MOST_CODES].astype(np.int64)
+            own = np.bincount(codes, minlength=len(found)).astype(float)
             own[: len(found)] += found
             found = own
     return found
