@@ -85,7 +85,7 @@ def test_phases_in_equal_steps_tell_nothing(acquired: Callable[..., Evidence]) -
 def test_times_longer_than_a_frame_are_refused(
     make_effect_bench: Callable[..., Bench], times: dict[str, float]
 ) -> None:
-    with pytest.raises(InputError, match=rf"rolling_shutter: {next(iter(times))}: .*period_s"):
+    with pytest.raises(InputError, match=rf"^{next(iter(times))}: .*period_s"):
         RollingShutter(**times).check(make_effect_bench())
 
 
