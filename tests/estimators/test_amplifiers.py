@@ -97,3 +97,15 @@ def test_light_mosaic_and_response_make_no_outputs(seed: int) -> None:
     # A colour mosaic, and a step of the response of the pixels, as of a stitched sensor.
     for factor in (0.6 ** (X % 2 * (Y % 2)), 1.03 ** (X >= 70)):
         assert differing_outputs(flat * factor, noise, flat > 0) is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_halves_are_told_by_steps_of_seven_errors_of_their_noise(seed: int) -> None:
+    """The error is that of the means of both halves: no lamp takes part of it."""
+    gains = 1.0085 ** (X // 75)
+    flat, noise = camera(gains, seed)
+    error = np.sqrt(2 / 400) * 2 / np.sqrt(X.size)
+    assert 0.0085 / error == pytest.approx(7, abs=0.3)
+    found = differing_outputs(flat, noise, flat > 0)
+    assert found is not None
+    assert len(found.names) == 2

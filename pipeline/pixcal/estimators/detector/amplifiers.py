@@ -18,7 +18,10 @@ from pixcal.model.arrays import F64, I64, Mask
 MAX_BOUNDARIES = 7  # most boundaries along each axis
 NARROWEST = 8  # fewest rows or columns of an amplifier
 SIGNIFICANT = 6.0  # standard deviations of a step of the flat
-SMOOTH = 2  # degree of the lamp's variation
+SMOOTH = (0, 1, 2)  # degrees of the lamp's variation
+# The same of noise over light: a curved response follows the lamp, which is mostly even about the
+# middle. A tilt would take half of what a step shows.
+EVEN = (0, 2)
 CERTAIN = 4.0  # the same of a step of the noise, to name the outputs
 _TILE = 32  # side (px) of the blocks to which a trend is fitted
 
@@ -114,10 +117,11 @@ def _parts(response: F64, ratio: F64, axis: int) -> list[Mask]:
     even_out = along - _sizes(along, [odd])[0][0] * odd
     patterns = [odd, *(place >= at for at in _boundaries(even_out))]
     # Steps too small for the noise to have them, as of the lamp, would blur the others.
-    sizes, errors = _sizes(along, patterns)[0], _sizes(in_noise, patterns)[1]
+    sizes, errors = _sizes(along, patterns)[0], _sizes(in_noise, patterns, EVEN)[1]
     told = abs(sizes) > CERTAIN / 2 * errors
     patterns = [pattern for pattern, one in zip(patterns, told, strict=True) if one]
-    (size, error), (seen, noise) = (_sizes(one, patterns) for one in (along, in_noise))
+    size, error = _sizes(along, patterns)
+    seen, noise = _sizes(in_noise, patterns, EVEN)
     there = (abs(size) > SIGNIFICANT * error) & (abs(seen) > CERTAIN * noise)
     alike = abs(seen - size) < np.maximum(CERTAIN / 2 * noise, abs(size) / 2)
     return [pattern for pattern, kept in zip(patterns, there & alike, strict=True) if kept]
@@ -205,15 +209,16 @@ def _boundaries(along: F64) -> list[int]:
     return sorted(steps)
 
 
-def _terms(count: int, patterns: Sequence[Mask]) -> F64:
-    return np.column_stack([legvander(np.linspace(-1, 1, count), SMOOTH), *patterns])
+def _terms(count: int, patterns: Sequence[Mask], trend: Sequence[int] = SMOOTH) -> F64:
+    smooth = legvander(np.linspace(-1, 1, count), max(trend))[:, trend]
+    return np.column_stack([smooth, *patterns])
 
 
-def _sizes(along: F64, patterns: Sequence[Mask]) -> tuple[F64, F64]:
-    """Steps of a profile, at places (place,) of patterns, and their errors from its scatter."""
-    terms = _terms(len(along), patterns)
+def _sizes(along: F64, patterns: Sequence[Mask], trend: Sequence[int] = SMOOTH) -> tuple[F64, F64]:
+    """Steps of a profile beside a trend, at places (place,) of patterns; errors by its scatter."""
+    terms = _terms(len(along), patterns, trend)
     inverse = np.linalg.inv(terms.T @ terms)
     fitted = inverse @ (terms.T @ along)
     scatter = float(np.var(along - terms @ fitted)) * len(along) / (len(along) - terms.shape[1])
-    first = SMOOTH + 1
+    first = len(trend)
     return fitted[first:], np.sqrt(np.diag(inverse)[first:] * scatter)
