@@ -19,6 +19,7 @@ from pixcal.estimators.test_statistics.fringe_set_data import STEPS
 from pixcal.model.arrays import F64
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.frames import split
+from pixcal.stages.diagnose.measure_nominal import _pixel_noise
 from pixcal.stages.diagnose.parts import RawFrames, evidence_of
 from pixcal.stages.diagnose.windows import whole_of
 from pixcal.stages.reduce.flat_survey import FlatSurvey
@@ -175,6 +176,20 @@ def test_noise_that_is_cut_off_at_code_zero_is_told_of(tmp_path: Path) -> None:
     cut = [warning for warning in report["warnings"] if "cut off at code 0" in warning]
     assert len(cut) == 2
     assert "raise the black level" in cut[0]
+
+
+def test_pixels_whose_noise_is_cut_off_are_simulated_with_that_noise(tmp_path: Path) -> None:
+    """Pixels of the same noise differ in level, and so in the part of it that is cut off."""
+    camera = CAMERA | {"bias": 3.0, "scatter": 5.0, "dark": 0.0}
+    evidence, _ = reduced(Detector(**camera, flats=ladder([(1.0, 1)])), 16, tmp_path)
+    noise = _pixel_noise([evidence], [{}], evidence.good)
+    rng = np.random.default_rng(17)
+    own = 1.0 if noise is None else noise.drawn(rng)
+    bias = next(s.adu for s in evidence.stacks if s.kind == "bias")
+    sigma = own * evidence.amplifier_noise / evidence.gain
+    drawn = np.maximum(np.rint(rng.normal(evidence.bias, sigma, bias.shape)), 0)
+    seen, simulated = (f.var(axis=0, ddof=1)[evidence.good].mean() for f in (bias, drawn))
+    assert simulated == pytest.approx(seen, rel=0.04)
 
 
 def test_a_gain_does_not_hang_on_noise_that_is_cut_off_at_code_zero(tmp_path: Path) -> None:

@@ -82,9 +82,9 @@ def nominal_bench(
 def _pixel_noise(
     evidence: Sequence[Evidence], halves: Sequence[FrameSubset], good: Mask
 ) -> PixelNoise | None:
-    """Read noise of each pixel; None where rounding hides it."""
+    """Read noise of each pixel; None where rounding, or the lowest code, hides it."""
     one = evidence[0]
-    if not one.dithered:
+    if not one.dithered or one.lowest_adu is not None:
         return None
     # If frames are too few to split, every part holds the same ones.
     parts = evidence if parted("bias", halves) else evidence[:1]
