@@ -7,12 +7,13 @@ numbers of a common size, and the size is zero or any below one. The gain is the
 sizes, each with the weight of its evidence (MacKay 1992, *Neural Computation* 4, 415); the
 remaining uncertainty of the curve is in its error.
 
-A camera that reads bright pixels with another amplifier (dual gain) has a step in the curve, which
-no such term describes. If points deviate from the curve by far more than their noise, lower ranges
-are fitted too, and the gain is that of the best-determined range.
-
 Frames without light may differ in noise from flats: a camera clips black, or reads dark pixels with
-another amplifier. The average includes curves without them, with a small prior probability.
+another amplifier (dual gain), up to a level between two flats. The average includes curves without
+them, and curves with a step between two levels, with a small prior probability.
+
+If levels cross such a step smoothly, none of these terms describes it. If points deviate from the
+curve by far more than their noise, lower ranges are fitted too, and the gain is that of the
+best-determined range.
 """
 
 import math
@@ -29,6 +30,7 @@ LADDER = 4  # groups of flats from which the curve may be curved
 _TERMS = 4  # terms of curvature
 _CHANCE_APART = 1e-4  # prior probability that noise without light is not on the curve
 _WIDTHS = 6  # prior errors of the noise at level zero that are tried then
+_NONE = 1e-6  # rise of the noise, over the error of that without light, that is effectively zero
 _STRAIGHT = 1e-6  # size of terms that is effectively zero
 _SIZES = np.concatenate([[_STRAIGHT], np.geomspace(1e-3, 1.0, 13)])
 _CHANCES = np.concatenate([[0.5], np.full(13, 0.5 / 13)])
@@ -39,6 +41,7 @@ _ITERATIONS = 5
 _OFF_CURVE = 1e-6  # chance of a misfit beyond which a curve may have a step
 _FEWEST = 2  # points below a step: with the noise without light, they check each other
 _SHORTER = 1.5  # factor between the ranges that are tried then
+_GAP = 1.2  # least factor between two levels that may lie on either side of a step
 
 
 @dataclass(frozen=True)
@@ -149,9 +152,9 @@ def _fit_range(
     sizes = _SIZES if terms else _SIZES[:1]
     several = not straight and len(level) >= 2 * _SPARE
     apart = _CHANCE_APART * several if without_dark is None else float(without_dark)
-    design = np.stack(
-        [np.ones_like(level), *(level * (level / top) ** n for n in range(terms + 1))]
-    )
+    below = level[:-1][level[1:] > _GAP * level[:-1]] if 0 < apart < 1 else level[:0]
+    curve = np.stack([level * (level / top) ** n for n in range(terms + 1)])
+    design = np.stack([np.ones_like(level), *curve, *(level > below[:, None])])
     slope, chi2 = float((dof * shot).sum() / (dof * level).sum()), 1.0
     expected = slope * level
     for _ in range(_ITERATIONS):
@@ -159,44 +162,59 @@ def _fit_range(
         weight = 1 / (2 * whole**2 / dof + uneven * np.sqrt(whole / np.pi))
         normal, right = (design * weight) @ design.T / chi2, design @ (weight * shot) / chi2
         narrow = math.hypot(read_variance[1], level_error * slope)
-        offsets, before = _offsets(narrow, float((slope * level).max()), apart)
-        information = np.zeros((len(offsets), len(sizes), terms + 2))
-        information[:, :, 0] = offsets[:, None] ** -2
-        information[:, :, 2:] = (sizes[:, None] * slope) ** -2
+        jumps, before = _jumps(narrow, float((slope * level).max()), apart, len(below))
+        information = _information(jumps, sizes * slope, terms)
         means, covariances, evidence = _posterior(normal, right, information)
         share = np.outer(before, _CHANCES[: len(sizes)]) * np.exp(evidence - evidence.max())
         share /= share.sum()
         mean = np.tensordot(share, means, 2)
         slope, expected = float(mean[1]), mean @ design
-        if not slope > 0 or not mean[1:].sum() > 0:
+        if not slope > 0 or not mean[1 : terms + 2].sum() > 0:
             return None
-        # About the most flexible curve: curvature is no scatter.
+        # About the best of the most flexible curves: neither curvature nor a step is scatter.
         freedom = len(level) - np.einsum("...ij,ij", covariances, normal)
-        rest = weight @ (shot - means[-1, -1] @ design) ** 2
-        chi2 = max(1.0, float(rest / max(freedom[-1, -1], 1)))
+        rest = (shot - means[:, -1] @ design) ** 2 @ weight
+        chi2 = max(1.0, float((rest / np.maximum(freedom[:, -1], 1)).min()))
     spread = np.diagonal(covariances, axis1=-2, axis2=-1) + (means - mean) ** 2
     of_zero, scatter = np.sqrt(np.tensordot(share, spread, 2)[:2])
     misfit, free = float(weight @ (shot - expected) ** 2), max(float((share * freedom).sum()), 1.0)
+    apart_at = share.sum(axis=1) @ (jumps > narrow)
+    step = bool(apart_at[1:].sum() > 0.5)
     return GainFit(
         1 / slope,
         float(scatter) / slope**2,
         misfit / free,
-        (float(level.min()), top),
+        (float(level.min()), float(below[np.argmax(apart_at[1:])]) if step else top),
         (read_variance[0] + float(mean[0]), float(of_zero)),
-        float(mean[2:].sum() / slope) if share[:, 0].sum() < _CURVED else 0.0,
+        float(mean[2 : terms + 2].sum() / slope) if share[:, 0].sum() < _CURVED else 0.0,
         chance=float(chdtrc(free, misfit)),
-        without_dark=bool(share[offsets > narrow].sum() > 0.5),
+        step=step,
+        without_dark=bool(apart_at[0] > 0.5),
     )
 
 
-def _offsets(narrow: float, highest: float, apart: float) -> tuple[F64, F64]:
-    """Errors of the variance at level zero, with frames without light or not; their priors.
+def _jumps(narrow: float, highest: float, apart: float, steps: int) -> tuple[F64, F64]:
+    """Errors (n, 1 + steps) of the variance at level zero and of its rise at each step; priors.
 
-    For frames read in another way, it is only known that noise grows with light.
+    For pixels read in another way, it is only known that noise grows with light. At most one of the
+    errors is wide.
     """
-    wide = np.geomspace(narrow, max(highest, 2 * narrow), _WIDTHS + 1)
-    chances = np.append(1 - apart, np.full(_WIDTHS, apart / _WIDTHS))
-    return wide[chances > 0], chances[chances > 0]
+    wide = np.geomspace(narrow, max(highest, 2 * narrow), _WIDTHS + 1)[1:]
+    found = np.full((1 + steps, _WIDTHS, 1 + steps), _NONE * narrow)
+    found[..., 0] = narrow
+    found[range(1 + steps), :, range(1 + steps)] = wide
+    usual = np.where(np.arange(1 + steps) > 0, _NONE, 1.0) * narrow
+    chances = np.append(1 - apart, np.full((1 + steps) * _WIDTHS, apart / _WIDTHS / (1 + steps)))
+    return np.vstack([usual, found.reshape(-1, 1 + steps)])[chances > 0], chances[chances > 0]
+
+
+def _information(jumps: F64, sizes: F64, terms: int) -> F64:
+    """Prior information (n, size, coefficient): ``jumps`` (n, 1 + steps), sizes of the terms."""
+    found = np.zeros((len(jumps), len(sizes), terms + 1 + jumps.shape[1]))
+    found[:, :, 0] = jumps[:, None, 0] ** -2
+    found[:, :, 2 : terms + 2] = sizes[:, None] ** -2
+    found[:, :, terms + 2 :] = jumps[:, None, 1:] ** -2
+    return found
 
 
 def _posterior(normal: F64, right: F64, information: F64) -> tuple[F64, F64, F64]:
