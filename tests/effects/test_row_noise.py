@@ -181,3 +181,20 @@ def test_groups_of_rows_have_the_power_that_is_foreseen() -> None:
     power = (np.abs(np.fft.rfft(rows, norm="ortho")) ** 2).mean(axis=0)[1:]
     spectrum = LineSpectrum(64, power, np.ones(32), 0.0, 0.0)
     np.testing.assert_allclose(power, group_power(spectrum, 4), rtol=0.12, atol=1e-9)
+
+
+@pytest.mark.parametrize("frames", [2, 3, 7])
+def test_few_frames_of_many_rows_suffice(frames: int, acquired: Callable[..., Evidence]) -> None:
+    """Each row of each frame is a sample of its noise."""
+    evidence, rng = acquired(), np.random.default_rng(frames)
+    good = np.ones((160, 200), bool)
+    for rows in (0.0, 0.2):
+        adu = rng.standard_normal((frames, *good.shape))
+        adu += rows * rng.standard_normal((frames, len(good), 1))
+        stack = replace(evidence.of_kind("bias")[0], adu=adu.astype(np.float32))
+        found = RowNoise.estimate(replace(evidence, stacks=(stack,), good=good, gain=1.0))
+        assert found is not None
+        assert (found.significance > 10) == (rows > 0)
+        size, error = found.effect.row_rms, found.errors["row_rms"]
+        assert size**2 == pytest.approx(rows**2, abs=4 * error * (2 * size + error))
+        assert rows == 0 or error < 0.15 * rows

@@ -27,7 +27,6 @@ FIRST_MODE = 3
 _rms = partial(quantity, unit="e-", low=0, high=1e5)
 BLOCKS, MIN_BLOCK = 16, 4  # most blocks per row, and least pixels per block
 FEWEST_BLOCKS = 4
-FEWEST_FRAMES = 8
 FEWEST_LINES = 8
 _ROUNDS = 4
 GROUPS = range(2, 9)  # rows that may be read together
@@ -109,7 +108,7 @@ class RowNoise(Effect):
         dark = [
             ((s.adu - s.adu.mean(axis=0)) * np.float32(evidence.gain), evidence.good, 1)
             for s in evidence.stacks
-            if s.kind in ("bias", "dark") and len(s.adu) >= FEWEST_FRAMES
+            if s.kind in ("bias", "dark")
         ]
         fringes = [] if dark else list(evidence.fringes.values())
         rows = [line_spectrum(*frames) for frames in dark]
@@ -219,7 +218,7 @@ def line_spectrum(residual: F32, good: Mask, fitted: int = 1) -> LineSpectrum | 
     lines -= lines % 2
     size = max(MIN_BLOCK, -(-width // BLOCKS))
     blocks = width // size
-    if frames < FEWEST_FRAMES or lines < FEWEST_LINES or blocks < FEWEST_BLOCKS:
+    if frames <= fitted or lines < FEWEST_LINES or blocks < FEWEST_BLOCKS:
         return None
     begin = np.arange(blocks) * size
     used = good[:lines] & np.isfinite(residual[:, :lines]).all(axis=0)

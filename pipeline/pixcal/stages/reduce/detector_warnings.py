@@ -52,7 +52,8 @@ def detector_warnings(
             "were filtered, smoothed or resampled before they were written; gain and noise are "
             "those of the filtered samples, and photon transfer is invalid; record raw frames"
         )
-    if saturation is not None:
+    # Without a level that saturates, only hot pixels do.
+    if saturation is not None and not summary.usable.all():
         warnings.append(
             f"flats saturate at {saturation:.0f} ADU, where their samples pile up: "
             f"gain and linearity exclude {(~summary.usable).sum()} of {len(summary.usable)} "
