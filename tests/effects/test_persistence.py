@@ -12,7 +12,7 @@ from all_frames import frames_of
 
 from pixcal.effects.lag import Lag
 from pixcal.estimators.detector.emva import dark_slope
-from pixcal.estimators.detector.persistence import persistence
+from pixcal.estimators.detector.persistence import persistence, released_late
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.model.arrays import F32
 from pixcal.model.bench import Bench
@@ -335,3 +335,19 @@ def test_charge_decays_in_a_pause_before_the_darks(make_effect_bench: Callable[.
         replace(lag, capacity_e=1e4).check(bench)
     with pytest.raises(InputError, match="slow_part: needs decay_s and slow_s"):
         replace(lag, slow_part=0.1).check(bench)
+
+
+def test_errors_of_decays_that_are_alike_are_real_numbers() -> None:
+    """Where nothing is released, two decays may be anything, and the same."""
+    rng = np.random.default_rng(7)
+    series = [("bias", 0.0, 0.0, 8), *(("flat", t / 100, 2e3 * t, 2) for t in (1, 3, 5, 7))]
+    for _ in range(60):
+        clock, levels = 0.0, []
+        for kind, seconds, light, count in [*series, ("dark", 0.5, 0.0, 5), ("dark", 1.5, 0.0, 5)]:
+            number = np.arange(count)
+            none = np.zeros((count, 1, 1), np.float32)
+            stack = Stack(kind, seconds, number, number * (seconds + 1), none, clock)
+            levels.append((stack, light + rng.normal(0, 0.05, count)))
+            clock += count * (seconds + 1)
+        with np.errstate(invalid="raise"):
+            released_late(levels, 0.05**2)

@@ -245,7 +245,7 @@ def _fit(
     turned = (share(decay * (1 + _STEP))[2] - model) * size / (_STEP * decay)
     design = np.stack([model, turned], axis=1)
     variance = max(left / freedom, least)
-    errors = np.sqrt(variance * np.diag(np.linalg.pinv(design.T @ design)))
+    errors = np.sqrt(variance) * np.linalg.norm(np.linalg.pinv(design), axis=1)
     errors = np.hypot(errors, _OF_MODEL * np.array([size, decay]))
     return Persistence(size, float(errors[0]), decay, float(errors[1]), in_seconds)
 
@@ -268,7 +268,9 @@ def _of_two_kinds(
         turned = (_shares(own, series, (1 + _STEP) * decays)[1] - models) * sizes
         design = np.concatenate([models, turned / (_STEP * decays)], axis=1)
         variance = max(left / freedom, least)
-        covariance = variance * np.linalg.pinv(design.T @ design)
+        # Of the design itself: the inverse of its square may be negative, where decays are alike.
+        inverse = np.linalg.pinv(design)
+        covariance = variance * inverse @ inverse.T
         if (sizes <= _SURE * np.sqrt(np.diag(covariance)[:2])).any():
             return None
         share = float(sizes.sum())
