@@ -221,6 +221,15 @@ def test_what_rises_with_the_charge_is_not_taken_for_a_share():
         assert 1e-5 < error < 3e-4
 
 
+def test_a_rise_that_no_hot_pixel_shows_has_no_finite_error():
+    found = shown(hot([0.03, 0.03]))
+    share, rise, covariance = found.rises()
+    assert np.isfinite(share).all()
+    assert np.isfinite(rise).all()
+    assert np.isinf(covariance[..., 1, 1]).any()
+    assert not np.isnan(covariance).any()
+
+
 def test_offsets_follow_a_change_of_the_maps_less_its_modes():
     rng = np.random.default_rng(4)
     shape, k = (45, 52), (0.9, 0.3)

@@ -112,6 +112,7 @@ class ClassShares:
         variance = np.divide(1, square, out=np.full_like(square, np.inf), where=square > 0)
         rise = product * np.where(square > 0, variance, 0)
         of_mean = np.divide(1, weight, out=np.full_like(weight, np.inf), where=weight > 0)
+        charge = np.where(weight > 0, charge, 1.0)
         mixed = -charge * variance
         both = np.array([[of_mean - charge * mixed, mixed], [mixed, variance]])
         return value - charge * rise, rise, np.moveaxis(both, (0, 1), (-2, -1))

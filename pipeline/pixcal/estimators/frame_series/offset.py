@@ -22,7 +22,7 @@ from pixcal.estimators.frame_series.variance_components import (
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.model.arrays import F32, F64, Mask
 
-FEWEST = 8  # fewest frames: with fewer, chance does not follow the assumed distribution
+FEWEST = 5  # fewest frames: with fewer, chance does not follow the assumed distribution
 FEWEST_PIXELS = 16  # in each quarter
 # R, C, K of the quarters
 CONTRASTS = np.array([[1, 1, -1, -1], [1, -1, 1, -1], [1, -1, -1, 1]]) / 4
