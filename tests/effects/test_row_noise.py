@@ -198,3 +198,17 @@ def test_few_frames_of_many_rows_suffice(frames: int, acquired: Callable[..., Ev
         size, error = found.effect.row_rms, found.errors["row_rms"]
         assert size**2 == pytest.approx(rows**2, abs=4 * error * (2 * size + error))
         assert rows == 0 or error < 0.15 * rows
+
+
+def test_rows_that_move_alone_are_found(acquired: Callable[..., Evidence]) -> None:
+    """Nothing else varies, so that the noise of single pixels is nothing beside that of rows."""
+    evidence, rng = acquired(), np.random.default_rng(8)
+    good = np.ones((64, 100), bool)
+    adu = np.repeat(rng.normal(0, 5.0, (4, 64, 1)), 100, axis=2).astype(np.float32)
+    stack = replace(evidence.of_kind("bias")[0], adu=adu)
+    found = RowNoise.estimate(replace(evidence, stacks=(stack,), good=good, gain=1.0))
+    assert found is not None
+    assert found.significance > 10
+    assert found.effect.row_rms == pytest.approx(5.0, rel=0.3)
+    still = replace(stack, adu=0 * adu)
+    assert RowNoise.estimate(replace(evidence, stacks=(still,), good=good)) is None

@@ -27,6 +27,7 @@ FIRST_MODE = 3
 _rms = partial(quantity, unit="e-", low=0, high=1e5)
 BLOCKS, MIN_BLOCK = 16, 4  # most blocks per row, and least pixels per block
 FEWEST_BLOCKS = 4
+_LEAST_OWN = 1e-6  # least noise of a block's own, of its variance
 FEWEST_LINES = 8
 _ROUNDS = 4
 GROUPS = range(2, 9)  # rows that may be read together
@@ -237,7 +238,11 @@ def line_spectrum(residual: F32, good: Mask, fitted: int = 1) -> LineSpectrum | 
     power = np.einsum("nij,ij->n", products, apart > 0) / pairs
     dof = np.full(len(power), 2.0 * (frames - fitted))
     dof[-1] /= 2
-    own = np.maximum(np.einsum("nii->i", products) / len(power) - power.mean(), 0.0)
+    whole = np.einsum("nii->i", products) / len(power)
+    if not whole.any():
+        return None
+    # Beside large common noise, that of the blocks is not known to be zero.
+    own = np.maximum(whole - power.mean(), _LEAST_OWN * whole)
     return LineSpectrum(
         lines=lines,
         power=power,
