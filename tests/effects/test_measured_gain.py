@@ -16,7 +16,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.recording import recordings
-from pixcal.stages.diagnose.flats import MeasuredGain, photon_transfer_change
+from pixcal.stages.diagnose.flats import CHANGE_ERROR, MeasuredGain, photon_transfer_change
 
 SHARE = 0.02
 SIDES = tuple(Coupling(dy, dx, SHARE) for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)))
@@ -43,6 +43,13 @@ def test_the_noise_of_flats_changes_as_the_kernel_says(
 ) -> None:
     bench = make_effect_bench({"detector.shape": [121, 127]})
     assert change(bench, effect) == pytest.approx(variance, abs=4e-3)
+
+
+def test_some_rows_of_a_large_detector_tell_how_its_noise_changes(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    bench = make_effect_bench({"detector.shape": [601, 701], "frames.bias": 2})
+    assert change(bench, Ipc(SIDES)) == pytest.approx(KERNEL, abs=3 * CHANGE_ERROR)
 
 
 def test_brighter_fatter_takes_noise_in_proportion_to_the_level(

@@ -9,6 +9,7 @@ from scipy.stats import kurtosis, median_abs_deviation
 from pixcal.kernels.robust import (
     Combination,
     clipped_variance_factor,
+    median,
     median_and_deviation,
     median_around,
     robust_sigma,
@@ -33,10 +34,10 @@ def combine(
 @pytest.mark.parametrize("n", [1, 2, 3, 5, 8, 13, 63, 64])
 def test_median_and_deviation_are_those_of_numpy(n: int) -> None:
     frames = 500 + noise((n, 7, 19))
-    median, deviation = median_and_deviation(frames)
-    np.testing.assert_allclose(median, np.median(frames, axis=0), rtol=1e-6)
+    middle, deviation = median_and_deviation(frames)
+    np.testing.assert_allclose(middle, np.median(frames, axis=0), rtol=1e-6)
     np.testing.assert_allclose(
-        deviation, np.median(np.abs(frames - median), axis=0), rtol=1e-5, atol=1e-4
+        deviation, np.median(np.abs(frames - middle), axis=0), rtol=1e-5, atol=1e-4
     )
 
 
@@ -44,12 +45,12 @@ def test_missing_samples_do_not_count_in_the_median() -> None:
     frames = noise((9, 5, 6))
     frames[np.random.default_rng(1).random(frames.shape) < 0.3] = np.nan
     frames[:, 2, 3] = np.nan
-    median, deviation = median_and_deviation(frames)
-    assert np.isnan(median[2, 3])
+    middle, deviation = median_and_deviation(frames)
+    assert np.isnan(middle[2, 3])
     assert np.isnan(deviation[2, 3])
     good = np.isfinite(frames).any(axis=0)
-    np.testing.assert_allclose(median[good], np.nanmedian(frames[:, good], axis=0), rtol=1e-6)
-    off = np.nanmedian(np.abs(frames - median)[:, good], axis=0)
+    np.testing.assert_allclose(middle[good], np.nanmedian(frames[:, good], axis=0), rtol=1e-6)
+    off = np.nanmedian(np.abs(frames - middle)[:, good], axis=0)
     np.testing.assert_allclose(deviation[good], off, rtol=1e-5, atol=1e-6)
 
 
@@ -181,6 +182,24 @@ def test_medians_around_pixels_are_those_of_scipy() -> None:
     values = np.random.default_rng(16).standard_normal((17, 23)).astype(np.float32)
     expected = median_filter(values, 5, mode="reflect")
     np.testing.assert_array_equal(median_around(values, 5), expected)
+
+
+@pytest.mark.parametrize("count", [1, 2, 4096, 4097, 50_000, 50_001])
+@pytest.mark.parametrize("kind", ["normal", "codes", "zeros", "sorted", "periodic"])
+def test_medians_are_exact(count: int, kind: str) -> None:
+    """Also where the sample that narrows the search tells nothing of the rest."""
+    values = np.random.default_rng(count).standard_normal(count)
+    values = {
+        "normal": values,
+        "codes": np.rint(3 * values),
+        "zeros": np.where(values > 0.5, values, 0.0),
+        "sorted": np.sort(values),
+        "periodic": np.where(np.arange(count) % (int(count ** (1 / 3)) | 1) == 0, 9.0, values),
+    }[kind]
+    expected = np.median(values)
+    for kept in (values, values.astype(np.float32)):
+        exact = expected if kept.dtype == values.dtype else np.median(kept)
+        assert median(kept.copy()) == exact
 
 
 @pytest.mark.parametrize("count", [1, 6, 1001])

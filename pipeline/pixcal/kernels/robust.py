@@ -27,6 +27,7 @@ from pixcal.model.arrays import F32, F64, Mask
 
 BATCH = 64  # frames processed at a time
 _LEVEL_PIXELS = 4096
+_SAMPLED = 4096  # values above which the median is sought near that of a sample
 _ROUNDING = np.float32(1e-6)
 SIGMA_OF_MAD = 1.482602218505602
 _BRIGHT, _LIT = 0.9, 0.1  # quantile of a tile that is lit if any pixel is; share of its signal
@@ -289,8 +290,17 @@ def robust_sigma(values: NDArray[Any]) -> float:
 
 
 def median(values: NDArray[Any]) -> float:
-    """Median of finite values (n,), as numpy's but faster; reorders them."""
+    """Median of finite values (n,), as numpy's but faster; may reorder them."""
     low, high = (len(values) - 1) // 2, len(values) // 2
+    if len(values) > _SAMPLED:
+        # Only values near the median of a sample are sorted; it is nearly always among them.
+        sample = np.sort(values[:: int(len(values) ** (1 / 3)) | 1])
+        reach = int(1.5 * len(sample) ** 0.5) + 1
+        first, last = sample[len(sample) // 2 - reach], sample[len(sample) // 2 + reach]
+        below = np.count_nonzero(values < first)
+        near = values[(values >= first) & (values <= last)]
+        if below <= low and high < below + len(near):
+            values, low, high = near, low - below, high - below
     values.partition(high)
     lower = values[high] if low == high else values[:high].max()
     return float((lower + values[high]) / 2)

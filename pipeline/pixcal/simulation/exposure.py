@@ -65,16 +65,16 @@ class Camera:
         """Frames of these numbers as read out: number and samples, ADU (array reused)."""
         chain = _Chain(self, recording)
         for frame in frames:
-            yield frame, chain.samples(frame)[self._kept]
+            yield frame, chain.samples(frame)[self.kept]
 
     def analogue(self, recording: Recording, frames: Iterable[int]) -> Iterator[F32]:
         """Frames before the converter: float32 (y, x), ADU; a new array for each."""
         chain = _Chain(self, recording)
         for frame in frames:
-            yield chain.adu(frame)[self._kept]
+            yield chain.adu(frame)[self.kept]
 
     @property
-    def _kept(self) -> slice:
+    def kept(self) -> slice:
         """The requested rows among the computed ones."""
         return slice(self.inside[0] - self.rows[0], self.inside[1] - self.rows[0])
 
