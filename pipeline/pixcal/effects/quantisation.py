@@ -299,7 +299,7 @@ def _uneven(
             rest = widths.without(found.bits, found.law).scatter()[0]
         found = widths.bits(2 * rest, found.law, start)
         bits, covariance = found.bits, found.covariance
-        levelled = np.stack([widths.level(one) for one in np.eye(len(bits))], 1)
+        levelled = widths.level(np.eye(len(bits)))
     # No bit deviates by more than its own weight, although a fit to few codes may say so.
     if bits is not None and (np.abs(levelled @ bits) <= 2.0 ** np.arange(len(bits))).all():
         values, errors, others, _ = _uneven(widths.without(bits, found.law))

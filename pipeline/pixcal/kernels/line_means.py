@@ -8,6 +8,7 @@ from scipy.ndimage import uniform_filter1d
 from pixcal.model.arrays import F32, Mask
 
 REACH = 5  # distance up to which pixels stay uncorrelated, px
+_NEAR = 2 * REACH + 1
 
 
 def without_line_means(noise: F32, used: Mask) -> F32:
@@ -34,6 +35,19 @@ def _counts(used: bytes, shape: tuple[int, int]) -> tuple[F32, F32]:
 
 def _half_near(values: F32, axis: int) -> F32:
     """Sum along an axis around each place, with half weight for near values."""
-    size = 2 * REACH + 1
-    near = uniform_filter1d(values, size, axis=axis, mode="constant") * np.float32(size / 2)
+    if axis == -1:
+        near = uniform_filter1d(values, _NEAR, mode="constant") * np.float32(_NEAR / 2)
+    else:
+        near = np.empty_like(values)
+        for frame, own in zip(_frames(values), _frames(near), strict=True):
+            # Whole rows, of one frame in the cache: scipy takes eight times as long along columns.
+            padded = np.pad(frame, ((REACH, REACH), (0, 0)))
+            own[:] = padded[: len(own)]
+            for row in range(1, _NEAR):
+                own += padded[row : row + len(own)]
+            own /= 2
     return np.asarray(values.sum(axis=axis, keepdims=True) - near)
+
+
+def _frames(values: F32) -> F32:
+    return values.reshape(-1, *values.shape[-2:])

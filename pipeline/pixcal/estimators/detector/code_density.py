@@ -58,7 +58,7 @@ def histogram(frames: Iterable[NDArray[np.generic]], good: Mask) -> F64 | None:
     # Samples at either end may have been clipped, so they do not count.
     counts = np.zeros(MAX_CODES)
     for stack in frames:
-        samples = stack[:, good]
+        samples = stack if good.all() else stack[:, good]
         if samples.dtype.kind == "f":
             whole = np.rint(samples)
             if not np.array_equal(whole, samples):
@@ -187,7 +187,7 @@ def level_errors(bits: F64, codes: int) -> F64:
     errors = np.zeros(1)
     for bit in bits:
         errors = np.concatenate([errors, errors + bit])
-    return np.resize(errors, codes)
+    return errors[:codes] if len(errors) >= codes else np.resize(errors, codes)
 
 
 def code_cells(bits: F64, law: Law, codes: int) -> tuple[F64, I64]:
@@ -382,14 +382,11 @@ class CodeWidths:
         return (len(self.gap) - 1).bit_length()
 
     def level(self, bits: F64) -> F64:
-        """Bits plus a gain, so that the response error has no slope over the measured codes."""
-        changing = np.ptp(self.number[:, None] >> np.arange(len(bits)) & 1, axis=0) > 0
-        gain = np.where(changing, 2.0 ** np.arange(len(bits)), 0.0)
-        of_bits, of_gain = (
-            np.polyfit(self.number, level_errors(own, len(self.gap))[self.number], 1)[0]
-            for own in (bits, gain)
-        )
-        return np.asarray(bits - of_bits / of_gain * gain)
+        """Bits (n, ...) plus a gain, so that the response error has no slope over the codes."""
+        has = (self.number[:, None] >> np.arange(len(bits)) & 1).astype(float)
+        gain = np.where(np.ptp(has, axis=0) > 0, 2.0 ** np.arange(len(bits)), 0.0)
+        slope = np.polyfit(self.number, has, 1)[0]
+        return np.asarray(bits - np.multiply.outer(gain, slope @ bits) / (slope @ gain))
 
     def _left_out(self, bits: F64, law: Law) -> F64:
         """Widths (n,) caused by errors of bit weights, less what the local fit absorbs."""
