@@ -297,7 +297,7 @@ def median(values: NDArray[Any]) -> float:
         sample = np.sort(values[:: int(len(values) ** (1 / 3)) | 1])
         reach = int(1.5 * len(sample) ** 0.5) + 1
         first, last = sample[len(sample) // 2 - reach], sample[len(sample) // 2 + reach]
-        below = np.count_nonzero(values < first)
+        below = int(np.count_nonzero(values < first))
         near = values[(values >= first) & (values <= last)]
         if below <= low and high < below + len(near):
             values, low, high = near, low - below, high - below

@@ -127,6 +127,7 @@ def flat_pair_sums(
     line_noise: "LineNoise",
     full: F32 | float = np.inf,
     dark: float = 0.0,
+    bands: bool = True,
 ) -> F64:
     """As above for flats (2, N_BINS, COLUMNS): of the frames, and without noise that rows share.
 
@@ -138,10 +139,11 @@ def flat_pair_sums(
     line_noise : of these pixels
     full : (y, x) or scalar, where samples saturate, ADU above bias and dark
     dark : dark signal, ADU: it has shot noise too, and belongs to the level
+    bands : whether rows may share more than without light; if not, both results are the first
     """
     lines = line_noise.lines or ()
-    also_rows = tuple(dict.fromkeys((*lines, "row")))
-    blocks: list[list[F64]] = [[_NO_BLOCKS], [_NO_BLOCKS]]
+    also_rows = tuple(dict.fromkeys((*lines, "row"))) if bands else lines
+    blocks = {without: [_NO_BLOCKS] for without in (lines, also_rows)}
     for n in range(0, len(frames) - 1, 2):
         (a, b), (first, second) = levels[n : n + 2], frames[n : n + 2]
         if not np.isfinite(a + b) or abs(a - b) > _PAIR_LAMP_CHANGE * (a + b) / 2:
@@ -153,12 +155,14 @@ def flat_pair_sums(
         # Full pixels beside those of an overscan would pass for half-full ones without noise.
         first[~lit(level) | (level + _NEARLY * noise > full)] = np.nan
         guess = {"gain": gain, "read_noise": read_noise, "quantum": quantum}
-        for own, without in zip(blocks, (lines, also_rows), strict=True):
+        for without, own in blocks.items():
             own.append(_blocks(first, second, without, **guess))
-    found = [np.concatenate(own) for own in blocks]
-    for every in found:
+    found = {}
+    for without, own in blocks.items():
+        every = np.concatenate(own)
         every[:, 1] += dark * (every[:, 0] > 0)
-    return np.stack([line_noise.put_back(bin_pairs(every)) for every in found])
+        found[without] = line_noise.put_back(bin_pairs(every))
+    return np.stack([found[lines], found[also_rows]])
 
 
 def without_bands(lit: F64, rest: F64) -> F64:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from pixcal.estimators.detector.calibration import MIN_STEPS
-from pixcal.model.arrays import F64, I64, Mask
+from pixcal.kernels.robust import finite_median
+from pixcal.model.arrays import F32, F64, I64, Mask
 from pixcal.model.errors import InputError
 from pixcal.storage.frame_reader import Reader
 
@@ -79,6 +80,38 @@ class FlatSurvey:
         rest = np.abs(rates[known & ~off] / usual - 1)
         many = len(np.unique(times[known & ~off])) >= MIN_STEPS and 10 * off.sum() <= len(off)
         return off if many and rest.max() < _STEADY_LAMP else np.zeros(len(off), np.bool_)
+
+    def may_have_bands(
+        self, arrays: Mapping[str, Reader], groups: Sequence[Sequence[int]], full: float
+    ) -> bool:
+        """Whether rows of flats may share noise that counts in `without_bands`.
+
+        ``groups``: numbers of the flats of each level; ``full``: level of saturation, ADU.
+        """
+        _, ny, nx = arrays["flat"].shape
+        each = (zip(group[::2], group[1::2], strict=False) for group in groups if ny > 1)
+        pairs = [pair for own in each for pair in own]
+        shared = noise = square = 0.0
+        for pair in pairs:
+            change = self._change(arrays, pair, full)
+            own = float(change.var()) / nx
+            shared += float(change.mean(axis=1).var(ddof=1)) - own
+            noise, square = noise + nx * own, square + 2 * own**2 / len(change)
+        least = noise * math.sqrt(2 / max(len(pairs) * ny * nx, 1))
+        # Half of it, as rows of two outputs may have bands of their own.
+        return not shared + 2 * math.sqrt(square) < least / 2
+
+    def _change(self, arrays: Mapping[str, Reader], pair: Sequence[int], full: float) -> F32:
+        """Difference (y, x) of the middle rows of flats made equally bright; zero for outliers."""
+        dark = next((arrays[name] for name in ("bias", "dark") if name in arrays), None)
+        unlit = np.float32(0) if dark is None else middle_rows(dark, 0, 1)[0].astype(np.float32)
+        first, second = (middle_rows(arrays["flat"], n, n + 1)[0].astype(np.float32) for n in pair)
+        a, b = self.levels[list(pair)]
+        change = (first - unlit) - (second - unlit) * np.float32(a / b if a * b > 0 else 1)
+        change[(first >= full) | (second >= full)] = np.nan
+        change -= np.float32(finite_median(change.ravel()))
+        change[~(np.abs(change) <= OUTLIER * finite_median(np.abs(change).ravel()) + 1)] = 0
+        return np.asarray(change, np.float32)
 
     def of_frames(self, numbers: Sequence[int]) -> "FlatSurvey":
         """The survey of some of the flats."""

@@ -75,6 +75,7 @@ class Measuring:
     # saturation, full: level (ADU) from which samples are saturated: in flats, and in any frames
     saturation: float
     full: float
+    bands: bool  # whether rows of flats may share more than those of frames without light
     quantum: float  # step of the samples (ADU), 0 for real numbers
     cut_off: Mapping[str, CutOff]  # arrays whose noise is cut off at their lowest code
     # whether the gain leaves out the noise of frames without light; None: to be found
@@ -305,8 +306,9 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
                 of_samples = job.read_noise, job.quantum
                 if lamp:
                     full = job.saturation - (0.0 if pedestal is None else pedestal)
+                    guess = job.gain, *of_samples, column.line_noise
                     column.pairs[1:] += flat_pair_sums(
-                        frames, levels, job.gain, *of_samples, column.line_noise, full, charge
+                        frames, levels, *guess, full, charge, job.bands
                     )
                 else:
                     frames -= levels[:, None, None]

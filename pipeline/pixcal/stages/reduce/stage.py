@@ -170,10 +170,11 @@ def _measuring(source: Ingested, config: Config, folder: Place) -> Measuring:
     if gain is None:
         levels = np.zeros(0) if source.survey is None else source.survey.levels
         gain = rough_gain(source.arrays, levels, [group.frames for group in exposures.flat])
+    frames = {
+        name: source.arrays[name] for name in ("bias", "dark", "flat") if name in source.arrays
+    }
     return Measuring(
-        frames={
-            name: source.arrays[name] for name in ("bias", "dark", "flat") if name in source.arrays
-        },
+        frames=frames,
         shape=source.shape,
         dark=exposures.dark,
         flat=exposures.flat,
@@ -182,6 +183,10 @@ def _measuring(source: Ingested, config: Config, folder: Place) -> Measuring:
         bright=None if source.survey is None else source.survey.brightest(FLAT_FLOOR),
         saturation=source.saturation("flat") if exposures.flat else math.inf,
         full=min(map(source.saturation, source.tables)),
+        bands=source.survey is not None
+        and source.survey.may_have_bands(
+            frames, [group.frames for group in exposures.flat], source.saturation("flat")
+        ),
         quantum=source.quantum,
         cut_off=source.cut_off,
         without_dark=None if source.black is None else source.black.without_dark,
