@@ -142,7 +142,9 @@ def without(columns: F64, free: F64) -> F64:
 
 def half_theta(fringes: FringeEvidence, half: int, good: Mask) -> F64:
     """Maps (3, pixel) of a set at good pixels, from every second frame only (half 0 or 1)."""
-    rest = np.nan_to_num(fringes.residual[half::2][:, good])
+    every = fringes.residual.reshape(len(fringes.residual), -1)[half::2]
+    rest = np.take(every, np.flatnonzero(good), axis=1).astype(float)
+    rest[np.isnan(rest)] = 0
     return np.asarray(fringes.theta[:, good] + np.linalg.pinv(fringes.g[half::2]) @ rest)
 
 
