@@ -42,7 +42,9 @@ from pixcal.stages.diagnose.thresholds import (
 )
 from pixcal.stages.diagnose.trial import Effects
 
-PROMISING = 0.25  # share of the best gain above which a candidate is simulated more than once,
+# share of the best gain above which a candidate is simulated more than once; the larger share if the
+# best gain is so high that more simulations cannot reverse the order
+PROMISING, PROMISING_IF_CLEAR, CLEAR = 0.25, 0.5, 40.0
 # largest significance credited after one simulation: its scatter is unknown
 MAX_SINGLE_SIMULATION_SIGMA = 3.0
 MAX_CAUSES = 5  # most causes that are accepted
@@ -327,7 +329,8 @@ class Search:
         if not self._effects:
             for name, addition in likeliest(once).items():
                 remaining[name].alone = addition.trial
-        least = PROMISING * max((one.gain for one in once), default=0.0)
+        best = max((one.gain for one in once), default=0.0)
+        least = best * (PROMISING if best < CLEAR else PROMISING_IF_CLEAR)
         hopeful = {one.name for one in once if one.gain >= least}
         # A replay is compared with its best law, even if that law is not promising.
         laws = likeliest(o for o in once if o.effect != remaining[o.name].replay)
