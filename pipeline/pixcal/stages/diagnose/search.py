@@ -42,8 +42,8 @@ from pixcal.stages.diagnose.thresholds import (
 )
 from pixcal.stages.diagnose.trial import Effects
 
-# share of the best gain above which a candidate is simulated more than once; the larger share if the
-# best gain is so high that more simulations cannot reverse the order
+# share of the best gain above which a candidate is simulated more than once; the larger share if
+# the best gain is so high that more simulations cannot reverse the order
 PROMISING, PROMISING_IF_CLEAR, CLEAR = 0.25, 0.5, 40.0
 # largest significance credited after one simulation: its scatter is unknown
 MAX_SINGLE_SIMULATION_SIGMA = 3.0
