@@ -138,8 +138,8 @@ def _group_flats(found: Exposures, times: list[float | None], steps: Sequence[in
         found.warnings.append(f"no EXPTIME in {unknown} of {len(times)} flat frames: not used")
     elif unexposed:
         found.warnings.append(
-            f"EXPTIME is 0 s in {unexposed} of {len(times)} flat frames: not used; list them under "
-            "frames.bias if they hold no light"
+            f"EXPTIME is 0 s in {unexposed} of {len(times)} flat frames: not used; write their "
+            "exposure times into the headers, or list them under frames.bias if they hold no light"
         )
     if all(len(group.frames) < 2 for group in found.flat):
         found.warnings.append(
