@@ -2,6 +2,7 @@
 
 from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,32 +26,33 @@ CALIBRATIONS = ("bias", "dark", "flat")
 MAX_FRAMES = 10_000_000
 MAX_DURATION_S = 1e10
 
+# quantities of one unit and range
+_adu = partial(quantity, unit="ADU", low=0, high=65535)
+_count = partial(quantity, high=MAX_FRAMES, doc="number of frames")
+_length = partial(quantity, unit="mm", low=0.1, high=1e7)
+_place = partial(quantity, (0.0, 0.0), unit="mm", low=-1e5, high=1e5)
+_px = partial(quantity, unit="px", low=1, high=65536)
+_rate = partial(quantity, unit="e-/s", low=0, high=1e7)
+_seed = partial(quantity, 0, low=0, high=10**18)
+_share = partial(quantity, 0.0, low=0, high=0.5)
+_time = partial(quantity, unit="s", low=0, high=1e6)
+
 
 @dataclass(frozen=True)
 class SimulatedDetector:
     """The chip, the window of it that is read, and its truth maps, which ``seed`` and chip fix."""
 
-    shape: tuple[int, int] = quantity(
-        unit="px", low=1, high=65536, doc="window that is read out: [rows, columns]"
-    )
+    shape: tuple[int, int] = _px(doc="window that is read out: [rows, columns]")
     pitch_um: float = as_in(Detector, "pitch_um")
     gain_e_per_adu: float = as_in(
         Detector, "gain_e_per_adu", default=MISSING, doc="conversion gain"
     )
     read_noise_e: float = as_in(Detector, "read_noise_e")
     name: str = as_in(Detector, "name")
-    seed: int = quantity(
-        0, low=0, high=10**18, doc="random seed of the detector: its fixed patterns"
-    )
-    chip: tuple[int, int] | None = quantity(
-        None, unit="px", low=1, high=65536, doc="whole chip: [rows, columns]; default: the window"
-    )
-    origin_px: tuple[int, int] | None = quantity(
-        None,
-        unit="px",
-        low=0,
-        high=65536,
-        doc="first pixel of the window; default: window in the centre",
+    seed: int = _seed(doc="random seed of the detector: its fixed patterns")
+    chip: tuple[int, int] | None = _px(None, doc="whole chip: [rows, columns]; default: the window")
+    origin_px: tuple[int, int] | None = _px(
+        None, low=0, doc="first pixel of the window; default: window in the centre"
     )
     bits: int = quantity(16, low=1, high=16, doc="of the analogue-to-digital converter")
     step_adu: int = quantity(
@@ -59,43 +61,25 @@ class SimulatedDetector:
     saturation_adu: float | None = quantity(
         None, unit="ADU", above=0, doc="samples are clipped here; default: highest code"
     )
-    lowest_adu: int = quantity(
-        0, unit="ADU", low=0, high=65535, doc="lowest code: lower samples are read as this"
-    )
+    lowest_adu: int = _adu(0, doc="lowest code: lower samples are read as this")
     full_well_e: float | None = quantity(
         None, unit="e-", low=1, high=1e7, doc="charge is clipped here; default: never"
     )
-    bias_adu: float = quantity(500.0, unit="ADU", low=0, high=65535, doc="mean bias")
-    bias_pixel_rms_adu: float = quantity(
-        0.0, unit="ADU", low=0, high=65535, doc="rms of the bias pattern from pixel to pixel"
+    bias_adu: float = _adu(500.0, doc="mean bias")
+    bias_pixel_rms_adu: float = _adu(0.0, doc="rms of the bias pattern from pixel to pixel")
+    bias_column_rms_adu: float = _adu(0.0, doc="rms of the bias pattern from column to column")
+    dark_e_s: float = _rate(0.0, doc="dark current")
+    hot_fraction: float = _share(doc="share of the pixels that are hot")
+    hot_rate_e_s: float = _rate(
+        0.0, doc="mean dark current of hot pixels; each has at least half of it"
     )
-    bias_column_rms_adu: float = quantity(
-        0.0, unit="ADU", low=0, high=65535, doc="rms of the bias pattern from column to column"
+    dead_fraction: float = _share(doc="share of the pixels without response")
+    prnu_rms: float = _share(doc="relative rms of the response from pixel to pixel")
+    delta_rms_px: float = _share(unit="px", doc="rms offset from pixel to pixel, each axis")
+    stitch_rms_px: float = _share(
+        unit="px", doc="rms offset from stitching block to block, each axis"
     )
-    dark_e_s: float = quantity(0.0, unit="e-/s", low=0, high=1e7, doc="dark current")
-    hot_fraction: float = quantity(0.0, low=0, high=0.5, doc="share of the pixels that are hot")
-    hot_rate_e_s: float = quantity(
-        0.0,
-        unit="e-/s",
-        low=0,
-        high=1e7,
-        doc="mean dark current of hot pixels; each has at least half of it",
-    )
-    dead_fraction: float = quantity(
-        0.0, low=0, high=0.5, doc="share of the pixels without response"
-    )
-    prnu_rms: float = quantity(
-        0.0, low=0, high=0.5, doc="relative rms of the response from pixel to pixel"
-    )
-    delta_rms_px: float = quantity(
-        0.0, unit="px", low=0, high=0.5, doc="rms offset from pixel to pixel, each axis"
-    )
-    stitch_rms_px: float = quantity(
-        0.0, unit="px", low=0, high=0.5, doc="rms offset from stitching block to block, each axis"
-    )
-    stitch_px: tuple[int, int] = quantity(
-        (64, 64), unit="px", low=1, high=65536, doc="stitching block: [rows, columns]"
-    )
+    stitch_px: tuple[int, int] = _px((64, 64), doc="stitching block: [rows, columns]")
     temperature_c: float = quantity(35.0, unit="C", low=-273.15, high=200, doc="for the headers")
 
     def __post_init__(self) -> None:
@@ -154,22 +138,16 @@ class SimulatedOptics:
     """Laser, fibres and their light; lengths on the detector are from the chip's centre."""
 
     wavelength_nm: float = as_in(Optics, "wavelength_nm")
-    distance_mm: float = quantity(unit="mm", low=0.1, high=1e7, doc="fibres to detector, true")
+    distance_mm: float = _length(doc="fibres to detector, true")
     beam_radius_mm: float = quantity(
         unit="mm", low=1e-3, high=1e7, doc="1/e² radius of each fibre's light on the detector"
     )
-    nominal_distance_mm: float | None = quantity(
-        None, unit="mm", low=0.1, high=1e7, doc="declared distance; default: the true one"
+    nominal_distance_mm: float | None = _length(
+        None, doc="declared distance; default: the true one"
     )
-    offset_mm: tuple[float, float] = quantity(
-        (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="projected centre of the fibres: [x, y]"
-    )
-    pointing_a_mm: tuple[float, float] = quantity(
-        (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="peak of A's light from the projection of A"
-    )
-    pointing_b_mm: tuple[float, float] = quantity(
-        (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="peak of B's light from the projection of B"
-    )
+    offset_mm: tuple[float, float] = _place(doc="projected centre of the fibres: [x, y]")
+    pointing_a_mm: tuple[float, float] = _place(doc="peak of A's light from the projection of A")
+    pointing_b_mm: tuple[float, float] = _place(doc="peak of B's light from the projection of B")
     power_ratio: float = quantity(1.0, low=1e-3, high=1e3, doc="power of B over that of A")
     visibility: float = quantity(
         1.0, above=0, high=1, doc="contrast where both fibres give the same intensity"
@@ -192,7 +170,7 @@ class SimulatedSet:
 
     name: str = as_in(FringeSet, "name")
     baseline_mm: tuple[float, float] = as_in(FringeSet, "baseline_mm")
-    count: int = quantity(low=1, high=MAX_FRAMES, doc="number of frames")
+    count: int = _count(low=1)
     peak_e: float = quantity(
         unit="e-",
         low=1e-3,
@@ -239,23 +217,21 @@ class SimulatedSet:
 class ExposureStep:
     """Calibration frames of one exposure time."""
 
-    exptime_s: float = quantity(unit="s", low=0, high=1e6, doc="exposure time")
-    count: int = quantity(low=1, high=MAX_FRAMES, doc="number of frames")
+    exptime_s: float = _time(doc="exposure time")
+    count: int = _count(low=1)
 
 
 @dataclass(frozen=True)
 class SimulatedFrames:
     """What is recorded, in the order bias, dark, flat, fringes, and how it is filed."""
 
-    exptime_s: float = quantity(unit="s", low=1e-9, high=1e6, doc="of the fringe frames")
-    period_s: float = quantity(
-        unit="s", low=1e-9, high=1e6, doc="time from frame to frame; longer exposures take longer"
-    )
+    exptime_s: float = _time(low=1e-9, doc="of the fringe frames")
+    period_s: float = _time(low=1e-9, doc="time from frame to frame; longer exposures take longer")
     start: str = quantity("2026-01-01T00:00:00", doc="time of the first frame, ISO 8601, UTC")
     per_file: int = quantity(1, low=1, high=100_000, doc="1: 2-D frames; more: 3-D cubes")
     compress: tuple[str, ...] = quantity((), doc="bias, dark, flat or sets to tile-compress (RICE)")
-    bias: int = quantity(0, low=0, high=MAX_FRAMES, doc="number of bias frames")
-    bias_exptime_s: float = quantity(0.0, unit="s", low=0, high=1e6, doc="of the bias frames")
+    bias: int = _count(0, low=0, doc="number of bias frames")
+    bias_exptime_s: float = _time(0.0, doc="of the bias frames")
     darks: tuple[ExposureStep, ...] = quantity(
         (), doc="dark frames, one entry for each exposure time"
     )
@@ -315,9 +291,7 @@ class Bench:
     detector: SimulatedDetector = quantity()
     optics: SimulatedOptics = quantity()
     frames: SimulatedFrames = quantity()
-    seed: int = quantity(
-        0, low=0, high=10**18, doc="random seed of all that changes from frame to frame"
-    )
+    seed: int = _seed(doc="random seed of all that changes from frame to frame")
     shot_noise: bool = quantity(True, doc="false: no shot noise")
     effects: dict[str, Any] = field(
         default_factory=dict,

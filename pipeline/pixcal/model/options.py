@@ -11,6 +11,7 @@ the unit (``--diameter`` is ``diameter_m``). In addition to the metadata of
 """
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,6 +28,9 @@ FWHMS = (0.5, 50.0)  # widths of stars, px
 def python_only_option(default: Any, **meaning: Any) -> Any:
     """An option of the Python function that the command line does not offer."""
     return quantity(default, python_only=True, **meaning)
+
+
+_factor = partial(python_only_option, low=1, high=1e6)
 
 
 def _own(doc: str, *, in_key: bool = True) -> Any:
@@ -101,17 +105,11 @@ class Reduce:
         high=1,
         doc="Response relative to the neighbours below which a pixel is ``DEAD``.",
     )
-    dead_above: float = python_only_option(
-        2.0,
-        low=1,
-        high=1e6,
-        doc="Response relative to the neighbours above which a pixel is ``DEAD``.",
+    dead_above: float = _factor(
+        2.0, doc="Response relative to the neighbours above which a pixel is ``DEAD``."
     )
-    noisy_factor: float = python_only_option(
-        1.5,
-        low=1,
-        high=1e6,
-        doc="Noise relative to the typical noise above which a pixel is ``NOISY``.",
+    noisy_factor: float = _factor(
+        1.5, doc="Noise relative to the typical noise above which a pixel is ``NOISY``."
     )
     nonlinear_share: float = python_only_option(
         0.03,
@@ -312,15 +310,14 @@ class Wcs:
     """
 
     out: Path = quantity(metavar="FILE", doc="FITS file to write.")
-    fwhm_px: float | None = quantity(
-        None,
-        unit="px",
-        low=FWHMS[0],
-        high=FWHMS[1],
+    fwhm_px: float | None = as_in(
+        Centroids,
+        "fwhm_px",
+        default=None,
         shown="no star: the pixel offsets",
         doc="Distortion for stars of this width, centred on pixels.",
     )
-    overwrite: bool = quantity(False, doc="Replace FILE.")
+    overwrite: bool = as_in(Centroids, "overwrite")
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,9 @@ class FrameBasis:
 
         parts = {name: _nuisance_parts(changes, name, every) for name in _names(changes, every)}
         self._nuisances = {n: part for n, part in parts.items() if not is_own(part, False)}
-        shapes = [_nuisance_shapes(changes, w) for w in every]
+        shapes = [
+            ramps(w.series, colour=changes.crossed) * (w.channels is not LIGHT) for w in every
+        ]
         kept = [
             q for q in range(shapes[0].shape[2]) if not is_own([v[..., q] for v in shapes], True)
         ]
@@ -210,11 +212,6 @@ def _nuisance_parts(changes: FrameChanges, name: str, every: Sequence[AffectedSe
         else:
             found.append(motion_part(name, w.series))
     return found
-
-
-def _nuisance_shapes(changes: FrameChanges, of: AffectedSeries) -> F64:
-    """Steady changes (t, 2, q) of a series by nuisances."""
-    return ramps(of.series, colour=changes.crossed) * (of.channels is not LIGHT)
 
 
 @dataclass(frozen=True)

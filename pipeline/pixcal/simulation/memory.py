@@ -48,7 +48,8 @@ class Carried:
         block = number // memory.block if memory.fades else 0
         begin = block * memory.block if memory.fades else number
         begin = max(begin - memory.frames, self._number(chain, 0) if memory.cleared else 0)
-        if not (self._is_before(chain.recording) and begin <= self._next <= number):
+        goes_on = self._recording in (chain.recording, chain.recording.before)
+        if self._recording is None or not (goes_on and begin <= self._next <= number):
             self._states, self._first, self._next = {}, block, begin
         for earlier in range(self._next, number):
             other, n = chain.of(frame - number + earlier)
@@ -75,7 +76,3 @@ class Carried:
         while earlier is not None:
             frame, earlier = frame + earlier.count, earlier.before
         return frame
-
-    def _is_before(self, recording: Any) -> bool:
-        """Whether the last frame is of this recording, or of the one before it."""
-        return self._recording is not None and self._recording in (recording, recording.before)

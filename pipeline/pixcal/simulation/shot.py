@@ -49,11 +49,11 @@ class Shot:
 
     def end_of(self, frame: int) -> float:
         """When another frame is read, s: as the next one starts, or a period after the last one."""
-        chain, frame = self._chain.of(frame)
+        chain, number = self._chain.of(frame)
         recording: Recording = chain.recording
-        if frame + 1 < recording.count:
-            return recording.start_s + float(recording.times_s[frame + 1])
-        return recording.start_s + float(recording.times_s[frame]) + recording.period_s
+        if number + 1 < recording.count:
+            return self.start_of(frame + 1)
+        return self.start_of(frame) + recording.period_s
 
     @property
     def states(self) -> FrameStates:

@@ -23,7 +23,7 @@ from pixcal.storage.header_values import (
     temperature_c,
     time_stamp_mjd,
 )
-from pixcal.storage.sources import SourceFile, unreadable
+from pixcal.storage.sources import SourceFile, reading
 
 _Stream = io.BufferedReader | gzip.GzipFile
 
@@ -36,7 +36,7 @@ def inspect(source: SourceFile) -> FrameFile:
     The image is the first data unit of 2-D or 3-D. Raises InputError naming the file: not FITS,
     truncated, no image, dimensions or types unsuitable for frames.
     """
-    with source.open() as handle:
+    with source.open() as handle, reading(source.path):
         try:
             packed = handle.read(2) == b"\x1f\x8b"
             handle.seek(0)
@@ -55,8 +55,6 @@ def inspect(source: SourceFile) -> FrameFile:
             ) from error
         except ValueError as error:
             raise InputError(f"{source.path}: {reason_of(error)}") from error
-        except OSError as error:
-            raise unreadable(source.path, error) from error
 
 
 def damaged_gzip(path: Path, error: Exception) -> InputError:

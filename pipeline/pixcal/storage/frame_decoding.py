@@ -22,7 +22,7 @@ from pixcal.model.errors import InputError, reason_of
 from pixcal.storage.cube import CHUNK
 from pixcal.storage.fits_in import damaged_gzip
 from pixcal.storage.frame_file import FrameFile, SampleFormat
-from pixcal.storage.sources import SourceFile, unreadable
+from pixcal.storage.sources import SourceFile, reading
 from pixcal.storage.tiff_png import picture_bytes, unpack_picture
 
 BAND = CHUNK[1]  # rows with a common checksum: those of a chunk
@@ -129,15 +129,13 @@ def _make_native(raw: NDArray[Any], coding: SampleFormat, native: NDArray[Any]) 
 def _read_exactly(handle: io.FileIO, start: int, raw: NDArray[Any], path: Path) -> None:
     view = raw.data.cast("B")
     read = 0
-    try:
+    with reading(path):
         handle.seek(start)
         while read < len(view):
             count = handle.readinto(view[read:])
             if not count:
                 raise InputError(f"{path}: cut short while it was being read; copy it again")
             read += count
-    except OSError as error:
-        raise unreadable(path, error) from error
 
 
 def _scale(raw: NDArray[Any], coding: SampleFormat) -> F32:

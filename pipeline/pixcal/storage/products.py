@@ -26,7 +26,7 @@ from pixcal.storage.folder import aside_of, written_aside
 BLOCK = 2880
 COMPRESSED = ".fits.fz"
 _TYPES = {8: ">u1", -32: ">f4", -64: ">f8"}
-_PIECE = 8 << 20
+_PIECE = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,11 @@ class FitsMap:
                 found = cls(path, shape, _TYPES[header["BITPIX"]], int(hdu.fileinfo()["datLoc"]))
                 if path.stat().st_size < found.data_at + found.n_bytes:
                     raise ValueError("cut short")
-                if "DATASUM" in header and int(header["DATASUM"]) != word_sum(
-                    path, found.data_at, found.n_bytes
-                ):
-                    raise ValueError("altered: its checksum does not match")
+                if "DATASUM" in header:
+                    filled = -(-found.n_bytes // BLOCK) * BLOCK
+                    with path.open("rb") as file:
+                        if int(header["DATASUM"]) != word_sum(file, found.data_at, filled):
+                            raise ValueError("altered: its checksum does not match")
         except (OSError, LookupError, TypeError, ValueError) as error:
             raise _not_a_map(path, error) from error
         return found
@@ -80,21 +81,11 @@ def _not_a_map(path: Path, error: Exception) -> DamagedError:
     return DamagedError(path, f"not a map that this version reads ({reason_of(error)})")
 
 
-def word_sum(path: Path, start: int, n_bytes: int) -> int:
+def word_sum(file: BinaryIO, start: int, n_bytes: int) -> int:
     """Sum of the 32-bit words of a part of a file in ones' complement (FITS 4.0, appendix J)."""
-    total = 0
-    with path.open("rb") as file:
-        file.seek(start)
-        for at in range(0, n_bytes, _PIECE):
-            total = add_words(total, file.read(min(_PIECE, n_bytes - at)))
-    return total
-
-
-def add_words(total: int, part: bytes, at: int = 0) -> int:
-    """Add the next part of the data, which begins at byte ``at``, to their `word_sum`."""
-    part = bytes(at % 4) + part
-    words = np.frombuffer(part + bytes(-len(part) % 4), ">u4")
-    total += int(words.sum(dtype=np.uint64))
+    file.seek(start)
+    sizes = (min(_PIECE, n_bytes - at) for at in range(0, n_bytes, _PIECE))
+    total = sum(int(np.fromfile(file, ">u4", n // 4).sum(dtype=np.uint64)) for n in sizes)
     while total >> 32:
         total = (total & 0xFFFFFFFF) + (total >> 32)
     return total
@@ -149,7 +140,7 @@ def write_map(
     for flag in PixelFlag:
         flags.header[f"FLAG{flag.value.bit_length()}"] = (flag.value, (flag.name or "").lower())
     path.parent.mkdir(parents=True, exist_ok=True)
-    with written_aside(path) as aside, aside.open("wb") as file:
+    with written_aside(path) as aside, aside.open("w+b") as file:
         for hdu, source in ((primary, data), (errors, sigma), (flags, mask)):
             _write_image(file, hdu.header, source)
 
@@ -161,20 +152,18 @@ def _write_image(file: BinaryIO, header: fits.Header, source: Source | NDArray[A
     header["DATASUM"] = ("0", "by pixcal")
     begin = file.tell()
     file.write(header.tostring(padding=True).encode("ascii"))
-    total = 0
+    data_at = file.tell()
     for y in range(0, source.shape[0], BAND):
         rows = (y, min(y + BAND, source.shape[0]))
         band = source[slice(*rows)] if isinstance(source, np.ndarray) else source.read(rows)
-        body = band.astype(band.dtype.newbyteorder(">")).tobytes()
-        total = add_words(total, body, file.tell() - begin)
-        file.write(body)
+        file.write(band.astype(band.dtype.newbyteorder(">")).tobytes())
     file.write(bytes(-file.tell() % BLOCK))
-    header["DATASUM"] = str(total)
-    text = header.tostring(padding=True).encode("ascii")
-    header["CHECKSUM"] = encoded(add_words(total, text))
-    file.seek(begin)
-    file.write(header.tostring(padding=True).encode("ascii"))
-    file.seek(0, os.SEEK_END)
+    end = file.tell()
+    for key, start, text in (("DATASUM", data_at, str), ("CHECKSUM", begin, encoded)):
+        header[key] = text(word_sum(file, start, end - start))
+        file.seek(begin)
+        file.write(header.tostring(padding=True).encode("ascii"))
+    file.seek(end)
 
 
 def is_whole(path: Path) -> bool:
@@ -190,8 +179,10 @@ def is_whole(path: Path) -> bool:
 def _checked(path: Path) -> Iterator[fits.HDUList]:
     """The images of a file, verified by checksum."""
     # CHECKSUM makes the sum of each header and data unit, and so of the file, minus zero.
-    if word_sum(path, 0, path.stat().st_size) != 0xFFFFFFFF:
-        raise ValueError("altered: its checksum does not match")
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        if size % BLOCK or word_sum(file, 0, size) != 0xFFFFFFFF:
+            raise ValueError("altered: its checksum does not match")
     with warnings.catch_warnings():
         # astropy reports a truncated file by this warning.
         warnings.simplefilter("error", AstropyUserWarning)

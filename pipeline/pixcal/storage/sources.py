@@ -10,7 +10,8 @@ import io
 import math
 import os
 import stat
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
@@ -96,10 +97,8 @@ class SourceFile:
 
     def open(self) -> io.FileIO:
         """Open the file for unbuffered reading; InputError if it has changed."""
-        try:
+        with reading(self.path):
             handle = io.FileIO(self.path)
-        except OSError as error:
-            raise unreadable(self.path, error) from error
         try:
             self.check_read(handle)
         except BaseException:
@@ -113,20 +112,24 @@ class SourceFile:
 
     def check_unchanged(self) -> None:
         """Raise InputError if the file is missing or has changed."""
-        try:
+        with reading(self.path):
             self._compare(self.path.stat())
-        except OSError as error:
-            raise unreadable(self.path, error) from error
 
     def _compare(self, now: os.stat_result) -> None:
         if (now.st_size, now.st_mtime_ns) != (self.size, self.mtime_ns):
             raise InputError(f"{self.path}: {self.CHANGED}")
 
 
-def unreadable(path: Path, error: OSError) -> InputError:
-    """The InputError with the reason why a file cannot be read."""
-    reason = error.strerror or reason_of(error)
-    return InputError(f"{path}: cannot be read ({reason}); restore the file or its permissions")
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Context in which errors of the system become an InputError, why the file cannot be read."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror or reason_of(error)}); restore the file or "
+            "its permissions"
+        ) from error
 
 
 def fingerprint(sources: Sequence[SourceFile]) -> str:
@@ -199,10 +202,8 @@ def _source(
     folder: Path, name: str, key: str, seen: dict[tuple[int, int], tuple[str, str]]
 ) -> SourceFile:
     path = folder / name
-    try:
+    with reading(path):
         facts = path.stat()
-    except OSError as error:
-        raise unreadable(path, error) from error
     if not stat.S_ISREG(facts.st_mode):
         raise InputError(f"{path}: not a regular file; remove it or narrow {key}")
     if facts.st_size == 0:

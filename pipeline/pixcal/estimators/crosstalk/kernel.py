@@ -50,7 +50,6 @@ class Kernel:
     couplings: tuple[Coupling, ...]
     covariance: F64  # (n, n) of their shares
     methods: tuple[str, ...]  # of measurement
-    log_evidence: float
     # relative change of the shares with the source's signal, 1/ke-, and its error
     per_ke: tuple[float, float] = (0.0, np.inf)
     either: bool = False  # a rise may also be due to noise shared through shifted boundaries
@@ -212,13 +211,12 @@ def _kernel(
         whole = block_diag(whole, np.zeros((free, free))) + more
         rights = np.concatenate([rights, np.zeros(free)]) + of_maps
     rights = rights + whole[:, : len(every)] @ known
-    shares, covariance, log_evidence = shrunk(whole, rights, sources.links, classes.count, free)
+    shares, covariance, _ = shrunk(whole, rights, sources.links, classes.count, free)
     couplings = zip(every, shares.tolist(), strict=True)
     return Kernel(
         tuple(replace(c, share=share, per_ke=per_ke) for c, share in couplings),
         covariance,
         (*by_source, *["maps"] * bool(free)),
-        log_evidence,
         (per_ke, error),
         either,
     )

@@ -23,10 +23,13 @@ def visibility_products(evidence: Evidence, sets: Sequence[FringeEvidence]) -> P
     products, errors = np.empty((2, len(pairs)))
     for at, (m, n) in enumerate(pairs):
         first, second = maps[m][:2] if m == n else (both[m], both[n])
-        product, errors[at] = _of_pixels(first, second, maps[m][2] & maps[n][2])
+        kept = maps[m][2] & maps[n][2]
+        same, near, farther = neighbour_products(first, second, kept)
+        white = (same - (4 * near - farther) / 3)[kept]
+        errors[at] = white.std() / np.sqrt(len(white))
         # Variance of the subtracted bias, e-², which is common to all frames.
         counts = [len(s.adu) for s in evidence.of_kind("bias")]
-        products[at] = product - (evidence.read_noise**2 / sum(counts) if counts else 0.0) / (
+        products[at] = white.mean() - (evidence.read_noise**2 / sum(counts) if counts else 0.0) / (
             mean_light(sets[m]) * mean_light(sets[n])
         )
     return pairs, products, errors
@@ -44,13 +47,6 @@ def _two_halves(found: FringeEvidence) -> tuple[F64, F64, Mask]:
     one, other = (_visibility(found, half) for half in (0, 1))
     kept = np.isfinite(one) & np.isfinite(other)
     return _structure(one, kept), _structure(other, kept), kept
-
-
-def _of_pixels(one: F64, other: F64, kept: Mask) -> tuple[float, float]:
-    """Mean product (and its error) of two maps per pixel, minus the covariance of neighbours."""
-    products = neighbour_products(one, other, kept)
-    white = (products[0] - (4 * products[1] - products[2]) / 3)[kept]
-    return float(white.mean()), float(white.std() / np.sqrt(len(white)))
 
 
 def _visibility(found: FringeEvidence, half: int) -> F64:
