@@ -36,12 +36,16 @@ def without_outliers(values: F64) -> F64:
     return np.where(np.isfinite(clipped(rest - around)), rest, np.nan)
 
 
+def orders(degree: int) -> list[tuple[int, int]]:
+    """Orders (y, x) of the terms up to a total degree, the constant first."""
+    return [(i, n - i) for n in range(degree + 1) for i in range(n + 1)]
+
+
 @lru_cache(maxsize=4)
 def legendre(shape: tuple[int, ...], degree: int) -> F64:
     """Products of Legendre polynomials (term, y, x) up to a total degree, the constant first."""
     y, x = (legvander(np.linspace(-1, 1, n), degree) for n in shape)
-    orders = [(i, n - i) for n in range(degree + 1) for i in range(n + 1)]
-    terms: F64 = np.stack([np.outer(y[:, i], x[:, j]) for i, j in orders])
+    terms: F64 = np.stack([np.outer(y[:, i], x[:, j]) for i, j in orders(degree)])
     terms.flags.writeable = False  # the array is cached
     return terms
 

@@ -54,7 +54,10 @@ def _gradient(evidence: Evidence) -> F32:
     y, x = np.linspace(-1, 1, ny)[:, None], np.linspace(-1, 1, nx)
     lit = np.where(evidence.good, evidence.flat, 0)
     terms = np.stack([lit, lit * y, lit * x]).reshape(3, -1)
-    return np.asarray(np.linalg.qr(terms.T)[0], np.float32)
+    # From their products: a decomposition of all pixels takes three times as long.
+    gram = terms @ terms.T
+    root = np.linalg.cholesky(gram + 1e-12 * np.trace(gram) * np.eye(len(gram)))
+    return np.asarray((np.linalg.inv(root) @ terms).T, np.float32)
 
 
 def repeated(evidence: Evidence, kind: str) -> tuple[Stack, ...]:
