@@ -96,7 +96,7 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("frames.start", "yesterday", "frames: start: 'yesterday' is not like 2026-01-01T00:00:00"),
     ("frames.start", "2026-01-01T00:00:00+02:00", "frames: start:"),
     ("frames.start", "9999-12-31", "frames: start: '9999-12-31' and"),
-    ("detector.name", "a\nb", "detector: name: 'a\\nb' holds characters"),
+    ("detector.name", "a\nb", "detector: name: 'a\\nb' must be text without line breaks"),
     ("frames.per_file", 0, "frames.per_file: 0 is below 1"),
     ("frames.compress", ["diagonal"], "frames: compress: 'diagonal' is not one of bias"),
     ("frames.flat_rate_e_s", None, "frames: flat_rate_e_s: missing (in e-/s)"),
