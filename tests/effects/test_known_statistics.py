@@ -99,6 +99,21 @@ def test_a_third_harmonic_shows_with_its_size(plain: Evidence) -> None:
     assert np.abs(np.delete(curve.value, 2)).max() < 2e-4
 
 
+def test_harmonics_of_single_pixels_show_where_their_mean_is_zero(plain: Evidence) -> None:
+    """As a response that is nonlinear in a way of its own in each pixel leaves them."""
+    one, size = plain.fringes["vertical"], 4e-3
+    alpha, psi = np.hypot(one.theta[1], one.theta[2]), np.arctan2(one.theta[1], one.theta[2])
+    own = size * np.random.default_rng(3).choice([-1, 1], plain.good.shape)
+    more = one.electrons + own * alpha * np.cos(2 * (one.phi[:, None, None] + psi))
+    found, usual = measure(changed(plain, electrons=more.astype(np.float32))), measure(plain)
+    key = ("pixel_harmonics", "vertical")
+    rise = found[key].value - usual[key].value
+    assert rise[0] == pytest.approx(size**2, rel=0.2)
+    assert np.abs(rise[1:]).max() < 0.1 * size**2
+    shared = found["harmonics", "vertical"].value - usual["harmonics", "vertical"].value
+    assert np.abs(shared).max() < 0.1 * size
+
+
 def test_offsets_along_one_axis_are_compared(plain: Evidence) -> None:
     twin = dataclasses.replace(
         plain.fringes["vertical"],

@@ -53,6 +53,7 @@ class FlatError(Effect):
     acts_at = Stage.PIXEL
     order = 2
     domains = ("space",)
+    random_map = True
     strengths = ("pixel_rms", "smooth_rms", "wave_cos", "wave_sin")
     absorbed_because = (
         "it scales level and fringes of a pixel equally and does not change the phase"

@@ -8,31 +8,43 @@ from pixcal.estimators.detector.flat_ladder import MIN_STEPS, ladder, straight_l
 from pixcal.estimators.diagnosis.evidence import Evidence, cached_on_evidence
 from pixcal.estimators.test_statistics import Curve, statistic
 from pixcal.estimators.test_statistics.fringe_set_data import CODES, FringeSetData
-from pixcal.model.arrays import F64
+from pixcal.model.arrays import C128, F64
 
 of_intensity = partial(statistic, "intensity")
 of_intensity_power = partial(statistic, "intensity", power=True)
 
 CLASSES = (4, 16, 64)
+ORDERS = (2, 3, 4)  # harmonics
+
+
+def _harmonics(data: FringeSetData) -> C128:
+    """Two to four times the phase in the residuals (order, pixel), over the fringe amplitude."""
+    found, good = data.fringes, data.good
+    alpha = float(np.median(np.hypot(found.theta[1], found.theta[2])[good]))
+    turns = np.exp(-1j * np.outer(ORDERS, found.phi)).astype(np.complex64)
+    # The signal goes with sin(phi + psi).
+    moments = (turns.real @ data.electrons + 1j * (turns.imag @ data.electrons))[:, good.ravel()]
+    return np.asarray(
+        2 * moments * np.exp(-1j * np.outer(ORDERS, data.psi[good])) / len(found.phi) / alpha
+    )
 
 
 @of_intensity("harmonics of the fringes", "amplitude / α", x="harmonic (cosine, sine)")
 def harmonics(data: FringeSetData) -> Curve:
-    """Two to four times the phase in the residuals, over the fringe amplitude."""
-    found, good = data.fringes, data.good
-    alpha = float(np.median(np.hypot(found.theta[1], found.theta[2])[good]))
-    phi, psi = found.phi, data.psi[good]
-    orders = (2, 3, 4)
-    turns = np.stack([f(n * phi) for n in orders for f in (np.cos, np.sin)]).astype(np.float32)
-    moments = (turns @ data.electrons)[:, good.ravel()]
-    places, values = [], []
-    for at, n in enumerate(orders):
-        # The signal goes with sin(phi + psi).
-        moment = moments[2 * at] - 1j * moments[2 * at + 1]
-        size = 2 * np.mean(moment * np.exp(-1j * n * psi)) / len(phi) / alpha
-        places += [n, n + 0.25]
-        values += [float(size.real), float(size.imag)]
-    return Curve(np.array(places), np.array(values))
+    """Those that all pixels share."""
+    sizes = _harmonics(data).mean(axis=1)
+    places = np.add.outer(ORDERS, (0, 0.25))
+    return Curve(places.ravel(), np.stack([sizes.real, sizes.imag], axis=1).ravel())
+
+
+@of_intensity_power(
+    "harmonics of the fringes that differ from pixel to pixel", "amplitude / α", x="harmonic"
+)
+def pixel_harmonics(data: FringeSetData) -> Curve:
+    """Median square: a few odd pixels do not count."""
+    sizes = _harmonics(data)
+    apart = np.abs(sizes - sizes.mean(axis=1, keepdims=True)) ** 2
+    return Curve(np.array(ORDERS, float), np.median(apart, axis=1))
 
 
 @of_intensity("mean residual against signal", "mean residual", unit="e-", x="bin of level")
