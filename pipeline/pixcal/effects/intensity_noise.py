@@ -5,13 +5,18 @@ from typing import Self
 
 import numpy as np
 
+from pixcal.effects._level_change import LevelChange
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.light import ambient_shares, light_changes, separate_powers
-from pixcal.kernels.processes import autoregression, mean_sine
+from pixcal.estimators.frame_series.light import (
+    ambient_shares,
+    gain_share,
+    light_changes,
+    separate_powers,
+)
 from pixcal.kernels.scene import FrameStates
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.config import quantity
-from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.effect import Estimate, Stage
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.track import Track, at
 
@@ -20,7 +25,7 @@ MAX_AMBIENT = 0.3
 
 
 @dataclass(frozen=True)
-class IntensityNoise(Effect):
+class IntensityNoise(LevelChange):
     """Intensity B and amplitude A of each frame vary by the same factor."""
 
     name = "intensity_noise"
@@ -28,28 +33,12 @@ class IntensityNoise(Effect):
     acts_at = Stage.LIGHT
     order = 2
     domains = ("time",)
-    strengths = ("rms", "line", "tracks")
-    absorbed_because = "the fit has a free intensity in each frame"
-    frames_needed = ()
-    quick = False
     sources = (
         "Rousset et al., section on simulations: 2 % fluctuations of the laser",
         "Thorlabs manual 12112-S01 (HRP350 He-Ne laser): modes that sweep through the gain curve "
         "change the power at below 1 Hz to some kHz, the mains at 50 and 100 Hz",
     )
 
-    rms: float = quantity(0.02, low=0, high=0.5, doc="relative rms of the intensity")
-    correlation_s: float = quantity(
-        0.0, unit="s", low=0, high=1e6, doc="correlation time; 0: white"
-    )
-    line: float = quantity(0.0, low=0, high=0.5, doc="relative amplitude of a periodic variation")
-    line_hz: float = quantity(
-        100.0,
-        unit="Hz",
-        low=0,
-        high=1e4,
-        doc="frequency of the periodic variation, which averages out in exposures of whole periods",
-    )
     ambient: tuple[float, ...] = quantity(
         (), low=0, high=0.9, doc="share of the light of each set that does not follow the laser"
     )
@@ -58,9 +47,6 @@ class IntensityNoise(Effect):
         low=0,
         high=0.1,
         doc="relative rms of the contrast, white, if the powers of the two fibres vary separately",
-    )
-    tracks: tuple[Track, ...] = quantity(
-        (), doc="measured relative change of each frame, by fringe set"
     )
     contrast_tracks: tuple[Track, ...] = quantity(
         (), doc="measured relative change of the contrast, if the fibres vary separately"
@@ -73,13 +59,7 @@ class IntensityNoise(Effect):
         )
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
-        drawn = recording.rng(self.name).standard_normal(recording.count)
-        keep = np.exp(-recording.period_s / self.correlation_s) if self.correlation_s else 0.0
-        time = recording.times_s
-        phase = 2 * np.pi * recording.rng(self.name, 1).random()
-        change = self.rms * autoregression(drawn, keep)
-        change += self.line * mean_sine(time, self.line_hz, phase, recording.exptime_s)
-        change += at(self.tracks, recording.set_name, time)
+        change, time = self.changes(recording), recording.times_s
         level = np.maximum(1 + (1 - self._ambient(recording.number)) * change, 0.0)
         contrast = self.separate * recording.rng(self.name, 2).standard_normal(recording.count)
         contrast += at(self.contrast_tracks, recording.set_name, time)
@@ -109,6 +89,8 @@ class IntensityNoise(Effect):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """As by `Effect`, with the change of contrast by ambient light or separate powers."""
         found = super().estimate(evidence)
+        if found is not None and gain_share(evidence):
+            return replace(found, refused="the noise rises as with a gain that varies, not light")
         if found is None:
             return None
         assert isinstance(found.effect, cls)

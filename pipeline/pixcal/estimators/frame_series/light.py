@@ -28,6 +28,7 @@ from pixcal.model.arrays import F64
 
 KNOTS = 32  # most points of a course of fringes
 FEWEST_DARK = 12  # fewest frames without light to measure their offset
+CALM = 25.0  # largest square of a residual over its noise, so that hits do not count
 IMBALANCE = 0.02, 0.15  # least and most difference of the fibres' powers over their sum
 LIGHT_PARTS = ("power", "power_walk", "contrast", "contrast_walk", "offset", "offset_walk")
 PATTERNS = {
@@ -111,6 +112,28 @@ def ambient_shares(evidence: Evidence) -> list[tuple[float, float]]:
             error = np.sqrt(float(rest @ rest) / max(len(rest) - 1, 1) / square)
             found[name] = slope / (1 + slope), float(error) / (1 + slope) ** 2
     return list(found.values())
+
+
+def gain_share(evidence: Evidence) -> bool:
+    """Whether the noise of bright frames shows that their gain is higher, not their light.
+
+    Both scale the signal; the variance of its shot noise goes with the light, but with the square
+    of the gain. The measured variance over that of the light then rises as the gain.
+    """
+    along = square = rest = 0.0
+    for f in evidence.fringes.values():
+        change = _levels(f)[0] - 1
+        noise, shot = np.empty((2, len(change)))
+        for t, (residual, model) in enumerate(zip(f.residual, f.model, strict=True)):
+            light = (f.shot_factor * model)[f.good]
+            ratio = residual[f.good] ** 2 / (light + f.read_variance[f.good])
+            noise[t], shot[t] = np.nanmean(np.minimum(ratio, CALM)), light.mean()
+        read = float(f.read_variance[f.good].mean())
+        gain = change * shot / (shot + read)
+        noise /= noise.mean()
+        along, square = along + float(gain @ (noise - 1)), square + float(gain @ gain)
+        rest = max(rest, float(np.var(noise)))
+    return along > square / 2 and along > SIGNIFICANT * np.sqrt(rest * square)
 
 
 def separate_powers(evidence: Evidence) -> float:
