@@ -25,7 +25,18 @@ def test_its_noise_tells_a_gain_from_light(
         assert bool(estimate.refused) == (one is not kind)
         assert isinstance(estimate.effect, one)
         assert estimate.effect.rms == pytest.approx(0.02, abs=4 * estimate.errors["rms"])
+        assert "cannot tell" not in estimate.refused
     noise = np.nanstd(evidence.fringes["vertical"].residual, axis=(1, 2))
     level = evidence.fringes["vertical"].free[:, 0]
     slope = np.polyfit(np.log(level), np.log(noise), 1)[0]
     assert slope == pytest.approx(1.0 if kind is GainDrift else 0.5, abs=0.15)
+
+
+def test_where_noise_cannot_tell_the_light_is_named(acquired: Callable[..., Evidence]) -> None:
+    evidence = acquired(None, {"gain_drift": {"rms": 5e-4, "correlation_s": 0.0}})
+    light, gain = IntensityNoise.estimate(evidence), GainDrift.estimate(evidence)
+    assert light is not None
+    assert gain is not None
+    assert light.significance > 4
+    assert not light.refused
+    assert "cannot tell" in gain.refused

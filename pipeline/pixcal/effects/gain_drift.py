@@ -8,6 +8,8 @@ import numpy as np
 from pixcal.effects._level_change import LevelChange
 from pixcal.effects.intensity_noise import IntensityNoise
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.light import gain_share
+from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F32
 from pixcal.simulation.effect import Estimate, Stage
 from pixcal.simulation.shot import Shot
@@ -45,4 +47,7 @@ class GainDrift(LevelChange):
         law = cast(IntensityNoise, found.effect)
         effect = cls(law.rms, law.correlation_s, law.line, law.line_hz)
         refused = "" if found.refused else "the noise does not rise as with a gain that varies"
+        share, error = gain_share(evidence)
+        if refused and 1 - share < SIGNIFICANT * error:
+            refused = "the noise cannot tell it from intensity_noise"
         return replace(found, effect=effect, why=WHY, law="", refused=refused)

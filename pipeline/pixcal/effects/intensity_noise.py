@@ -89,7 +89,8 @@ class IntensityNoise(LevelChange):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """As by `Effect`, with the change of contrast by ambient light or separate powers."""
         found = super().estimate(evidence)
-        if found is not None and gain_share(evidence):
+        share, error = gain_share(evidence)
+        if found is not None and share > max(0.5, SIGNIFICANT * error):
             return replace(found, refused="the noise rises as with a gain that varies, not light")
         if found is None:
             return None

@@ -114,8 +114,8 @@ def ambient_shares(evidence: Evidence) -> list[tuple[float, float]]:
     return list(found.values())
 
 
-def gain_share(evidence: Evidence) -> bool:
-    """Whether the noise of bright frames shows that their gain is higher, not their light.
+def gain_share(evidence: Evidence) -> tuple[float, float]:
+    """Part of the frames' changes that is of the gain, not of the light, and its error.
 
     Both scale the signal; the variance of its shot noise goes with the light, but with the square
     of the gain. The measured variance over that of the light then rises as the gain.
@@ -133,7 +133,7 @@ def gain_share(evidence: Evidence) -> bool:
         noise /= noise.mean()
         along, square = along + float(gain @ (noise - 1)), square + float(gain @ gain)
         rest = max(rest, float(np.var(noise)))
-    return along > square / 2 and along > SIGNIFICANT * np.sqrt(rest * square)
+    return along / max(square, 1e-300), float(np.sqrt(rest / max(square, 1e-300)))
 
 
 def separate_powers(evidence: Evidence) -> float:
