@@ -216,7 +216,7 @@ def test_a_time_constant_is_found() -> None:
             return estimate_components(modes, start=start, steps=steps)
 
         profile = best_shape(fit, np.geomspace(0.3, 1200.0, 9), steady=False)
-        rms, error = profile.found.root(1)
+        rms, error = profile.components.root(1)
         owed = profile.slope([side.root(1)[0] for side in profile.sides])
         pulls.append((profile.value - 10) / profile.error)
         assert abs(rms - 2) < 4 * np.hypot(error, owed) < 2.0

@@ -136,7 +136,7 @@ def _stacks(
             if not exposure >= 0:
                 raise InputError(f"{kind}s[{exposure!r}]: not an exposure time in seconds")
             given.append((f"{kind}/{number}", f"{kind}s[{exposure!r}]", stack, exposure))
-    found: Stacks = {}
+    stacks: Stacks = {}
     window: tuple[int, ...] = ()
     for file, name, stack, seconds in given:
         array = _checked(name, stack)
@@ -146,8 +146,8 @@ def _stacks(
                 f"{name}: frames of {array.shape[1:]} pixels (y, x), where the first array has "
                 f"{window}; all frames must have the same size"
             )
-        found[file] = array, seconds
-    return found
+        stacks[file] = array, seconds
+    return stacks
 
 
 def _checked(name: str, stack: ArrayLike) -> Frames:

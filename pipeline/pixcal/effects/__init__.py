@@ -22,12 +22,12 @@ from pixcal.simulation.own_effect import effect_of_file, only_effect
 @cache
 def effects() -> dict[str, type[Effect]]:
     """All effects that pixcal knows, by name."""
-    found = {}
+    by_name = {}
     for module in pkgutil.iter_modules(__path__):
         if not module.name.startswith("_"):
             effect = only_effect(importlib.import_module(f"{__name__}.{module.name}"))
-            found[effect.name] = effect
-    return found
+            by_name[effect.name] = effect
+    return by_name
 
 
 def known_effects(own: Iterable[Path] = ()) -> dict[str, type[Effect]]:
@@ -60,9 +60,9 @@ def parse_effects(
     Raises InputError for the first name or key that is unknown, or value out of range.
     """
     known = effects() if known is None else known
-    found = []
+    parsed = []
     for name, values in plain.items():
         check_known(name, known, f"{where}: effects")
         parameters = {} if values is None else values
-        found.append(parse(known[name], parameters, where, key=f"effects.{name}"))
-    return tuple(found)
+        parsed.append(parse(known[name], parameters, where, key=f"effects.{name}"))
+    return tuple(parsed)

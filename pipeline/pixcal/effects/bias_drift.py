@@ -113,11 +113,11 @@ class BiasDrift(Effect):
     def readout(self, adu: F32, shot: Shot) -> F32:
         recording, rng = shot.recording, shot.rng(self.name)
         lit, time = recording.kind == "fringes", float(recording.times_s[shot.frame])
-        own = recording.set_name if lit else f"{recording.kind} frames"
-        if any(track.set == own for track in self.tracks):
+        name = recording.set_name if lit else f"{recording.kind} frames"
+        if any(track.set == name for track in self.tracks):
             # As measured: of fringes without the jitter, which hides in the light.
             jitter = self.jitter_rms * rng.standard_normal() if lit else 0.0
-            offset = float(at(self.tracks, own, time)) + jitter
+            offset = float(at(self.tracks, name, time)) + jitter
         else:
             offset = self.offset(shot.time_s, shot.bench.seed, rng)
             offset += self._in_run(recording, time) if lit else 0.0
@@ -155,8 +155,8 @@ class BiasDrift(Effect):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Levels of frames without light against time; in fringe frames, changes of B without A."""
         through, in_runs = cls._through(evidence), cls._in_runs(evidence)
-        found = [e for e in (through, in_runs) if e is not None]
-        return max(found, key=lambda e: e.significance, default=None)
+        estimates = [e for e in (through, in_runs) if e is not None]
+        return max(estimates, key=lambda e: e.significance, default=None)
 
     @classmethod
     def _in_runs(cls, evidence: Evidence) -> Estimate | None:
@@ -176,8 +176,8 @@ class BiasDrift(Effect):
         if np.sqrt(2 * rise) > STEADY:
             law, there = "ramp", sloped
             ramp = float(there.beta[0]) * HOUR_S
-            own = float(np.sqrt(there.shape_covariance((at,))[0, 0]))
-            errors = {"run_ramp_e_h": own * HOUR_S}
+            slope_error = float(np.sqrt(there.shape_covariance((at,))[0, 0]))
+            errors = {"run_ramp_e_h": slope_error * HOUR_S}
         walk, error = there.root(at)
         per_hour = float(np.sqrt(HOUR_S))
         return Estimate(
@@ -204,19 +204,19 @@ class BiasDrift(Effect):
         # The walk is refitted without the ramp: if it is only a walk, the ramp then adds little.
         steady = float(np.sqrt(2 * _rise(full, level)))
         best, settling = _settling(every, full)
-        found = best.found if best else full
-        slope, error = float(found.beta[0]), float(np.sqrt(found.shape_covariance((1,))[0, 0]))
+        fit = best.components if best else full
+        slope, error = float(fit.beta[0]), float(np.sqrt(fit.shape_covariance((1,))[0, 0]))
         changes = [drift, settling, log_chance((slope / error) ** 2 / 2)]
         if not best and steady < STEADY:
-            found, slope = level, 0.0
-        (jitter, of_jitter), (walk, of_walk) = found.root(0), found.root(1)
+            fit, slope = level, 0.0
+        (jitter, of_jitter), (walk, of_walk) = fit.root(0), fit.root(1)
         walk, of_walk = walk * HOUR_S**0.5, of_walk * HOUR_S**0.5
         values = {"jitter_rms": jitter, "ramp_e_h": slope, "walk_e_h": walk, "settle_e": 0.0}
         errors = {"jitter_rms": of_jitter, "ramp_e_h": error, "walk_e_h": of_walk}
         if best:
-            own = float(np.sqrt(found.shape_covariance((1,))[1, 1]))
-            values |= {"settle_e": float(found.beta[1]), "settle_s": best.value}
-            errors |= {"settle_e": own, "settle_s": best.error}
+            settle_error = float(np.sqrt(fit.shape_covariance((1,))[1, 1]))
+            values |= {"settle_e": float(fit.beta[1]), "settle_s": best.value}
+            errors |= {"settle_e": settle_error, "settle_s": best.error}
         return Estimate(
             cls(**values),
             errors,
@@ -260,7 +260,7 @@ def _settling(every: Sequence[OffsetSeries], plain: Components) -> tuple[Profile
     trials = np.geomspace(3 * step, max(length, 6 * step), SETTLINGS)
     best = best_shape(fit, trials, True, plain)
     # Neighbouring time constants are correlated: half their number counts as trials.
-    chance = log_chance_of_any([log_chance(_rise(best.found, plain))] * (SETTLINGS // 2))
+    chance = log_chance_of_any([log_chance(_rise(best.components, plain))] * (SETTLINGS // 2))
     return best if sigmas(chance) > SIGNIFICANT else None, chance
 
 

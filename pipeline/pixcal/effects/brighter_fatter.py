@@ -81,10 +81,10 @@ class BrighterFatter(Effect):
         return charge + moved[inside, inside]
 
     def undo_samples(self, charge: F32) -> F32:
-        found = charge
+        corrected = charge
         for _ in range(_TURNS):
-            found = charge - moved_charge(found, self._shifts, self.along_y)
-        return found
+            corrected = charge - moved_charge(corrected, self._shifts, self.along_y)
+        return corrected
 
     @property
     def undo_halo(self) -> int:
@@ -145,8 +145,8 @@ def _by_axis(noise: SharedCharge) -> tuple[float, float, float, float]:
 
 def _explaining(evidence: Evidence, otherwise_px: float) -> Boundaries | None:
     """Boundaries that explain all harmonics; None if a nonlinear response is also needed."""
-    found = boundaries_alone(evidence, otherwise_px)
-    return found if found.against <= max(_NEEDED, found.shapes) else None
+    boundaries = boundaries_alone(evidence, otherwise_px)
+    return boundaries if boundaries.against <= max(_NEEDED, boundaries.shapes) else None
 
 
 def _agree(noise: SharedCharge, shift: float, variance: float) -> bool:

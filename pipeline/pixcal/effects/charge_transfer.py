@@ -73,8 +73,8 @@ class ChargeTransfer(Effect):
         detector = shot.bench.detector
         y = np.arange(*shot.rows) + detector.origin[0]
         x = np.arange(detector.shape[1]) + detector.origin[1]
-        found = self._trailed(signal, self.rows, self.row_release_px, y, self.output_row)
-        along = found.T
+        trailed = self._trailed(signal, self.rows, self.row_release_px, y, self.output_row)
+        along = trailed.T
         along = self._trailed(along, self.columns, self.column_release_px, x, self.output_column)
         return np.ascontiguousarray(along.T)
 
@@ -88,20 +88,20 @@ class ChargeTransfer(Effect):
         left = np.minimum(loss * (at[:, None] - output + 1), _MOST) * self.level_e
         left = np.minimum(left * (charge / self.level_e) ** self.power, _MOST * charge)
         left = left.astype(np.float32)
-        found = signal - left
+        trailed = signal - left
         ratio = math.exp(-1 / release)
         for n in range(1, min(_length(release) + 1, len(signal))):
-            found[n:] += np.float32((1 - ratio) * ratio ** (n - 1)) * left[:-n]
-        return np.asarray(found, np.float32)
+            trailed[n:] += np.float32((1 - ratio) * ratio ** (n - 1)) * left[:-n]
+        return np.asarray(trailed, np.float32)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Trails of hot pixels in darks that grow with the distance from the output."""
-        found = trails(evidence)
-        if found is None:
+        both = trails(evidence)
+        if both is None:
             return None
-        there = [one.significance > SIGNIFICANT for one in found]
-        (rows, columns), best = found, max(found, key=lambda one: one.significance)
+        there = [one.significance > SIGNIFICANT for one in both]
+        (rows, columns), best = both, max(both, key=lambda one: one.significance)
         made = cls(
             rows=rows.loss[0] if there[0] else 0.0,
             columns=columns.loss[0] * _scale(columns, best) if there[1] else 0.0,

@@ -114,11 +114,11 @@ class CosmicHits(Effect):
         count = int(rng.poisson((self.rate_cm2_s * seconds + self.readout_cm2) * area))
         if not count:
             return charge
-        found = charge.copy()
+        with_hits = charge.copy()
         tracks = self.tracks(rng, count, pitch, detector.shape)
-        add_tracks(found, tracks, self.diffusion_um / pitch, shot.rows[0])
+        add_tracks(with_hits, tracks, self.diffusion_um / pitch, shot.rows[0])
         full = np.inf if detector.full_well_e is None else detector.full_well_e
-        return np.minimum(found, np.float32(full))
+        return np.minimum(with_hits, np.float32(full))
 
     def tracks(
         self,
@@ -142,10 +142,10 @@ class CosmicHits(Effect):
         if not searches:
             return None
         (law, _), *others = _laws(cls(), searches, evidence.pitch_um)
-        found = _fitted(law, searches, evidence.pitch_um)
-        if found is None:
+        fit = _fitted(law, searches, evidence.pitch_um)
+        if fit is None:
             return None
-        effect, errors = found
+        effect, errors = fit
         step: dict[str, float] = {}
         for other, apart in others:
             if (as_likely := _fitted(other, searches, evidence.pitch_um)) is not None:
@@ -173,18 +173,18 @@ class CosmicHits(Effect):
 
 def _rates(counts: F64, chances: F64, exposures: F64) -> tuple[list[float], list[float]]:
     """Hits (n,) per exposure of both kinds, and errors; the second is zero unless significant."""
-    found: list[tuple[F64, F64]] = []
+    fits: list[tuple[F64, F64]] = []
     for own in (exposures[:1], exposures):
         # Maximum of the likelihood of Poisson counts, by expectation and maximisation.
         total = own.sum(axis=1)
         rates = counts.sum() / total / len(own)
         for _ in range(_STEPS):
             rates = rates * (own @ (counts / np.maximum(rates @ own + chances, _FEWEST))) / total
-        found.append((rates, np.maximum(rates @ own + chances, _FEWEST)))
-    (_, one), (_, both) = found
+        fits.append((rates, np.maximum(rates @ own + chances, _FEWEST)))
+    (_, one), (_, both) = fits
     gain = 2 * float((counts * np.log(both / one) - both + one).sum())
     used = 1 + (gain > SIGNIFICANT**2) if len(exposures) > 1 else 1
-    rates, expected = found[used - 1]
+    rates, expected = fits[used - 1]
     # The posterior of a rate, without prior, has one hit more: few hits constrain it poorly.
     normal = exposures[:used] @ (exposures[:used] / (expected + 1 / len(counts))).T
     errors = np.sqrt(np.diag(np.linalg.inv(normal)))
@@ -205,12 +205,12 @@ class _Hits:
     def classes(self, faintest: float) -> tuple[F64, F64]:
         """Number of hits of each size and brightness, and of each size and width."""
         size = np.digitize(self.sizes, _SIZES)
-        found = []
+        counts = []
         for other, edges in ((self.peaks / faintest, _BRIGHTNESS), (self.near, _NEAR)):
             kinds = len(edges) + 1
             number = size * kinds + np.digitize(other, edges)
-            found.append(np.bincount(number, minlength=(len(_SIZES) + 1) * kinds).astype(float))
-        return found[0], found[1]
+            counts.append(np.bincount(number, minlength=(len(_SIZES) + 1) * kinds).astype(float))
+        return counts[0], counts[1]
 
 
 @dataclass(frozen=True)
@@ -274,7 +274,7 @@ def _counts(searches: Sequence[_Search]) -> tuple[F64, F64]:
 
 def _hits(outliers: Mask, joined: Mask, residual: F32) -> _Hits:
     """Groups of adjacent outliers in a frame, with fainter samples that join them."""
-    found = []
+    hits = []
     for frame in np.flatnonzero(outliers.any(axis=(1, 2))):
         bright = joined[frame] | outliers[frame]
         labels, _ = ndimage.label(ndimage.binary_dilation(bright, np.ones((3, 3))), np.ones((3, 3)))
@@ -286,8 +286,8 @@ def _hits(outliers: Mask, joined: Mask, residual: F32) -> _Hits:
             at = int(charge.argmax())
             near = (abs(y - y[at]) <= 1) & (abs(x - x[at]) <= 1)
             pixel = y[at] * residual.shape[2] + x[at]
-            found.append((float(charge[at]), len(y), np.count_nonzero(near), frame, pixel))
-    return _Hits(*np.array(found, float).reshape(-1, 5).T)
+            hits.append((float(charge[at]), len(y), np.count_nonzero(near), frame, pixel))
+    return _Hits(*np.array(hits, float).reshape(-1, 5).T)
 
 
 def _hits_per_pixel(hits: _Hits, shape: tuple[int, ...]) -> tuple[I64, I64]:
@@ -340,8 +340,8 @@ class _Drawn:
         t, y, x = (rng.integers(0, n, (_DRAWN, 1)) for n in sigma.shape)
         dy, dx = np.divmod(self._pixels, _TILE)
         # Periodic window: tracks that leave it replace tracks that enter from outside.
-        own = sigma[t, (y + dy) % sigma.shape[1], (x + dx) % sigma.shape[2]]
-        return np.where(np.isfinite(own), own, np.inf)
+        noise = sigma[t, (y + dy) % sigma.shape[1], (x + dx) % sigma.shape[2]]
+        return np.where(np.isfinite(noise), noise, np.inf)
 
     def hits(self, scale: float) -> list[_Hits]:
         """Tracks that each search detects, for ``scale`` times the charge."""
@@ -352,9 +352,9 @@ class _Drawn:
         counts = np.isfinite(noise)
         sigma = np.where(counts, noise, 1.0)
         samples = np.where(counts, scale * self._charges + sigma * self._noise, 0.0)
-        found = (samples > limit * sigma).any(axis=1)
-        samples, pixels = samples[found], self._pixels[found]
-        bright = samples > limit * JOINED / THRESHOLD * sigma[found]
+        detected = (samples > limit * sigma).any(axis=1)
+        samples, pixels = samples[detected], self._pixels[detected]
+        bright = samples > limit * JOINED / THRESHOLD * sigma[detected]
         at = samples.argmax(axis=1)[:, None]
         (y, x), (y0, x0) = (
             np.divmod(p, _TILE) for p in (pixels, np.take_along_axis(pixels, at, 1))
@@ -373,19 +373,19 @@ class _Drawn:
             """Mean rank of the hits among the detected drawn tracks, minus one half."""
             total = 0.0
             for s, drawn in zip(self._searches, self.hits(np.exp(log_scale)), strict=True):
-                found = np.sort(drawn.peaks)
+                peaks = np.sort(drawn.peaks)
                 # If few drawn tracks are detected, hits are brighter than the law can explain.
-                rare = len(found) < _RARE * _DRAWN
-                ranks = np.searchsorted(found, s.hits.peaks)
-                total += len(ranks) if rare else ranks.sum() / len(found)
+                rare = len(peaks) < _RARE * _DRAWN
+                ranks = np.searchsorted(peaks, s.hits.peaks)
+                total += len(ranks) if rare else ranks.sum() / len(peaks)
             return total / hits - 0.5
 
         low, high = np.log(0.05), np.log(20.0)
         if rank(low) * rank(high) >= 0:
             return 1.0, None
-        found = float(brentq(rank, low, high, xtol=1e-3))
-        slope = abs(rank(found + 0.2) - rank(found - 0.2)) / 0.4
-        scale = float(np.exp(found))
+        best = float(brentq(rank, low, high, xtol=1e-3))
+        slope = abs(rank(best + 0.2) - rank(best - 0.2)) / 0.4
+        scale = float(np.exp(best))
         return scale, scale / (max(slope, 0.05) * np.sqrt(12 * hits))
 
     @property
@@ -434,7 +434,7 @@ def _fitted(
     """A law with its best rates and charge, and errors; None without detection."""
     drawn = _Drawn(law, searches, pitch_um)
     every = zip(searches, drawn.hits(drawn.scale), strict=True)
-    seen = [(s, s.area * len(own.peaks) / _DRAWN) for s, own in every]
+    seen = [(s, s.area * len(hits.peaks) / _DRAWN) for s, hits in every]
     exposures = np.array([(area * s.seconds, area) for s, area in seen]).T
     if not exposures.sum() > 0:
         return None
@@ -452,5 +452,5 @@ def _fitted(
 
 def _steps(effect: CosmicHits, other: CosmicHits, errors: float) -> dict[str, float]:
     """Change of each number per error, for another law at a distance of ``errors``."""
-    own, others = numbers(effect), numbers(other)
-    return {n: (others[n] - own[n]) / errors for n in own if others[n] != own[n]}
+    these, others = numbers(effect), numbers(other)
+    return {n: (others[n] - these[n]) / errors for n in these if others[n] != these[n]}

@@ -46,18 +46,18 @@ class ExcessNoise(Effect):
         normals, scale = shot.normals(self.name), np.float32(self.excess)
         shape = np.maximum(signal, 0) / scale
         some = np.maximum(shape, np.float32(_MANY))
-        found = shape * (1 - 1 / (9 * some) + normals / (3 * np.sqrt(some))) ** 3
+        drawn = shape * (1 - 1 / (9 * some) + normals / (3 * np.sqrt(some))) ** 3
         few = (shape > 0) & (shape < _MANY)
-        found[few] = gammaincinv(shape[few].astype(float), ndtr(normals[few].astype(float)))
-        return np.asarray(np.where(signal > 0, scale * found, signal), np.float32)
+        drawn[few] = gammaincinv(shape[few].astype(float), ndtr(normals[few].astype(float)))
+        return np.asarray(np.where(signal > 0, scale * drawn, signal), np.float32)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """From photon transfer of flats, if the third moment of their noise shows a register."""
-        found = shot_share_of_flats(evidence)
-        if found is None:
+        measured = shot_share_of_flats(evidence)
+        if measured is None:
             return None
-        share, error = found
+        share, error = measured
         if evidence.excess_noise_factor <= 1:
             why = "the third moment of the noise of flats shows no multiplied electrons"
             return Estimate(cls(0.0), {"excess": error}, 0.0, why)

@@ -164,8 +164,8 @@ class FlatError(Effect):
 
 def _size(variance: float, error: float) -> dict[str, float | str]:
     """The pattern's rms as the size of the effect."""
-    (rms,), (own,) = root_with_error(np.array([variance]), np.array([error]))
-    return {"value": float(rms), "error": float(own), "unit": "", "of": "rms of the response"}
+    (rms,), (rms_error,) = root_with_error(np.array([variance]), np.array([error]))
+    return {"value": float(rms), "error": float(rms_error), "unit": "", "of": "rms of the response"}
 
 
 def _in_full(variance: float, iota: F64, alpha: F64, origin: tuple[int, int]) -> FlatError | None:
@@ -205,13 +205,13 @@ def _two_flats(evidence: Evidence) -> tuple[F64, F64] | None:
 
 
 def _structure(
-    found: FringeEvidence, flat: F64, flats: tuple[F64, F64], good: Mask
+    fringes: FringeEvidence, flat: F64, flats: tuple[F64, F64], good: Mask
 ) -> tuple[F64, F64]:
     """Logarithms of iota and alpha over the flats minus smooth terms, each from half the frames."""
-    free = np.concatenate([polynomial(good.shape, 2), gauge_terms(found)])[:, good].T
+    free = np.concatenate([polynomial(good.shape, 2), gauge_terms(fringes)])[:, good].T
     maps = []
     for n in (0, 1):
-        theta = half_theta(found, n, good)
+        theta = half_theta(fringes, n, good)
         size = theta[0] if n == 0 else np.hypot(theta[1], theta[2])
         ratio = np.log(np.maximum(size * flat[good] / flats[n][good], 1e-12))
         rest = without(ratio[:, None], free)[:, 0]

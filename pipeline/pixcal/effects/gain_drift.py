@@ -41,13 +41,13 @@ class GainDrift(LevelChange):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """That of `IntensityNoise`, where the noise is that of a gain."""
-        found = IntensityNoise.estimate(evidence)
-        if found is None:
+        estimate = IntensityNoise.estimate(evidence)
+        if estimate is None:
             return None
-        law = cast(IntensityNoise, found.effect)
+        law = cast(IntensityNoise, estimate.effect)
         effect = cls(law.rms, law.correlation_s, law.line, law.line_hz)
-        refused = "" if found.refused else "the noise does not rise as with a gain that varies"
+        refused = "" if estimate.refused else "the noise does not rise as with a gain that varies"
         share, error = gain_share(evidence)
         if refused and 1 - share < SIGNIFICANT * error:
             refused = "the noise cannot tell it from intensity_noise"
-        return replace(found, effect=effect, why=WHY, law="", refused=refused)
+        return replace(estimate, effect=effect, why=WHY, law="", refused=refused)

@@ -74,20 +74,20 @@ class GainError(Effect):
             ),
             "flats": shot_share_of_flats(evidence),
         }
-        found = {
+        by_method = {
             name: _of_light(*way, evidence.excess_noise_factor)
             for name, way in ways.items()
             if way is not None
         }
-        if not found:
+        if not by_method:
             return None
-        share, error = _joined(found)
+        share, error = _joined(by_method)
         relative, error = 1 / share - 1, error / share**2
         return Estimate(
             cls(float(np.clip(relative, -0.9999, 9999.0))),
             {"relative": float(error)},
             float(abs(relative) / error),
-            f"noise that grows with the level in the {' and the '.join(found)} is "
+            f"noise that grows with the level in the {' and the '.join(by_method)} is "
             f"{share:.3f} times that expected with the gain used",
         )
 
@@ -99,36 +99,36 @@ def _of_light(share: float, error: float, excess: float) -> tuple[float, float]:
     return share / excess, math.hypot(error, EXCESS_ERROR * share) / excess
 
 
-def _joined(found: dict[str, tuple[float, float]]) -> tuple[float, float]:
+def _joined(by_method: dict[str, tuple[float, float]]) -> tuple[float, float]:
     """Share and error from all methods; from the flats only if the fringes disagree."""
-    shares, errors = np.array(list(found.values())).T
-    if len(found) == 2 and abs(shares[0] - shares[1]) > _DISAGREE * np.hypot(*errors):
-        found = {"flats": found["flats"]}
-        shares, errors = np.array(list(found.values())).T
+    shares, errors = np.array(list(by_method.values())).T
+    if len(by_method) == 2 and abs(shares[0] - shares[1]) > _DISAGREE * np.hypot(*errors):
+        by_method = {"flats": by_method["flats"]}
+        shares, errors = np.array(list(by_method.values())).T
     weight = 1 / errors**2
     return float((weight * shares).sum() / weight.sum()), float(weight.sum() ** -0.5)
 
 
-def _of_fringes(found: FringeEvidence) -> F64 | None:
+def _of_fringes(fringes: FringeEvidence) -> F64 | None:
     """`residual_sums` of a fringe set; None with too few frames or good pixels."""
-    pixels = np.count_nonzero(found.good)
-    if len(found.g) < _MIN_FRAMES or pixels < MIN_PIXELS:
+    pixels = np.count_nonzero(fringes.good)
+    if len(fringes.g) < _MIN_FRAMES or pixels < MIN_PIXELS:
         return None
-    freedom = Freedom(found)
+    freedom = Freedom(fringes)
     i, j = np.triu_indices(len(freedom.of_time))
     of_time = (freedom.of_time[i] * freedom.of_time[j]).T * np.where(i == j, 1, 2)
-    of_pixels = np.zeros((len(i), *found.good.shape))
-    of_pixels[:, found.good] = freedom.pixel_inverse[:, i, j].T
+    of_pixels = np.zeros((len(i), *fringes.good.shape))
+    of_pixels[:, fringes.good] = freedom.pixel_inverse[:, i, j].T
     # (B, A cos phi, A sin phi) of every frame, and free fringe vectors, absorb residuals in
     # proportion to the correlation of their patterns in neighbours.
-    alike = np.cos(STEPS @ np.array([found.k[1], found.k[0]]))
-    taken = (1 + (4 if np.any(found.dk) else 2) * alike) / pixels
+    alike = np.cos(STEPS @ np.array([fringes.k[1], fringes.k[0]]))
+    taken = (1 + (4 if np.any(fringes.dk) else 2) * alike) / pixels
     return residual_sums(
-        found.residual,
-        found.model,
-        found.shot_factor,
-        found.read_variance,
-        found.good,
+        fringes.residual,
+        fringes.model,
+        fringes.shot_factor,
+        fringes.read_variance,
+        fringes.good,
         of_time,
         of_pixels,
         taken,

@@ -108,8 +108,8 @@ class GhostFringes(Effect):
 
     def _ghosts(self, of: str) -> list[tuple[Beat, complex, Parent]]:
         """Beat, amplitude relative to the parent beam, and parent of all ghosts in a set."""
-        own = self.share * np.exp(1j * self.phase_rad)
-        ghosts = [(self.beat_rad_px, own, parent) for parent in PARENTS[self.parent]]
+        ratio = self.share * np.exp(1j * self.phase_rad)
+        ghosts = [(self.beat_rad_px, ratio, parent) for parent in PARENTS[self.parent]]
         for wave in self.waves:
             if wave.set in ("", of):
                 each = zip(wave.of_beams, _EVERY_PARENT, strict=True)
@@ -164,48 +164,48 @@ class GhostFringes(Effect):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Waves that mean light and fringes share, set by set (`find_waves`)."""
-        found = find_waves(evidence)
-        if found is None:
+        ghosts = find_waves(evidence)
+        if ghosts is None:
             return None
         ny, nx = evidence.good.shape
         middle = (evidence.origin[1] + (nx - 1) / 2, evidence.origin[0] + (ny - 1) / 2)
         waves: list[GhostWave] = []
         errors: dict[str, float] = {}
-        *single, both = (TiedWaves.of(law, found.waves) for law in LAWS)
+        *single, both = (TiedWaves.of(law, ghosts.waves) for law in LAWS)
         best = min(single, key=lambda tied: tied.misfit)
-        static = sum(abs(w.static) ** 2 / w.errors[0] ** 2 for w in found.waves)
+        static = sum(abs(w.static) ** 2 / w.errors[0] ** 2 for w in ghosts.waves)
         # Two ghosts have more free numbers, and must explain much more than one. Crosstalk causes
         # no static fringes.
-        two = best.misfit > 2 * both.misfit + TWO_GHOSTS * len(found.waves) < static
+        two = best.misfit > 2 * both.misfit + TWO_GHOSTS * len(ghosts.waves) < static
         tied = both if two else best
         columns = [abs(f.k[0]) >= abs(f.k[1]) for f in evidence.fringes.values()]
         alike = max(sum(columns), len(columns) - sum(columns))
-        taken = tied.shrunk(found.waves, alike)
-        for n, (one, own) in enumerate(zip(found.waves, taken, strict=True)):
-            waves.append(_wave(own, middle))
+        taken = tied.shrunk(ghosts.waves, alike)
+        for n, (one, shrunk) in enumerate(zip(ghosts.waves, taken, strict=True)):
+            waves.append(_wave(shrunk, middle))
             for key, error in zip(("static", "forward", "backward"), one.errors, strict=False):
                 errors |= {f"waves[{n}].{key}[{part}]": error for part in (0, 1)}
             errors |= {f"waves[{n}].beat_rad_px[{axis}]": one.errors[3 + axis] for axis in (0, 1)}
         by_law = tuple(_wave(one, middle) for one in tied.waves)
         return Estimate(
-            cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=tuple(waves)),
+            cls(0.0, waves[0].beat_rad_px, in_flats=ghosts.in_flats, waves=tuple(waves)),
             errors,
-            found.significance if _of_a_beam(found.waves, tied, evidence) else 0.0,
-            "fringes of a common vector in " + " and ".join(found.seen_in),
+            ghosts.significance if _of_a_beam(ghosts.waves, tied, evidence) else 0.0,
+            "fringes of a common vector in " + " and ".join(ghosts.seen_in),
             law=tied.law,
-            by_law=cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=by_law),
+            by_law=cls(0.0, waves[0].beat_rad_px, in_flats=ghosts.in_flats, waves=by_law),
         )
 
 
-def _wave(found: WaveFit, middle: tuple[float, float]) -> GhostWave:
+def _wave(fit: WaveFit, middle: tuple[float, float]) -> GhostWave:
     """A wave relative to the window's first pixel instead of its centre."""
-    qx, qy = found.q
+    qx, qy = fit.q
     turn = np.exp(-1j * (qx * middle[0] + qy * middle[1]))
     # Mean light: Re(s e); fringes: f e and b / e.
-    static, forward, backward = found.static * turn, found.forward * turn, found.backward / turn
+    static, forward, backward = fit.static * turn, fit.forward * turn, fit.backward / turn
     return GhostWave(
         (float(np.clip(qx, -np.pi, np.pi)), float(np.clip(qy, -np.pi, np.pi))),
-        found.set,
+        fit.set,
         _pair(static.conjugate()),
         _pair(forward),
         _pair(backward),
@@ -273,9 +273,9 @@ def _of_the_flat(waves: Sequence[WaveFit], evidence: Evidence) -> bool:
         return abs(one.static - first.static) < ALIKE * abs(first.static) + apart
 
     def leaves_phases(of: str) -> bool:
-        own = [w for w in close if w.set == of]
-        moved = np.linalg.norm([w.forward - w.backward.conjugate() for w in own])
-        error = np.linalg.norm([w.errors[1:3] for w in own])
+        in_set = [w for w in close if w.set == of]
+        moved = np.linalg.norm([w.forward - w.backward.conjugate() for w in in_set])
+        error = np.linalg.norm([w.errors[1:3] for w in in_set])
         return bool(moved < PHASE_SHARE * abs(first.static) + ALIKE_SIGMAS * error)
 
     return (

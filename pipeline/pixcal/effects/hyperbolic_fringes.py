@@ -79,26 +79,26 @@ class HyperbolicFringes(Effect):
 
     def geometry(self, bench: Bench, number: int) -> Geometry:
         """Geometry of a fringe set with given foot and distance, and the same fringe vector."""
-        own, pitch = geometry(bench, number), bench.detector.pitch_um * 1e-3
-        distance = self.distance_mm or own.distance
-        wider = distance / own.distance
+        placed, pitch = geometry(bench, number), bench.detector.pitch_um * 1e-3
+        distance = self.distance_mm or placed.distance
+        wider = distance / placed.distance
         scan, (x, y) = bench.frames.fringes[number], bench.detector.chip_centre_px
         pair = next((p for p in self.pairs if p.set == scan.name), None)
         if pair is None and self.foot_mm is not None:
             pair = FibrePair(scan.name, self.foot_mm)
         if pair is not None:
             foot_x, foot_y = pair.foot_mm
-            own = replace(
-                own,
+            placed = replace(
+                placed,
                 centre_x=x * pitch + foot_x,
                 centre_y=y * pitch + foot_y,
                 baseline_z=pair.height_mm,
             )
         return replace(
-            own,
+            placed,
             distance=distance,
-            baseline_x=own.baseline_x * wider,
-            baseline_y=own.baseline_y * wider,
+            baseline_x=placed.baseline_x * wider,
+            baseline_y=placed.baseline_y * wider,
         )
 
     @classmethod
@@ -106,10 +106,10 @@ class HyperbolicFringes(Effect):
         """A common foot of all sets, or one position per set, at the nominal distance."""
         pairs = tuple(FibrePair(name, (0.0, 0.0)) for name in evidence.fringes)
         common = cls((0.0, 0.0), evidence.distance_mm)
-        own = cls(None, evidence.distance_mm, pairs=pairs)
+        separate = cls(None, evidence.distance_mm, pairs=pairs)
         return [
             LightStart(common, ("foot_mm",), "one fibre position for all sets"),
-            LightStart(own, ("pairs",), "a separate fibre position for each set"),
+            LightStart(separate, ("pairs",), "a separate fibre position for each set"),
         ]
 
 

@@ -88,19 +88,21 @@ class IntensityNoise(LevelChange):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """As by `Effect`, with the change of contrast by ambient light or separate powers."""
-        found = super().estimate(evidence)
+        estimate = super().estimate(evidence)
         share, error = gain_share(evidence)
-        if found is not None and share > max(0.5, SIGNIFICANT * error):
-            return replace(found, refused="the noise rises as with a gain that varies, not light")
-        if found is None:
+        if estimate is not None and share > max(0.5, SIGNIFICANT * error):
+            return replace(
+                estimate, refused="the noise rises as with a gain that varies, not light"
+            )
+        if estimate is None:
             return None
-        assert isinstance(found.effect, cls)
-        effect = found.effect
+        assert isinstance(estimate.effect, cls)
+        effect = estimate.effect
         shares = ambient_shares(evidence)
         if any(SIGNIFICANT * error < share < MAX_AMBIENT for share, error in shares):
             ambient = tuple(float(np.clip(share, 0, MAX_AMBIENT)) for share, _ in shares)
             effect = replace(effect, ambient=ambient)
-        elif found.significance > SIGNIFICANT:
+        elif estimate.significance > SIGNIFICANT:
             effect = replace(effect, separate=separate_powers(evidence))
-        law = "the powers of the two fibres vary separately" if effect.separate else found.law
-        return replace(found, effect=effect, law=law)
+        law = "the powers of the two fibres vary separately" if effect.separate else estimate.law
+        return replace(estimate, effect=effect, law=law)

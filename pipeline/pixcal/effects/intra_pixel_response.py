@@ -77,8 +77,8 @@ class IntraPixelResponse(Effect):
 
         common = np.sqrt(self.alike) * drawn("both") if self.alike else 0.0
         for axis, (width, rate) in enumerate(zip(self.width_px, k, strict=True)):
-            own = common + np.sqrt(1 - self.alike) * drawn(axis)
-            factor *= transfer(rate, np.maximum(width + self.width_rms_px * own, 0))
+            pattern = common + np.sqrt(1 - self.alike) * drawn(axis)
+            factor *= transfer(rate, np.maximum(width + self.width_rms_px * pattern, 0))
         kept = factor.astype(np.float32)
         return replace(light, alpha_sin=light.alpha_sin * kept, alpha_cos=light.alpha_cos * kept)
 
@@ -102,22 +102,22 @@ class IntraPixelResponse(Effect):
         k = np.array([f.k for f in sets])
         square, error = _width(k, np.array([_log_visibility(f) for f in sets]))
         width, width_error = map(float, root_with_error(min(square, 9.0), error))
-        found = _scatter(sets, max(width, 0.5), visibility_products(evidence, sets))
-        rms, rms_error = map(float, root_with_error(found.variance, found.error))
+        scatter = _scatter(sets, max(width, 0.5), visibility_products(evidence, sets))
+        rms, rms_error = map(float, root_with_error(scatter.variance, scatter.error))
         # A wider response changes the visibility more for the same scatter of its width.
         rms_error = float(np.hypot(rms_error, rms * width_error / max(width, 0.5)))
         return Estimate(
-            cls((width, width), min(rms, 0.5), found.alike),
+            cls((width, width), min(rms, 0.5), scatter.alike),
             {
                 "width_px[0]": width_error,
                 "width_px[1]": width_error,
                 "width_rms_px": rms_error,
-                **({"alike": found.alike_error} if found.alike else {}),
+                **({"alike": scatter.alike_error} if scatter.alike else {}),
             },
             # Of the scatter only, because unequal fibre powers also change a visibility.
-            found.variance / found.error,
+            scatter.variance / scatter.error,
             "visibility that varies from pixel to pixel, more strongly at shorter fringe periods",
-            refused=found.refused,
+            refused=scatter.refused,
         )
 
 
@@ -126,9 +126,9 @@ def transfer(k: Any, width: Any) -> Any:
     return np.sinc(k * width / (2 * np.pi))
 
 
-def _log_visibility(found: FringeEvidence) -> float:
-    alpha = np.hypot(found.theta[1], found.theta[2])[found.good]
-    return float(np.log(np.median(alpha / found.theta[0][found.good])))
+def _log_visibility(fringes: FringeEvidence) -> float:
+    alpha = np.hypot(fringes.theta[1], fringes.theta[2])[fringes.good]
+    return float(np.log(np.median(alpha / fringes.theta[0][fringes.good])))
 
 
 def _width(k: F64, seen: F64) -> tuple[float, float]:
@@ -200,8 +200,8 @@ def _cross(sets: list[FringeEvidence], m: int, n: int) -> bool:
     return bool(area >= CROSSED * np.hypot(*k) * np.hypot(*other))
 
 
-def _slopes(found: FringeEvidence, width: float) -> F64:
+def _slopes(fringes: FringeEvidence, width: float) -> F64:
     """Change (2,) of the logarithm of the visibility per pixel of width, along each axis."""
-    k = np.array(found.k)
+    k = np.array(fringes.k)
     wide, narrow = (np.log(np.abs(transfer(k, width + step))) for step in (_STEP, -_STEP))
     return np.asarray((wide - narrow) / (2 * _STEP))

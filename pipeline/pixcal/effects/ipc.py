@@ -183,26 +183,26 @@ class Ipc(Effect):
         # Shares that are not significant are shrunk by their errors.
         if not self.couplings or any(c.per_ke for c in self.couplings):
             return None
-        found = dense_kernel(parts, self.couplings)
-        if found is None:
+        kernel = dense_kernel(parts, self.couplings)
+        if kernel is None:
             return None
         return Estimate(
-            type(self)(_worth_it(found.couplings)),
-            {f"couplings[{n}].share": float(s) for n, s in enumerate(found.errors)},
+            type(self)(_worth_it(kernel.couplings)),
+            {f"couplings[{n}].share": float(s) for n, s in enumerate(kernel.errors)},
             float("nan"),
             "every coupling within two pixels, measured on all frames",
-            covariance=found.covariance,
+            covariance=kernel.covariance,
         )
 
     def phase_slopes(self, maps: FringeMaps) -> F64:
         """As in `Effect.phase_slopes`: the source's fringe is added to that of the receiver."""
         flat = 1.0 if maps.flat is None else maps.flat
         z = (maps.theta[2] + 1j * maps.theta[1]) * flat
-        found = np.zeros((len(self.couplings), *z.shape))
-        for own, c in zip(found, self.couplings, strict=True):
+        slopes = np.zeros((len(self.couplings), *z.shape))
+        for slope, c in zip(slopes, self.couplings, strict=True):
             here, there = c.places((z.shape[0], z.shape[1]), maps.origin)
-            own[there] = -np.imag(z[here] / z[there])
-        return found
+            slope[there] = -np.imag(z[here] / z[there])
+        return slopes
 
     @property
     def undo_halo(self) -> int:

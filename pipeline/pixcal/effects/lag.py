@@ -215,15 +215,15 @@ class Lag(Effect):
 
     def _released(self, held: F32, releases: F64, shot: Shot, kind: int = 0) -> F32:
         """Charge (y, x) that a frame gets from traps; each electron is released by chance."""
-        found: F32 = np.zeros_like(held[0])
-        drawn = np.zeros_like(found)
+        released: F32 = np.zeros_like(held[0])
+        drawn = np.zeros_like(released)
         for release, part in zip(releases, held, strict=True):
-            found += np.float32(release) * part
+            released += np.float32(release) * part
             drawn += np.float32(release * (1 - release)) * part
         if shot.bench.shot_noise and self.quiet < 1 and drawn.any():
             normals = shot.normals(f"{self.name} {'slow ' * kind}release")
-            found += np.sqrt(np.float32(1 - self.quiet) * np.maximum(drawn, 0)) * normals
-        return found
+            released += np.sqrt(np.float32(1 - self.quiet) * np.maximum(drawn, 0)) * normals
+        return released
 
     def lost(self, charge: F32) -> tuple[F32, F32]:
         """Mean net loss of frames, and charge released from earlier ones; both (t, ...), e-.
@@ -315,10 +315,10 @@ class Lag(Effect):
                 slow.share / slow.share_error,
                 "the dark level decays after exposure to light",
             )
-        found = lag_of_flats(evidence)
-        if found is None:
+        of_flats = lag_of_flats(evidence)
+        if of_flats is None:
             return None
-        share, error, carried = found
+        share, error, carried = of_flats
         before = "charge of the frame before"
         if not carried:
             pairs = all(len(s.adu) < _TELL_LAMP for s in evidence.ladder)

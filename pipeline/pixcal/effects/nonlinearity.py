@@ -136,23 +136,23 @@ class Nonlinearity(Effect):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Second and third harmonic of the phase in the residuals; without fringes, flats."""
-        found = _polynomial(evidence)
-        if found is None:
+        fit = _polynomial(evidence)
+        if fit is None:
             return None
-        quadratic, cubic = (float(np.clip(v, -0.3, 0.3)) for v in found.sizes)
-        effect = cls(quadratic, cubic, found.level_e)
+        quadratic, cubic = (float(np.clip(v, -0.3, 0.3)) for v in fit.sizes)
+        effect = cls(quadratic, cubic, fit.level_e)
         more, refused = None, ""
-        evidence_for = found.significance, found.why
-        sure = effect.linearised if found.significance > SIGNIFICANT else None
+        evidence_for = fit.significance, fit.why
+        sure = effect.linearised if fit.significance > SIGNIFICANT else None
         bent = None if evidence.fringes else ladder_curve(evidence, sure)
         if bent is not None:
             points = np.pad(bent.charge, (1, 0)).tolist(), np.pad(bent.change, (1, 0)).tolist()
             named = {f"bends[{n}].change_e": float(e) for n, e in enumerate(bent.error, 1)}
-            steps = tuple(dict(zip(named, own, strict=True)) for own in bent.steps.T.tolist())
+            steps = tuple(dict(zip(named, step, strict=True)) for step in bent.steps.T.tolist())
             # The last point lies beyond the flats.
             size = _size(bent.charge[-2], bent.change[-2], bent.error[-2])
             return Estimate(
-                cls(0.0, 0.0, found.level_e, tuple(map(CurvePoint, *points))),
+                cls(0.0, 0.0, fit.level_e, tuple(map(CurvePoint, *points))),
                 named,
                 *evidence_for,
                 steps,
@@ -160,14 +160,14 @@ class Nonlinearity(Effect):
                 by_law=effect,
                 size=size,
             )
-        if evidence.fringes and found.significance > SIGNIFICANT:
+        if evidence.fringes and fit.significance > SIGNIFICANT:
             part = central_crop(evidence)
-            more, agreement = _bends(part, effect.response, found.chi2)
+            more, agreement = _bends(part, effect.response, fit.chi2)
             refused = SETS_DISAGREE if agreement.rejected else ""
-        errors = np.sqrt(np.diag(found.covariance))
+        errors = np.sqrt(np.diag(fit.covariance))
         named = {"quadratic": float(errors[0]), "cubic": float(errors[1])}
         if more is None:
-            return Estimate(effect, named, *evidence_for, refused=refused, size=found.size)
+            return Estimate(effect, named, *evidence_for, refused=refused, size=fit.size)
         named |= {f"bends[{n}].change_e": error for n, error in enumerate(more[1])}
         curve = replace(effect, bends=more[0])
         return Estimate(
@@ -177,13 +177,13 @@ class Nonlinearity(Effect):
             law="response curve of second and third order",
             by_law=effect,
             refused=refused,
-            size=_size_of_curve(curve, more[1], found.error),
+            size=_size_of_curve(curve, more[1], fit.error),
         )
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
-        found = _polynomial(evidence)
-        return None if found is None else found.significance
+        fit = _polynomial(evidence)
+        return None if fit is None else fit.significance
 
 
 @dataclass(frozen=True)

@@ -100,21 +100,21 @@ class OutputJitter(Effect):
         stacks = [s for s in unlit_stacks(evidence, "bias", "dark") if len(s.adu) >= MIN_FRAMES]
         gain = np.float32(evidence.gain)
         rests = [(s.adu - s.adu.mean(axis=0)) * gain for s in stacks]
-        found = find_outputs(rests, [s.time_s for s in stacks], evidence.good)
-        if found is None:
+        outputs = find_outputs(rests, [s.time_s for s in stacks], evidence.good)
+        if outputs is None:
             return None
-        size, error = np.array([found.size, found.error]) * [1.0, HOUR_S]
+        size, error = np.array([outputs.size, outputs.error]) * [1.0, HOUR_S]
         rms, rms_error = root_with_error(size, error)
         rows, columns = (
             tuple(int(edge) + first for edge in edges)
             for edges, first in zip(
-                (found.row_edges, found.column_edges), evidence.origin, strict=True
+                (outputs.row_edges, outputs.column_edges), evidence.origin, strict=True
             )
         )
         return Estimate(
             cls(float(rms[0]), min(float(rms[1]), 1e6), rows, columns),
             dict(zip(cls.strengths, rms_error.tolist(), strict=True)),
-            found.sigmas,
+            outputs.sigmas,
             "steps between outputs that change in each frame without light",
         )
 
@@ -140,14 +140,14 @@ def find_outputs(stacks: Sequence[F32], times: Sequence[F64], good: Mask) -> Out
     rests = [_calm(stacks[n], good) for n in chosen]
     if not rests:
         return None
-    found = [_edges(rests, good, axis) for axis in (0, 1)]
-    clearest = max(found, key=lambda own: own[1])
+    by_axis = [_edges(rests, good, axis) for axis in (0, 1)]
+    clearest = max(by_axis, key=lambda edges: edges[1])
     if clearest[1] == -np.inf:
         return None
-    kept = [[e for e, s in own[0] if s > SIGNIFICANT] for own in found]
+    kept = [[e for e, s in edges[0] if s > SIGNIFICANT] for edges in by_axis]
     if not any(kept):
-        kept[found.index(clearest)] = [clearest[0][0][0]]
-    rows, columns = (tuple(sorted(own)) for own in kept)
+        kept[by_axis.index(clearest)] = [clearest[0][0][0]]
+    rows, columns = (tuple(sorted(edges)) for edges in kept)
     numbers = output_numbers(rows, columns, np.arange(good.shape[0]), np.arange(good.shape[1]))
     size, error = _sizes(rests, [times[n] for n in chosen], good, numbers)
     return Outputs(rows, columns, size, error, clearest[1])
@@ -177,24 +177,24 @@ def _edges(rests: Sequence[F32], good: Mask, axis: int) -> tuple[list[tuple[int,
         return [], -np.inf
     count = np.maximum(good.sum(axis=1 - axis), 1)
     lines = [rest.sum(axis=2 - axis, dtype=float) / count for rest in rests]
-    dof = sum(len(own) - 1 for own in lines)
+    dof = sum(len(line) - 1 for line in lines)
     free = {width: _steps(lines, width, dof) for width in WIDTHS if 4 * width < size}
     looks = 2 * sum(np.count_nonzero(square) for square in free.values())
-    found: list[tuple[int, float]] = []
-    while len(found) < MAX_EDGES and max(square.max() for square in free.values()) > 0:
+    edges: list[tuple[int, float]] = []
+    while len(edges) < MAX_EDGES and max(square.max() for square in free.values()) > 0:
         best = max(free.values(), key=np.max)
         at = int(best.argmax())
         chance = sigmas_of_chi2(float(best[at]), dof)
         sigmas = sigmas_of_best(*[chance] * looks)
         edge = _placed(lines, at)
-        found.append((edge, sigmas))
+        edges.append((edge, sigmas))
         if sigmas < SIGNIFICANT:
             break
         # Clipped steps are equal at several places; the first is not necessarily the edge.
         for width, square in free.items():
             for middle in (at, edge):
                 square[max(middle - width, 0) : middle + width + 1] = 0
-    return found, found[0][1] if found else -np.inf
+    return edges, edges[0][1] if edges else -np.inf
 
 
 def _steps(lines: Sequence[F64], width: int, dof: int) -> F64:
@@ -202,20 +202,20 @@ def _steps(lines: Sequence[F64], width: int, dof: int) -> F64:
     size = lines[0].shape[1]
     places = np.arange(width, size - width + 1)
     square = np.zeros(len(places))
-    for own in lines:
+    for line in lines:
         # Noise may depend on position.
         # Variance (n,) of line means (t, n), from differences of neighbours, insensitive to steps.
-        change = np.square(np.diff(own, axis=1)).mean(axis=0) / 2
+        change = np.square(np.diff(line, axis=1)).mean(axis=0) / 2
         near = np.pad(change, (NARROWEST, NARROWEST + 1), mode="reflect")
         noise = np.asarray(np.median(sliding_window_view(near, 2 * NARROWEST + 1), axis=1))[None]
         expected = _means(noise, places, width)[0] + _means(noise, places - width, width)[0]
-        steps = _means(own, places, width) - _means(own, places - width, width)
+        steps = _means(line, places, width) - _means(line, places - width, width)
         steps /= np.sqrt(np.maximum(expected, 1e-12))
         usual = robust_sigma(steps) or 1.0
         square += np.square(np.clip(steps / usual, -_CLIP, _CLIP)).sum(axis=0)
-    found = np.zeros(size + 1)
-    found[places] = square * dof / max(float(np.median(square)), 1e-9)
-    return found
+    chi2 = np.zeros(size + 1)
+    chi2[places] = square * dof / max(float(np.median(square)), 1e-9)
+    return chi2
 
 
 def _means(lines: F64, first: Indices, count: int) -> F64:
@@ -272,11 +272,11 @@ def _noise(rest: F32, mask: Mask) -> float:
     """Variance of the mean of a rectangle of pixels without its bad ones."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     cut = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
-    own, used = rest[:, *cut] * mask[cut], np.maximum(np.count_nonzero(mask), 1)
+    noise, used = rest[:, *cut] * mask[cut], np.maximum(np.count_nonzero(mask), 1)
     ny, nx = mask[cut].shape
-    own = own - own.sum(axis=(1, 2), keepdims=True) / used
-    pixels = float(np.square(own, dtype=float).sum()) / len(own) / used
-    lines = [own.sum(axis=a) / np.maximum(mask[cut].sum(axis=a - 1), 1) for a in (2, 1)]
+    noise = noise - noise.sum(axis=(1, 2), keepdims=True) / used
+    pixels = float(np.square(noise, dtype=float).sum()) / len(noise) / used
+    lines = [noise.sum(axis=a) / np.maximum(mask[cut].sum(axis=a - 1), 1) for a in (2, 1)]
     # Neighbours: noise shared by distant rows is shared by neighbouring ones too.
     of_rows, of_columns = (float(np.square(line, dtype=float).mean()) for line in lines)
     return float(max(of_rows / ny + of_columns / nx - pixels / used, 0.0))

@@ -83,9 +83,9 @@ class Pickup(Effect):
         size = np.sqrt(2) * np.array(self.rms) / shot.bench.detector.gain_e_per_adu
         down = y[:, None] * (2 * np.pi * np.array(self.rows)) + phases
         along = np.array(self.columns)[:, None] * (2 * np.pi * x)
-        found = adu.copy()
-        add_waves(turns(down) * size.astype(np.float32), turns(along), found)
-        return found
+        samples = adu.copy()
+        add_waves(turns(down) * size.astype(np.float32), turns(along), samples)
+        return samples
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
@@ -150,11 +150,11 @@ def _noise(evidence: Evidence) -> tuple[F32, Mask] | None:
             adu = stack.adu[:, *middle].astype(np.float32)
             count = len(adu) // 2 * 2
             for step in (adu[1:count:2] - adu[:count:2]) * np.float32(evidence.gain / 2**0.5):
-                own = np.where(good, step - step[good].mean(), np.float32(0))
+                noise = np.where(good, step - step[good].mean(), np.float32(0))
                 # Root mean squares, as medians of integers are quantised.
-                own[np.abs(own) > _WILD * np.sqrt(np.square(own).mean())] = 0
-                if own.any():
-                    some.append(own)
+                noise[np.abs(noise) > _WILD * np.sqrt(np.square(noise).mean())] = 0
+                if noise.any():
+                    some.append(noise)
     return (np.stack(some[:_FRAMES]), good) if some else None
 
 
@@ -177,7 +177,7 @@ def _search(frames: F32) -> tuple[F64, F64]:
     slow = np.flatnonzero(down < _DRIFTS)
     half = (ny + 1) // 2
     of_rows = np.pad(_over_next_highest(power[:half, 0]), (0, ny - half))
-    of_columns = np.array([_over_next_highest(own) for own in power[slow]])
+    of_columns = np.array([_over_next_highest(row) for row in power[slow]])
     # Outputs that share noise have columns of modes with more of it, at all frequencies.
     fast = power[:, _SLOW:]
     fast /= np.maximum(_surroundings(fast, _AROUND), np.median(fast, axis=0))
@@ -194,23 +194,23 @@ def _search(frames: F32) -> tuple[F64, F64]:
     at = at[np.argsort(-power[*at.T])][:_AT_ONCE]
     # An ordinate over its median has Wilson and Hilferty's distribution (1931).
     ninth = 1 / (9 * count)
-    own = (np.cbrt(power[*at.T]) - 1) * (1 - ninth) / np.sqrt(ninth)
-    sigmas = [sigmas_of_largest(float(z), (ny - 1) * (nx // 2)) for z in own]
+    normals = (np.cbrt(power[*at.T]) - 1) * (1 - ninth) / np.sqrt(ninth)
+    sigmas = [sigmas_of_largest(float(z), (ny - 1) * (nx // 2)) for z in normals]
     return np.stack([np.fft.fftfreq(ny)[at[:, 0]], at[:, 1] / nx], axis=1), np.array(sigmas)
 
 
 def _over_next_highest(power: F64) -> F64:
     """Modes (n,) along one axis over the mean of those within an octave; zero for no tone."""
     # The highest modes are differences of even and odd lines.
-    found, end = np.zeros(len(power)), len(power) - 2
+    ratios, end = np.zeros(len(power)), len(power) - 2
     for k in range(_FIRST, end):
         about = np.concatenate([power[k // 2 : k - 1], power[k + 2 : min(2 * k, end) + 1]])
         # All but one: hum has a harmonic.
         top = int(about.argmax())
         others = np.delete(about, range(max(top - 1, 0), min(top + 2, len(about))))
         if power[k] > _STANDS_OUT * others.max():
-            found[k] = power[k] / about.mean()
-    return found
+            ratios[k] = power[k] / about.mean()
+    return ratios
 
 
 def _surroundings(power: F64, size: tuple[int, int]) -> F64:
@@ -269,8 +269,8 @@ def _sizes(frames: F32, good: Mask, tones: F64) -> C128:
             [same.imag + opposite.imag, same.real - opposite.real],
         ]
     )
-    found = np.linalg.lstsq(real, np.concatenate([products.real, products.imag]))[0]
-    return np.asarray((found[: len(tones)] + 1j * found[len(tones) :]).T)
+    amplitudes = np.linalg.lstsq(real, np.concatenate([products.real, products.imag]))[0]
+    return np.asarray((amplitudes[: len(tones)] + 1j * amplitudes[len(tones) :]).T)
 
 
 def _drawn(size: C128, tones: F64, shape: tuple[int, ...]) -> F32:

@@ -184,21 +184,21 @@ class Quantisation(Effect):
 
         None where samples are no whole numbers, or too few.
         """
-        found = _by_law(evidence, far=True)
-        if found is None:
+        fit = _by_law(evidence, far=True)
+        if fit is None:
             return None
-        by_law, significance = cls(**found.values), sigmas_of_best(*found.sigmas)
-        effect, widths = by_law, found.widths
+        by_law, significance = cls(**fit.values), sigmas_of_best(*fit.sigmas)
+        effect, widths = by_law, fit.widths
         if widths is not None and significance > SIGNIFICANT:
             rest = widths.without(np.array(by_law.bits), by_law.law) if by_law.bits else widths
             effect = replace(by_law, widths=tuple(map(float, rest.measured)))
-        errors = found.errors
+        errors = fit.errors
         return Estimate(
             effect,
             errors,
             significance,
             "missing codes, and code counts compared with neighbouring codes",
-            (*found.together, *({n: e} for n, e in errors.items() if n[:4] != "bits")),
+            (*fit.together, *({n: e} for n, e in errors.items() if n[:4] != "bits")),
             law="" if effect == by_law else _LAW,
             by_law=None if effect == by_law else by_law,
             refused=_OTHER_GAIN if widths is not None and widths.uneven_above else "",
@@ -206,8 +206,8 @@ class Quantisation(Effect):
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
-        found = _by_law(evidence)
-        return None if found is None else sigmas_of_best(*found.sigmas)
+        fit = _by_law(evidence)
+        return None if fit is None else sigmas_of_best(*fit.sigmas)
 
 
 @dataclass(frozen=True)
@@ -242,9 +242,9 @@ def _by_law(evidence: Evidence, far: bool = False) -> _ByLaw | None:
     if counts is not None:
         top = evidence.saturation_adu
         if 1 < step < FEW_MISSING:
-            own = code_widths(counts, noise, first, top)
+            measured = code_widths(counts, noise, first, top)
             # Wrong bits leave codes out too.
-            if own is not None and "bits" in _uneven(own)[0]:
+            if measured is not None and "bits" in _uneven(measured)[0]:
                 step = 1.0
         widths = code_widths(converter_counts(counts, step), noise, first, top / step)
     if widths is None and step == evidence.step_adu:
@@ -285,26 +285,26 @@ def _uneven(
     values: dict[str, Any] = {"ripple": 0.0}
     errors = {"ripple": line.amplitude_error}
     # With displaced thresholds, neighbouring widths may have twice the variance.
-    found = widths.wrong_bits(2 * variance)
-    wrong = sigmas_of_chi2(found.chi2, max(int((np.diag(found.covariance) > 0).sum()), 1))
+    bit_fit = widths.wrong_bits(2 * variance)
+    wrong = sigmas_of_chi2(bit_fit.chi2, max(int((np.diag(bit_fit.covariance) > 0).sum()), 1))
     share = 1.0 if line.period == 2 else 0.5
-    rest = widths.without(found.bits, found.law).scatter()[0]
+    rest = widths.without(bit_fit.bits, bit_fit.law).scatter()[0]
     # Bits are periodic too: the lowest ones resemble a ripple of two or four codes.
     clearer = 2 * rest < variance - share * line.amplitude**2
     bits: F64 | None = None
     if wrong > SIGNIFICANT and (wrong > sure or clearer):
         start = None
-        if far and (other := widths.far_bits(found.law)):
-            found, start = other, other.bits
-            rest = widths.without(found.bits, found.law).scatter()[0]
-        found = widths.bits(2 * rest, found.law, start)
-        bits, covariance = found.bits, found.covariance
+        if far and (other := widths.far_bits(bit_fit.law)):
+            bit_fit, start = other, other.bits
+            rest = widths.without(bit_fit.bits, bit_fit.law).scatter()[0]
+        bit_fit = widths.bits(2 * rest, bit_fit.law, start)
+        bits, covariance = bit_fit.bits, bit_fit.covariance
         levelled = widths.level(np.eye(len(bits)))
     # No bit deviates by more than its own weight, although a fit to few codes may say so.
     if bits is not None and (np.abs(levelled @ bits) <= 2.0 ** np.arange(len(bits))).all():
-        values, errors, others, _ = _uneven(widths.without(bits, found.law))
+        values, errors, others, _ = _uneven(widths.without(bits, bit_fit.law))
         covariance = levelled @ covariance @ levelled.T
-        values |= {"bits": tuple(map(float, levelled @ bits)), **found.law._asdict()}
+        values |= {"bits": tuple(map(float, levelled @ bits)), **bit_fit.law._asdict()}
         spread = np.sqrt(np.diag(covariance))
         errors |= {f"bits[{n}]": float(e) for n, e in enumerate(spread) if e}
         size, ways = np.linalg.eigh(covariance)

@@ -133,9 +133,9 @@ class RollingShutter(Effect):
         columns, lines = states.turns(shot.frame, shape, shot.rows)
         cos, sin = np.cos(turn).astype(np.float32), np.sin(turn).astype(np.float32)
         later = np.stack([lines[0] * cos - lines[1] * sin, lines[1] * cos + lines[0] * sin])
-        found = []
+        signals = []
         for of_rows in (lines, later):
-            found.append(np.empty_like(light.iota))
+            signals.append(np.empty_like(light.iota))
             illuminate(
                 light.iota,
                 light.alpha_sin,
@@ -144,9 +144,9 @@ class RollingShutter(Effect):
                 states.amplitude[shot.frame],
                 columns,
                 of_rows,
-                found[-1],
+                signals[-1],
             )
-        return found[1] - found[0]
+        return signals[1] - signals[0]
 
     def undo(self, maps: FringeMaps) -> FringeMaps | None:
         """Maps corrected for the phase errors of the rows; None if frames are unknown."""
@@ -205,7 +205,7 @@ class RollingShutter(Effect):
         many = [RowSums.of(f) for f in evidence.fringes.values() if enough_frames(f)]
         if not many:
             return None
-        sets = [sums for sums in many if sums.found.exptime_s > 0]  # false if unknown (NaN)
+        sets = [sums for sums in many if sums.fringes.exptime_s > 0]  # false if unknown (NaN)
         settled = find_settling(many)
         which = "from the previous" if settled.way < 0 else "to the next"
         law = "phase error of the rows in proportion to the phase step, with any profile"
@@ -231,10 +231,10 @@ class RollingShutter(Effect):
         """From light of two frames in the exposure of a row."""
         sums = [RowRamp.of(sets, way) for way in (1, -1)]
         following, last = (s.slope / s.error for s in sums)
-        ramp, found = sums[int(last > max(following, 4.0))], sets[0].found
-        per_row = found.exptime_s * 1e6
-        period = float(np.median(np.diff(found.time_s)))
-        late = max(period - found.exptime_s, 0.0) * 1e6 if ramp.way < 0 else 0.0
+        ramp, fringes = sums[int(last > max(following, 4.0))], sets[0].fringes
+        per_row = fringes.exptime_s * 1e6
+        period = float(np.median(np.diff(fringes.time_s)))
+        late = max(period - fringes.exptime_s, 0.0) * 1e6 if ramp.way < 0 else 0.0
         line = max(ramp.slope, 0.0) * per_row
         error = float(np.hypot(ramp.error * per_row, _MODEL * line))
         return Estimate(

@@ -83,8 +83,8 @@ class RowNoise(Effect):
         rng = shot.recording.pixel_rng(self.name, shot.frame)
         rows, columns = self.offsets(shot.bench.detector.shape, rng)
         gain = shot.bench.detector.gain_e_per_adu
-        own = rows[slice(*shot.rows), None] / gain
-        return adu + own.astype(np.float32) + (columns / gain).astype(np.float32)
+        of_rows = rows[slice(*shot.rows), None] / gain
+        return adu + of_rows.astype(np.float32) + (columns / gain).astype(np.float32)
 
     def offsets(self, shape: tuple[int, int], rng: np.random.Generator) -> tuple[F64, F64]:
         """Offsets of one frame's rows (y,) and columns (x,), e-."""
@@ -158,9 +158,9 @@ def _fit_rows(spectra: Sequence["LineSpectrum"]) -> "tuple[LineVariances, int]":
     fits = {0: fit_lines(spectra, shapes)}
     for rows in GROUPS:
         powers = [group_power(s, rows) for s in spectra]
-        found = fit_lines(spectra, list(map(np.vstack, zip(shapes, powers, strict=True))))
-        if found.size[-1] > 0 and found.misfit < fits[0].misfit - _NEEDED:
-            fits[rows] = found
+        fit = fit_lines(spectra, list(map(np.vstack, zip(shapes, powers, strict=True))))
+        if fit.size[-1] > 0 and fit.misfit < fits[0].misfit - _NEEDED:
+            fits[rows] = fit
     best = min(fits, key=lambda rows: fits[rows].misfit)
     return fits[best], best
 
@@ -171,16 +171,16 @@ def group_power(spectrum: "LineSpectrum", rows: int) -> F64:
     return np.asarray(np.abs(np.exp(turns * np.arange(rows)[:, None]).sum(axis=0)) ** 2 / rows)
 
 
-def _of_fringes(found: FringeEvidence, across: bool) -> "LineSpectrum | None":
+def _of_fringes(fringes: FringeEvidence, across: bool) -> "LineSpectrum | None":
     """Spectrum of a set's residuals; None if its fringes run along the lines."""
-    ny, nx = found.good.shape
-    turns = (found.k[1] * ny if across else found.k[0] * nx) / (2 * np.pi)
+    ny, nx = fringes.good.shape
+    turns = (fringes.k[1] * ny if across else fringes.k[0] * nx) / (2 * np.pi)
     if abs(turns) < TURNS:
         return None
     if across:
-        spectrum = line_spectrum(_turned(found.residual), found.good.T, FREEDOM)
+        spectrum = line_spectrum(_turned(fringes.residual), fringes.good.T, FREEDOM)
     else:
-        spectrum = line_spectrum(found.residual, found.good, FREEDOM)
+        spectrum = line_spectrum(fringes.residual, fringes.good, FREEDOM)
     if spectrum is None:
         return None
     # Infinite noise: no weight.
@@ -242,13 +242,13 @@ def line_spectrum(residual: F32, good: Mask, fitted: int = 1) -> LineSpectrum | 
     if not whole.any():
         return None
     # Beside large common noise, that of the blocks is not known to be zero.
-    own = np.maximum(whole - power.mean(), _LEAST_OWN * whole)
+    excess = np.maximum(whole - power.mean(), _LEAST_OWN * whole)
     return LineSpectrum(
         lines=lines,
         power=power,
         dof=dof,
-        noise=float(own.sum()) / blocks**2,
-        pair_noise=float(np.sqrt(own @ (apart > 0) @ own)) / pairs,
+        noise=float(excess.sum()) / blocks**2,
+        pair_noise=float(np.sqrt(excess @ (apart > 0) @ excess)) / pairs,
     )
 
 

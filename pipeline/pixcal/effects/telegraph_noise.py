@@ -112,7 +112,7 @@ class TelegraphNoise(Effect):
         return noisy
 
     def readout(self, adu: F32, shot: Shot) -> F32:
-        found = adu.copy()
+        samples = adu.copy()
         detector, recording = shot.bench.detector, shot.recording
         stays = Stays(self.switching_s, self.switching_decades)
         first, last = shot.rows
@@ -129,8 +129,8 @@ class TelegraphNoise(Effect):
             step = (up - upper) * amplitudes * np.float32(self.amplitude_e)
             inside = (rows >= first) & (rows < last)
             at = rows[inside] - first, columns[inside]
-            found[at] += step[inside] / np.float32(detector.gain_e_per_adu)
-        return found
+            samples[at] += step[inside] / np.float32(detector.gain_e_per_adu)
+        return samples
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
@@ -142,48 +142,48 @@ class TelegraphNoise(Effect):
         noisy = np.zeros(evidence.good.shape, bool)
         for fringes in evidence.fringes.values():
             noisy |= evidence.good & np.isfinite(fringes.theta).all(axis=0) & ~fringes.good
-        found = find_telegraph(series, partial(_lit, evidence), np.flatnonzero(noisy))
-        if found is None:
+        telegraph = find_telegraph(series, partial(_lit, evidence), np.flatnonzero(noisy))
+        if telegraph is None:
             return None
-        return _estimate(cls, found, evidence)
+        return _estimate(cls, telegraph, evidence)
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
         return significance(_series(evidence))
 
 
-def _estimate(cls: type[TelegraphNoise], found: Telegraph, evidence: Evidence) -> Estimate:
+def _estimate(cls: type[TelegraphNoise], telegraph: Telegraph, evidence: Evidence) -> Estimate:
     by_law = cls(
-        found.share,
-        found.amplitude,
-        found.stays.mean_s,
-        found.shape,
-        found.stays.decades,
-        found.stays.upper,
+        telegraph.share,
+        telegraph.amplitude,
+        telegraph.stays.mean_s,
+        telegraph.shape,
+        telegraph.stays.decades,
+        telegraph.stays.upper,
     )
-    effect, own = by_law, found.own
-    if own is not None and len(own.pixel):
+    effect, pixels = by_law, telegraph.own
+    if pixels is not None and len(pixels.pixel):
         (y, x), (ny, nx) = evidence.origin, evidence.good.shape
-        rows, columns = np.divmod(own.pixel, nx)
+        rows, columns = np.divmod(pixels.pixel, nx)
         measured = MeasuredPixels(
             (y, y + ny),
             (x, x + nx),
-            found.smallest_jump / found.amplitude,
+            telegraph.smallest_jump / telegraph.amplitude,
             tuple((y + rows).tolist()),
             tuple((x + columns).tolist()),
-            tuple((own.amplitude / found.amplitude).tolist()),
-            tuple(own.upper.tolist()),
+            tuple((pixels.amplitude / telegraph.amplitude).tolist()),
+            tuple(pixels.upper.tolist()),
         )
         effect = replace(by_law, measured=(measured,))
     return Estimate(
         effect,
         {
-            "share": found.share_error,
-            "amplitude_e": found.amplitude_error,
-            "switching_s": found.switching_error,
+            "share": telegraph.share_error,
+            "amplitude_e": telegraph.amplitude_error,
+            "switching_s": telegraph.switching_error,
         }
-        | ({"amplitude_shape": found.shape_error} if found.shape_error else {}),
-        found.signs.significance,
+        | ({"amplitude_shape": telegraph.shape_error} if telegraph.shape_error else {}),
+        telegraph.signs.significance,
         "noisy pixels have two levels or stay in one from frame to frame",
         law="" if effect == by_law else _LAW,
         by_law=None if effect == by_law else by_law,
@@ -244,13 +244,13 @@ def _states(seed: int, frames: int, kept: bytes, upper: bytes) -> U8:
 
 def _series(evidence: Evidence) -> tuple[Series, ...]:
     dark = [s for s in evidence.stacks if s.kind != "flat" and len(s.adu) >= _MIN_FRAMES]
-    found = tuple(s for stack in dark if (s := _of_stack(stack, evidence)) is not None)
+    unlit = tuple(s for stack in dark if (s := _of_stack(stack, evidence)) is not None)
     if sum(len(s.adu) for s in dark) >= _ENOUGH or not evidence.fringes:
-        return found
+        return unlit
     # A few frames without light show small jumps, hundreds of fringes large and rare ones.
     fringes = evidence.fringes.values()
     lit = tuple(_of_fringes(f, evidence) for f in fringes if len(f.g) >= _ENOUGH)
-    return max(lit, found, key=lambda series: significance(series) or -np.inf)
+    return max(lit, unlit, key=lambda series: significance(series) or -np.inf)
 
 
 def _of_stack(stack: Stack, evidence: Evidence) -> Series | None:
@@ -282,22 +282,22 @@ def _lit(evidence: Evidence, pixels: Indices) -> list[PixelSeries]:
     """Residual charge of given pixels in every fringe set."""
     chosen = np.zeros(evidence.good.size, bool)
     chosen[pixels] = True
-    found = []
+    series = []
     for fringes in evidence.fringes.values():
         freedom, left = _left_over(fringes, chosen.reshape(evidence.good.shape), LIT_HARMONICS)
         period = _period(fringes.time_s) if len(fringes.time_s) > 1 else 0.0
-        own, fitted = np.flatnonzero(freedom.good), freedom.of_time.T.astype(float)
+        used, fitted = np.flatnonzero(freedom.good), freedom.of_time.T.astype(float)
         weight = freedom.weight.astype(float)
-        found.append(PixelSeries(np.nan_to_num(left), weight, fringes.frame, period, own, fitted))
-    return found
+        series.append(PixelSeries(np.nan_to_num(left), weight, fringes.frame, period, used, fitted))
+    return series
 
 
 def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Series:
     # Include pixels that the fit excluded for their noise, as these may be telegraph noise.
     freedom, left = _left_over(fringes, evidence.good, HARMONICS)
     sigma = float(freedom.weight[freedom.weight > 0].mean() ** -0.5)
-    own, noise = np.flatnonzero(freedom.good), left * np.sqrt(freedom.weight)
-    return Series(noise, fringes.frame, own, sigma, _period(fringes.time_s))
+    used, noise = np.flatnonzero(freedom.good), left * np.sqrt(freedom.weight)
+    return Series(noise, fringes.frame, used, sigma, _period(fringes.time_s))
 
 
 def _left_over(fringes: FringeEvidence, pixels: Mask, harmonics: int) -> tuple[Freedom, F64]:

@@ -133,18 +133,18 @@ def _hops(
     excess = float(weight @ (size - hop) ** 2) / max(len(jumps) - 1, 1)
     own_error = float(np.sqrt(max(excess, 1.0) / weight.sum()))
     # The posterior of a rate, without prior: few jumps constrain it poorly.
-    found = Hopping(hop, own_error, rate, float(np.sqrt(len(jumps) + 1)) / seconds)
+    hopping = Hopping(hop, own_error, rate, float(np.sqrt(len(jumps) + 1)) / seconds)
     colours, bases = [colour_of(s) for s in motion.raw], [colour_of(s) for s in motion.series]
     times = [s.time_s for s in motion.raw]
     slopes = [float(np.polyfit(t - t[0], b, 1)[0]) for t, b in zip(times, bases, strict=True)]
     levels = find_hopping(colours, times, slopes, hop, rate)
     alike = 0.5 < levels.size / hop < 2
     if alike and all(n < LEVEL * scatter_of(c) for n, c in zip(levels.noise, colours, strict=True)):
-        found = levels
+        hopping = levels
     if walks:
-        found = replace(found, size=hop, error=own_error, ramp_error=np.inf)
-    values = {"hop": found.size, "hops_per_h": found.rate * HOUR_S}
-    errors = {"hop": found.error, "hops_per_h": found.rate_error * HOUR_S}
-    if np.isfinite(found.ramp_error):
-        values["ramp"], errors["ramp"] = found.ramp * HOUR_S, float(found.ramp_error * HOUR_S)
+        hopping = replace(hopping, size=hop, error=own_error, ramp_error=np.inf)
+    values = {"hop": hopping.size, "hops_per_h": hopping.rate * HOUR_S}
+    errors = {"hop": hopping.error, "hops_per_h": hopping.rate_error * HOUR_S}
+    if np.isfinite(hopping.ramp_error):
+        values["ramp"], errors["ramp"] = hopping.ramp * HOUR_S, float(hopping.ramp_error * HOUR_S)
     return values, errors

@@ -66,26 +66,26 @@ class Star:
         """
         # Excluded pixels may have any value.
         data, offsets = np.where(good, data, 0.0), np.where(good[:, None], offsets, 0.0)
-        found = np.full((len(data), 4), np.nan)
+        fitted = np.full((len(data), 4), np.nan)
         theta = np.tile([0.0, 0.0, self.electrons, self.background], (len(data), 1))
         left = np.arange(len(data))
         for _ in range(MAX_STEPS):
-            own = theta[left]
-            jacobian, weight, mean, _ = self._linear(own, offsets[left])
+            stars = theta[left]
+            jacobian, weight, mean, _ = self._linear(stars, offsets[left])
             slopes = jacobian.reshape(len(left), 4, -1)
             weighted = slopes * (weight * good[left]).reshape(len(left), 1, -1)
             rest = (data[left] - mean).reshape(len(left), -1, 1)
             step, regular = _solved(weighted @ slopes.swapaxes(1, 2), (weighted @ rest)[:, :, 0])
             length = np.hypot(step[:, 0], step[:, 1])
             # Steps of at most half a pixel, beyond which the PSF is not linear.
-            own = own + np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None] * step
-            inside = regular & (np.hypot(own[:, 0], own[:, 1]) < self.side / 2)
+            stars = stars + np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None] * step
+            inside = regular & (np.hypot(stars[:, 0], stars[:, 1]) < self.side / 2)
             done = inside & (length < PRECISION)
-            theta[left], found[left[done]] = own, own[done]
+            theta[left], fitted[left[done]] = stars, stars[done]
             left = left[inside & ~done]
             if not len(left):
                 break
-        return found
+        return fitted
 
     def information(self, place: F64) -> F64:
         """Fisher information of a, b, N and B: (4, 4)."""

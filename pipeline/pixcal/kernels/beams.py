@@ -117,8 +117,8 @@ class Light:
         return replace(self, incoherent=self.incoherent + more)
 
     def _field(self, fibre: str, *, crossed: bool = True) -> C128:
-        own = [b.field for b in self.beams if b.fibre == fibre and (crossed or not b.crossed)]
-        return np.asarray(sum(own)) if own else np.zeros((1, 1), complex)
+        fields = [b.field for b in self.beams if b.fibre == fibre and (crossed or not b.crossed)]
+        return np.asarray(sum(fields)) if fields else np.zeros((1, 1), complex)
 
 
 def with_margin(light: LightMaps, margin: int) -> LightMaps:

@@ -20,8 +20,8 @@ def left_behind(charge: F32, share: F32, begins: F32, weights: F32, normal: F32)
         mean += weight * (part if n == 0 else np.maximum(part, 0))
     mean *= share
     scatter = np.sqrt(np.maximum(mean * (1 - share), 0))
-    found: F32 = np.clip(mean + scatter * normal, 0, np.maximum(charge, 0))
-    return found
+    left: F32 = np.clip(mean + scatter * normal, 0, np.maximum(charge, 0))
+    return left
 
 
 def fill_traps(taken: F32, keep: float, most: float) -> tuple[F32, F32]:
@@ -52,8 +52,8 @@ def without_lag(frames: F32, share: float, keep: float) -> F32:
 
     In the order of time without gaps; the first one after darkness.
     """
-    found, held = np.empty_like(frames), np.zeros_like(frames[0])
+    corrected, held = np.empty_like(frames), np.zeros_like(frames[0])
     for n, frame in enumerate(frames):
-        found[n] = (frame - np.float32(1 - keep) * held) / np.float32(1 - share)
-        held = np.float32(keep) * held + np.float32(share) * found[n]
-    return found
+        corrected[n] = (frame - np.float32(1 - keep) * held) / np.float32(1 - share)
+        held = np.float32(keep) * held + np.float32(share) * corrected[n]
+    return corrected

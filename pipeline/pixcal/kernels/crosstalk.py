@@ -108,10 +108,10 @@ def _steps(
     for c in couplings:
         if c.share != 0:
             alike.setdefault((c.dy, c.dx, c.per_ke), []).append(c)
-    found: list[_Step] = []
-    for (dy, dx, per_ke), own in alike.items():
-        parts = [(*c.places(shape, first), kind.type(c.share)) for c in own]
-        if len(own) > 1 and shape[0] * shape[1] <= MAP_PIXELS:
+    steps: list[_Step] = []
+    for (dy, dx, per_ke), group in alike.items():
+        parts = [(*c.places(shape, first), kind.type(c.share)) for c in group]
+        if len(group) > 1 and shape[0] * shape[1] <= MAP_PIXELS:
             share, times = np.zeros(shape, kind), np.zeros(shape, int)
             for here, _, value in parts:
                 share[here] = value
@@ -120,8 +120,8 @@ def _steps(
             if times.max(initial=0) == 1:
                 here, there = Coupling(dy, dx, 0.0).places(shape, first)
                 parts = [(here, there, share[here])]
-        found.append(_Step(tuple(parts), per_ke))
-    return tuple(found)
+        steps.append(_Step(tuple(parts), per_ke))
+    return tuple(steps)
 
 
 def couple(
@@ -146,10 +146,10 @@ def couple(
 
 def _move(out: NDArray[Any], step: _Step, moved: Sequence[NDArray[Any]]) -> None:
     # All losses first, then all gains: the last bits do not depend on how sources are grouped.
-    for (here, _, _), own in zip(step.parts, moved, strict=True):
-        out[(..., *here)] -= own
-    for (_, there, _), own in zip(step.parts, moved, strict=True):
-        out[(..., *there)] += own
+    for (here, _, _), charge in zip(step.parts, moved, strict=True):
+        out[(..., *here)] -= charge
+    for (_, there, _), charge in zip(step.parts, moved, strict=True):
+        out[(..., *there)] += charge
 
 
 def couple_fringes(
@@ -182,14 +182,14 @@ def uncouple(
     steps: int = STEPS,
 ) -> NDArray[Any]:
     """Signal collected, from the signal that is read: the inverse of `couple`."""
-    return _inverse(signal, lambda found: couple(found, couplings, first), steps)
+    return _inverse(signal, lambda trial: couple(trial, couplings, first), steps)
 
 
 def uncouple_fringes(
     theta: F64, couplings: Sequence[Coupling], first: tuple[int, int] = (0, 0)
 ) -> F64:
     """The inverse of `couple_fringes`."""
-    return _inverse(theta, lambda found: couple_fringes(found, couplings, first))
+    return _inverse(theta, lambda trial: couple_fringes(trial, couplings, first))
 
 
 def _inverse(
@@ -198,20 +198,20 @@ def _inverse(
     """Inverse by fixed-point iteration: the remainder is added back."""
     # Each step shrinks the rest by the shares that leave a pixel: for a tenth, some 15 steps to the
     # last digit.
-    found = data.copy()
+    inverse = data.copy()
     size = float(np.max(np.abs(data), initial=0.0))
     before = np.inf
     for _ in range(steps):
-        rest = data - forward(found)
+        rest = data - forward(inverse)
         left = float(np.max(np.abs(rest), initial=0.0))
         # A trial of couplings that grow steeply with the signal may have no inverse.
         if not left <= 2 * before:
             break
-        found += rest
+        inverse += rest
         if left <= CONVERGED * size:
             break
         before = left
-    return found
+    return inverse
 
 
 def outflow(

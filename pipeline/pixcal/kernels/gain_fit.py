@@ -110,11 +110,11 @@ def fit_gain(
     given = sums, read_variance, level_error, uneven, straight
 
     def up_to(highest: float) -> GainFit | None:
-        found = _fit_range(*given, highest, without_dark)
-        if found and found.without_dark and not found.chance > _OFF_CURVE:
+        fit = _fit_range(*given, highest, without_dark)
+        if fit and fit.without_dark and not fit.chance > _OFF_CURVE:
             # Flats that lie on no curve cannot show which points belong to it.
-            found = _fit_range(*given, highest, bool(without_dark))
-        return found and replace(found, error=math.hypot(found.error, common * found.gain))
+            fit = _fit_range(*given, highest, bool(without_dark))
+        return fit and replace(fit, error=math.hypot(fit.error, common * fit.gain))
 
     whole = up_to(highest)
     if straight or (whole is not None and whole.chance > _OFF_CURVE):
@@ -123,10 +123,10 @@ def fit_gain(
     level = level[(level > 0) & (level <= highest)]
     best, top = whole, float(level.max(initial=0.0)) / _SHORTER
     while np.count_nonzero(level <= top) >= _FEWEST:
-        found = up_to(top)
-        better = found is not None and (best is None or found.error < best.error)
-        if found is not None and better and found.chance > _OFF_CURVE:
-            best = replace(found, step=True)
+        fit = up_to(top)
+        better = fit is not None and (best is None or fit.error < best.error)
+        if fit is not None and better and fit.chance > _OFF_CURVE:
+            best = replace(fit, step=True)
         top /= _SHORTER
     return best
 
@@ -200,21 +200,21 @@ def _jumps(narrow: float, highest: float, apart: float, steps: int) -> tuple[F64
     errors is wide.
     """
     wide = np.geomspace(narrow, max(highest, 2 * narrow), _WIDTHS + 1)[1:]
-    found = np.full((1 + steps, _WIDTHS, 1 + steps), _NONE * narrow)
-    found[..., 0] = narrow
-    found[range(1 + steps), :, range(1 + steps)] = wide
+    variances = np.full((1 + steps, _WIDTHS, 1 + steps), _NONE * narrow)
+    variances[..., 0] = narrow
+    variances[range(1 + steps), :, range(1 + steps)] = wide
     usual = np.where(np.arange(1 + steps) > 0, _NONE, 1.0) * narrow
     chances = np.append(1 - apart, np.full((1 + steps) * _WIDTHS, apart / _WIDTHS / (1 + steps)))
-    return np.vstack([usual, found.reshape(-1, 1 + steps)])[chances > 0], chances[chances > 0]
+    return np.vstack([usual, variances.reshape(-1, 1 + steps)])[chances > 0], chances[chances > 0]
 
 
 def _information(jumps: F64, sizes: F64, terms: int) -> F64:
     """Prior information (n, size, coefficient): ``jumps`` (n, 1 + steps), sizes of the terms."""
-    found = np.zeros((len(jumps), len(sizes), terms + 1 + jumps.shape[1]))
-    found[:, :, 0] = jumps[:, None, 0] ** -2
-    found[:, :, 2 : terms + 2] = sizes[:, None] ** -2
-    found[:, :, terms + 2 :] = jumps[:, None, 1:] ** -2
-    return found
+    information = np.zeros((len(jumps), len(sizes), terms + 1 + jumps.shape[1]))
+    information[:, :, 0] = jumps[:, None, 0] ** -2
+    information[:, :, 2 : terms + 2] = sizes[:, None] ** -2
+    information[:, :, terms + 2 :] = jumps[:, None, 1:] ** -2
+    return information
 
 
 def _posterior(normal: F64, right: F64, information: F64) -> tuple[F64, F64, F64]:

@@ -19,10 +19,10 @@ def without_line_means(noise: F32, used: Mask) -> F32:
     stay uncorrelated, to second order in 1 / n. ``used``: (y, x) pixels of the means.
     """
     weight = used.astype(np.float32)
-    found = noise * weight
+    residual = noise * weight
     for axis, count in zip((-1, -2), _counts(used.tobytes(), used.shape), strict=True):
-        found = (found - _half_near(found, axis) / count) * weight
-    return np.asarray(found, np.float32)
+        residual = (residual - _half_near(residual, axis) / count) * weight
+    return np.asarray(residual, np.float32)
 
 
 @lru_cache(maxsize=8)  # stacks of frames have the same pixels

@@ -53,8 +53,8 @@ class Psf:
         ``x``, ``y``: centre of the pixel minus the star (px); beyond `reach`, values at the edge.
         """
         xs, ys = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
-        found = _shares(self.coefficients, self.step, xs.ravel(), ys.ravel())
-        return np.asarray(found.reshape(3, *xs.shape))
+        shares = _shares(self.coefficients, self.step, xs.ravel(), ys.ravel())
+        return np.asarray(shares.reshape(3, *xs.shape))
 
 
 def diffraction_psf(sampling: float, obscuration: float, half: int) -> Psf:

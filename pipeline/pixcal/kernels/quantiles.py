@@ -30,10 +30,10 @@ def quantiles_of_parts(
     within = {int(digit): np.zeros(1 << _DIGIT, np.int64) for digit in np.unique(first)}
     for part in parts():
         bits = part.view(np.uint32)
-        for digit, found in within.items():
+        for digit, tally in within.items():
             of_digit = bits[bits >> _DIGIT == digit] & ((1 << _DIGIT) - 1)
-            found += np.bincount(of_digit, minlength=len(found))
-    upto = {digit: np.cumsum(found) for digit, found in within.items()}
+            tally += np.bincount(of_digit, minlength=len(tally))
+    upto = {digit: np.cumsum(tally) for digit, tally in within.items()}
     values = np.empty(ranks.shape, np.float32)
     for place in np.ndindex(ranks.shape):
         digit = int(first[place])

@@ -55,8 +55,8 @@ def walk_normals(seed: int, effect: str, first: int, *last: int) -> Callable[[in
     name = crc32(effect.encode())
 
     def normal(level: int, place: int) -> float:
-        own = generator(seed, Stream.EFFECT, name, first + level, place, *last)
-        return float(own.standard_normal())
+        rng = generator(seed, Stream.EFFECT, name, first + level, place, *last)
+        return float(rng.standard_normal())
 
     return normal
 
@@ -210,7 +210,7 @@ def convert(adu: F32, step: int, lowest: int, top: int, out: U16) -> None:
 
 def turns(angles: NDArray[Any]) -> F32:
     """cos and sin of angles (rad), shape (2, *angles.shape)."""
-    found = np.empty((2, *angles.shape), np.float32)
-    np.cos(angles, out=found[0])
-    np.sin(angles, out=found[1])
-    return found
+    cos_sin = np.empty((2, *angles.shape), np.float32)
+    np.cos(angles, out=cos_sin[0])
+    np.sin(angles, out=cos_sin[1])
+    return cos_sin

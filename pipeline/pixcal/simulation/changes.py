@@ -189,7 +189,7 @@ class Changes:
         names: dict[str | int, list[str]] = {}
         for of, name in keys:
             names.setdefault(of, []).append(name)
-        found: Draw = {}
+        draw: Draw = {}
         e, stacks = self._evidence, range(len(self._evidence.stacks))
         bias = rate = relative = np.zeros(e.good.shape)
         maps = any("maps" in own for own in names.values())
@@ -197,7 +197,7 @@ class Changes:
             samples = self._replica.simulated_samples(of, [model], seed=seed) - self._simulated(of)
             look, stack = self._looks.get(of), e.stacks[of]
             if of in names and isinstance(look, StackDeviations):
-                found |= _named(of, look.change(samples, bias, names[of]))
+                draw |= _named(of, look.change(samples, bias, names[of]))
             mean, seconds = samples.mean(axis=0).astype(float), np.nan_to_num(stack.exptime_s)
             if stack.kind == "bias":
                 bias = mean
@@ -212,10 +212,10 @@ class Changes:
             assert isinstance(look, SetDeviations)
             samples = self._replica.simulated_samples(of, [model], seed=seed) - self._simulated(of)
             samples *= self._per_adu
-            seconds = np.nan_to_num(look.found.exptime_s)
+            seconds = np.nan_to_num(look.fringes.exptime_s)
             constant = (bias * e.gain + rate * seconds) / self._flat
-            found |= _named(of, look.change(samples, constant, relative, names[of]))
-        return found
+            draw |= _named(of, look.change(samples, constant, relative, names[of]))
+        return draw
 
     def _second_moments(self, model: ForwardModel, seed: int, keys: Sequence[Key]) -> Draw:
         """Contribution of a random change to quadratic deviations."""
@@ -228,14 +228,14 @@ class Changes:
 
     def _mixed(self, model: ForwardModel, seed: int, keys: Iterable[Key]) -> Draw:
         """Change of quadratic deviations by the action of the model on the noise of samples."""
-        found: Draw = {}
+        draw: Draw = {}
         for of, name in keys:
             noise = self._replica.simulated_samples(of, noise=True, seed=seed, most=MIXED)
             noise -= self._simulated(of)[: len(noise)]
             other = self._replica.simulated_samples(of, [model], noise=True, seed=seed, most=MIXED)
             other -= self._replica.simulated_samples(of, [model], seed=seed, most=MIXED)
-            found[of, name] = self._looks[of].pairs_between(noise, other, self._per_adu)
-        return found
+            draw[of, name] = self._looks[of].pairs_between(noise, other, self._per_adu)
+        return draw
 
 
 def _named(of: str | int, change: Change) -> Draw:

@@ -53,11 +53,11 @@ class Deviation:
 def weighed(maps: F64) -> Deviation:
     """Maps less smooth surfaces, with weights from differences of neighbours; NaN: weight 0."""
     flat, weight = without_smooth(maps), np.zeros(maps.shape)
-    for own, out in zip(maps, weight, strict=True):
-        steps = np.diff(own, axis=1)
+    for values, out in zip(maps, weight, strict=True):
+        steps = np.diff(values, axis=1)
         if np.isfinite(steps).any():
             spread = robust_sigma(steps) / np.sqrt(2)
-            out[np.isfinite(own)] = 1 / max(spread**2, 1e-30)
+            out[np.isfinite(values)] = 1 / max(spread**2, 1e-30)
     return Deviation(flat, weight)
 
 
@@ -101,8 +101,8 @@ class _Deviations:
 
     def measured(self, name: str) -> Deviation:
         """A deviation of the data."""
-        found: Deviation = getattr(self, name)
-        return found
+        deviation: Deviation = getattr(self, name)
+        return deviation
 
     residual: Any
     _parameters: Any  # (s, t) of the frames
@@ -158,23 +158,23 @@ class _Deviations:
 class SetDeviations(_Deviations):
     """Deviations of a fringe set from the nominal bench."""
 
-    def __init__(self, evidence: Evidence, found: FringeEvidence) -> None:
-        self.found, self._evidence, self.good = found, evidence, found.good
-        turns = np.arange(1, HARMONICS + 1)[:, None] * found.phi
-        terms = np.concatenate([np.ones((1, len(found.phi))), np.cos(turns), np.sin(turns)])
+    def __init__(self, evidence: Evidence, fringes: FringeEvidence) -> None:
+        self.fringes, self._evidence, self.good = fringes, evidence, fringes.good
+        turns = np.arange(1, HARMONICS + 1)[:, None] * fringes.phi
+        terms = np.concatenate([np.ones((1, len(fringes.phi))), np.cos(turns), np.sin(turns)])
         self._of_phase = np.linalg.svd(terms, full_matrices=False)[2]
-        self._lost = len(self._of_phase) / len(found.phi)
+        self._lost = len(self._of_phase) / len(fringes.phi)
 
     @cached_property
     def freedom(self) -> Freedom:
         """Degrees of freedom of the fit."""
-        return Freedom(self.found)
+        return Freedom(self.fringes)
 
     @cached_property
     def residual(self) -> Deviation:
         """Residuals (t, n) of the fit in good pixels, e-."""
         freedom = self.freedom
-        rest = freedom.left_over(freedom.of_good(self.found.residual))
+        rest = freedom.left_over(freedom.of_good(self.fringes.residual))
         calm = rest**2 * freedom.weight < OUTLIER_SIGMA**2
         weight = np.where(calm, freedom.weight, np.float32(0))
         return Deviation(rest, weight)
@@ -182,7 +182,7 @@ class SetDeviations(_Deviations):
     @cached_property
     def maps(self) -> Deviation:
         """Maps (3, y, x) of the pixels, of `MAPS`."""
-        maps = FringeSetData(self.found, self._evidence).maps
+        maps = FringeSetData(self.fringes, self._evidence).maps
         return weighed(np.stack([maps[name] for name in MAPS]))
 
     @cached_property
@@ -194,15 +194,15 @@ class SetDeviations(_Deviations):
 
     @cached_property
     def _parameters(self) -> F64:
-        return self._series(self.found.free)
+        return self._series(self.fringes.free)
 
     @cached_property
     def _frame_noise(self) -> F64:
         """Noise of the series (4, t), from the noise of the samples."""
-        found, nothing = self.found, np.zeros(len(self.found.g))
-        b, a_cos, a_sin = found.g.T
+        fringes, nothing = self.fringes, np.zeros(len(self.fringes.g))
+        b, a_cos, a_sin = fringes.g.T
         size = a_cos**2 + a_sin**2
-        kx, ky = (np.full(len(b), k) for k in found.k)
+        kx, ky = (np.full(len(b), k) for k in fringes.k)
         slopes = np.stack(
             [
                 [1 / b, nothing, nothing, nothing, nothing],
@@ -211,14 +211,14 @@ class SetDeviations(_Deviations):
                 [nothing, nothing, nothing, -ky, kx],
             ]
         )
-        variance = np.einsum("sit,tij,sjt->st", slopes, found.free_covariance, slopes)
+        variance = np.einsum("sit,tij,sjt->st", slopes, fringes.free_covariance, slopes)
         return np.asarray(np.sqrt(np.maximum(variance, 1e-30)))
 
     def _series(self, free: F64) -> F64:
         """Intensity and contrast (relative), fringe vector along and across it, (4, t)."""
         b, a_cos, a_sin, dkx, dky = free.T
         contrast = np.hypot(a_cos, a_sin) / b
-        kx, ky = self.found.k
+        kx, ky = self.fringes.k
         series = np.stack(
             [b / b.mean(), contrast / contrast.mean(), kx * dkx + ky * dky, kx * dky - ky * dkx]
         )
@@ -232,31 +232,31 @@ class SetDeviations(_Deviations):
         ``samples``: (t, y, x) reduced, e-. ``constant, relative``: (y, x) simultaneous change of
         bias and darks, subtracted from every frame, e-; and relative change of the flats.
         """
-        found, good = self.found, self.good
+        fringes, good = self.fringes, self.good
         changed = np.take(samples.reshape(len(samples), -1), np.flatnonzero(good), axis=1)
-        share = np.linalg.pinv(found.g).astype(np.float32) @ changed
+        share = np.linalg.pinv(fringes.g).astype(np.float32) @ changed
         change: Change = {}
         if "residual" in names:
             change["residual"] = self.freedom.left_over(changed)
         if "frames" in names:
             # Residual change after the fit of the pixels.
-            beside = found.model.copy()
-            beside[:, good] += changed - found.g.astype(np.float32) @ share
-            (free, _), *_ = found.free_of(beside)
-            own = np.hstack([found.g, found.dk])
-            change["frames"] = self._series(free) - self._series(own)
+            beside = fringes.model.copy()
+            beside[:, good] += changed - fringes.g.astype(np.float32) @ share
+            (free, _), *_ = fringes.free_of(beside)
+            before = np.hstack([fringes.g, fringes.dk])
+            change["frames"] = self._series(free) - self._series(before)
         if "maps" in names:
-            theta = share.astype(float) - found.theta[:, good] * relative[good]
-            theta[0] -= constant[good] / found.g[:, 0].mean()
+            theta = share.astype(float) - fringes.theta[:, good] * relative[good]
+            theta[0] -= constant[good] / fringes.g[:, 0].mean()
             change["maps"] = self._map_change(theta)
         return change
 
     def _map_change(self, change: F64) -> F64:
         good = self.good
-        (iota, s, c), (d_iota, d_s, d_c) = self.found.theta[:, good], change
+        (iota, s, c), (d_iota, d_s, d_c) = self.fringes.theta[:, good], change
         alpha2 = np.maximum(s**2 + c**2, 1e-30)
         light, amplitude = d_iota / iota, (s * d_s + c * d_c) / alpha2
-        turn = (c * d_s - s * d_c) / alpha2 / float(np.hypot(*self.found.k))
+        turn = (c * d_s - s * d_c) / alpha2 / float(np.hypot(*self.fringes.k))
         of_map = {"offset": turn, "contrast": amplitude - light, "light": light}
         out = np.full((len(MAPS), *good.shape), np.nan)
         out[:, good] = [of_map[name] for name in MAPS]

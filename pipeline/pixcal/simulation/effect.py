@@ -198,18 +198,18 @@ class Effect(ForwardModel):
             if series is None:
                 return None
             return Estimate(series.model, series.errors, series.significance, series.why)
-        found = score(cls, evidence)
-        if found is None:
+        scored = score(cls, evidence)
+        if scored is None:
             return None
-        ask = partial(score_again, found.model, found.response, template=found.template)
-        again = Again(found.model, ask, simulates=True)
-        return Estimate(found.model, found.errors, found.significance, found.why, again=again)
+        ask = partial(score_again, scored.model, scored.response, template=scored.template)
+        again = Again(scored.model, ask, simulates=True)
+        return Estimate(scored.model, scored.errors, scored.significance, scored.why, again=again)
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
         """Significance as in `estimate`; most simulations need nothing else."""
-        found = cls.estimate(evidence)
-        return None if found is None else found.significance
+        estimate = cls.estimate(evidence)
+        return None if estimate is None else estimate.significance
 
     def read_variance(self, detector: SimulatedDetector) -> float:
         """Variance (e-²) that it adds to the samples, about the mean of the frame."""
@@ -315,19 +315,19 @@ class Again:
         return self.effect.quick
 
 
-def _of_light(found: LightFit, degree: int) -> Estimate:
+def _of_light(fit: LightFit, degree: int) -> Estimate:
     """An estimate from the maps; fits of other maps start from it."""
-    here = replace(found.start, model=found.model)
+    here = replace(fit.start, model=fit.model)
     return Estimate(
-        found.model,
-        found.errors,
-        found.significance,
-        found.why,
-        law=found.start.law,
-        again=Again(found.model, partial(_of_light_again, here, degree)),
+        fit.model,
+        fit.errors,
+        fit.significance,
+        fit.why,
+        law=fit.start.law,
+        again=Again(fit.model, partial(_of_light_again, here, degree)),
     )
 
 
 def _of_light_again(start: LightStart, degree: int, evidence: Evidence) -> float | None:
-    found = fit_light([start], evidence, degree)
-    return None if found is None else found.significance
+    fit = fit_light([start], evidence, degree)
+    return None if fit is None else fit.significance

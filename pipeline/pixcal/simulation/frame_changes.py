@@ -45,18 +45,18 @@ class AffectedSeries:
 
     def changes(self, model: ForwardModel, draws: int) -> F64:
         """Change of the series by each draw (r, t, 2)."""
-        found = np.zeros((draws, len(self.series), 2))
+        changes = np.zeros((draws, len(self.series), 2))
         if self.recording is None:
-            return found
+            return changes
         bench, count = self.recording.bench, self.recording.count
         one, nothing = np.ones(count), np.zeros(count)
         still = FrameStates(nothing, one, one, nothing, nothing)
-        for seed, out in enumerate(found, start=1):
+        for seed, out in enumerate(changes, start=1):
             s = model.states(still, replace(self.recording, bench=replace(bench, seed=seed)))
             contrast = np.log(np.maximum(s.amplitude, 1e-9) / np.maximum(s.level, 1e-9))
             every = np.stack([s.level - 1, contrast, s.dkx, s.dky], axis=1)
             out[:] = every[np.ix_(self.frames, self.channels)]
-        return found
+        return changes
 
     @lru_cache(maxsize=KEPT)  # noqa: B019
     def part(self, model: ForwardModel) -> F64:
@@ -109,13 +109,13 @@ def strengths_of(
     every: Sequence[AffectedSeries], start: ForwardModel, leave: Sequence[str]
 ) -> list[Strength]:
     """Strengths of a model that change some series."""
-    start, found = _off_resonance(start), []
+    start, strengths = _off_resonance(start), []
     for key, value in numbers(start).items():
         field = field_of(key)
         if field in start.strengths and field not in leave:
-            own = with_numbers(start.scaled(0.0), {key: value or UNIT})
-            found += _strength(every, own, key, value or UNIT)
-    return found
+            model = with_numbers(start.scaled(0.0), {key: value or UNIT})
+            strengths += _strength(every, model, key, value or UNIT)
+    return strengths
 
 
 def _off_resonance(start: ForwardModel) -> ForwardModel:
@@ -125,16 +125,16 @@ def _off_resonance(start: ForwardModel) -> ForwardModel:
 
 
 def _strength(
-    every: Sequence[AffectedSeries], own: ForwardModel, key: str, unit: float
+    every: Sequence[AffectedSeries], model: ForwardModel, key: str, unit: float
 ) -> list[Strength]:
-    drawn = [w.changes(own, 2) for w in every]
+    drawn = [w.changes(model, 2) for w in every]
     if not any(v.any() for v in drawn):
         return []
     shape = None
-    for other in fields(own):
-        value = getattr(own, other.name)
-        if other.name not in own.strengths and isinstance(value, float):
-            changed = replace(own, **{other.name: OTHER * value or 1.0})
+    for other in fields(model):
+        value = getattr(model, other.name)
+        if other.name not in model.strengths and isinstance(value, float):
+            changed = replace(model, **{other.name: OTHER * value or 1.0})
             both = zip(drawn, every, strict=True)
             if any(not np.array_equal(v, w.changes(changed, 2)) for v, w in both):
                 shape = other.name
@@ -142,11 +142,11 @@ def _strength(
     steady, power = all(np.array_equal(*v) for v in drawn), 1.0
     if not steady:
         # With the same random numbers, two draws suffice.
-        half = with_numbers(own, {key: unit / 2})
+        half = with_numbers(model, {key: unit / 2})
         less = [w.changes(half, 2) for w in every]
         whole, part = (sum(float(np.diff(v, axis=0).var()) for v in d) for d in (drawn, less))
         power = float(np.log2(whole / part))
-    return [Strength(own, key, unit, shape, steady, power)]
+    return [Strength(model, key, unit, shape, steady, power)]
 
 
 class FrameChanges:

@@ -72,10 +72,10 @@ class FrameBasis:
         def whole(values: Sequence[F64], steady: bool) -> F64:
             """All series as a vector, in units of the noise."""
             if steady:
-                found = [(v - v.mean(axis=0)) @ r for v, r in zip(values, roots, strict=True)]
+                scaled = [(v - v.mean(axis=0)) @ r for v, r in zip(values, roots, strict=True)]
             else:
-                found = [r @ v @ r for v, r in zip(values, roots, strict=True)]
-            return np.concatenate([v.ravel() for v in found])
+                scaled = [r @ v @ r for v, r in zip(values, roots, strict=True)]
+            return np.concatenate([v.ravel() for v in scaled])
 
         def is_own(values: Sequence[F64], steady: bool) -> bool:
             vector = rest = whole(values, steady)
@@ -139,9 +139,9 @@ class FrameBasis:
         ``shapes``: shape parameters by the field of the strength. With ``by_set``, the differences
         of each later set from the first follow in ``beta``.
         """
-        own = [(s.steady, self.own(s, shapes.get(s.field))) for s in strengths]
-        parts = [*(v for steady, v in own if not steady), *self._nuisances.values()]
-        known = [v for steady, v in own if steady]
+        by_strength = [(s.steady, self.own(s, shapes.get(s.field))) for s in strengths]
+        parts = [*(v for steady, v in by_strength if not steady), *self._nuisances.values()]
+        known = [v for steady, v in by_strength if steady]
         if by_set:
             later = [n for n, w in enumerate(self.every) if w.recording is not None][1:]
             known += [
@@ -164,30 +164,30 @@ class FrameBasis:
 
     def slow(self, random: Sequence[Strength], shapes: Mapping[str, float]) -> list[int]:
         """Indices of the parts with few modes, whose sizes are poorly determined."""
-        found = []
+        indices = []
         parts = [*(self.own(s, shapes.get(s.field)) for s in random), *self._nuisances.values()]
         for n, part in enumerate(parts):
             power = [np.einsum("kaa->k", v) for v in part]
             low = sum(float(p[: max(int(SLOW * len(p)), 1)].sum()) for p in power)
             if low > sum(float(p.sum()) for p in power) / 2:
-                found.append(n)
-        return found
+                indices.append(n)
+        return indices
 
-    def rough(self, of: Strength, shape: float | None, found: Components) -> float:
+    def rough(self, of: Strength, shape: float | None, fit: Components) -> float:
         """Relative scatter of a strength's size in excess of normal draws."""
         normal = square = seen = 0.0
-        sizes = np.maximum(found.size, 0.0)
-        covariance = (sizes @ found.modes.flat).reshape(found.modes.parts.shape[1:])
+        sizes = np.maximum(fit.size, 0.0)
+        covariance = (sizes @ fit.modes.flat).reshape(fit.modes.parts.shape[1:])
         at = 0
-        for w, own in zip(self.every, self.own(of, shape), strict=True):
-            weight = np.linalg.inv(covariance[at : at + len(own)])
-            weighed = weight @ own @ weight
-            both = weighed @ own
+        for w, part in zip(self.every, self.own(of, shape), strict=True):
+            weight = np.linalg.inv(covariance[at : at + len(part)])
+            weighed = weight @ part @ weight
+            both = weighed @ part
             modes = w.series.walk_modes.of(w.changes(of.at(shape), DRAWS).transpose(1, 0, 2))
             seen += float(np.einsum("kra,kab,krb->r", modes, weighed, modes).var(ddof=1))
             normal += 2 * float(np.einsum("kab,kba->", both, both))
             square += float(np.einsum("kaa->", both))
-            at += 2 * len(own)
+            at += 2 * len(part)
         more = seen - normal
         return float(np.sqrt(more)) / square if more > ROUGH * normal else 0.0
 
@@ -203,15 +203,15 @@ def _names(changes: FrameChanges, every: Sequence[AffectedSeries]) -> list[str]:
 
 def _nuisance_parts(changes: FrameChanges, name: str, every: Sequence[AffectedSeries]) -> list[F64]:
     """Covariance (t - 1, 2, 2) of the modes of each series by a nuisance."""
-    found = []
+    parts = []
     for w in every:
         if (w.channels is LIGHT) != (name in LIGHT_PARTS):
-            found.append(np.zeros((len(w.series) - 1, 2, 2)))
+            parts.append(np.zeros((len(w.series) - 1, 2, 2)))
         elif w.channels is LIGHT and changes.light is not None:
-            found.append(changes.light.part(name, w.series))
+            parts.append(changes.light.part(name, w.series))
         else:
-            found.append(motion_part(name, w.series))
-    return found
+            parts.append(motion_part(name, w.series))
+    return parts
 
 
 @dataclass(frozen=True)
@@ -241,11 +241,11 @@ def fit_frames(
         fit.take([s for s in plain if s.field == field])
     model, errors = fit.values()
     for field in dict.fromkeys(s.field for s in strengths if s.of_line):
-        own = [s for s in strengths if s.field == field]
-        line = changes.line(own[0])
+        of_field = [s for s in strengths if s.field == field]
+        line = changes.line(of_field[0])
         fit.chances[field] = 0.0 if line is None else line.log_chance
         if line is not None and line.significant:
-            model, of_line = _with_line(model, own, line, fit.basis)
+            model, of_line = _with_line(model, of_field, line, fit.basis)
             errors |= of_line
     kinds = {w.channels is LIGHT for w in fit.basis.every}
     names = {True: "intensity and contrast", False: "the fringe vector"}
@@ -271,48 +271,48 @@ class _Fit:
         self.profiles: dict[str, tuple[Profiled, int]] = {}
         self.shapes: dict[str, float] = {}
 
-    def take(self, own: Sequence[Strength]) -> None:
+    def take(self, strengths: Sequence[Strength]) -> None:
         """Add a field; after others, one with its own shape only if it is significant."""
-        field, before = own[0].field, self.basis.components(self.taken, self.shapes)
-        profile = None if own[0].shape is None else self._profiled(own, before)
+        field, before = strengths[0].field, self.basis.components(self.taken, self.shapes)
+        profile = None if strengths[0].shape is None else self._profiled(strengths, before)
         if profile is None:
-            after = self.basis.components([*self.taken, *own], self.shapes)
-            at = sum(s.steady == own[0].steady for s in self.taken)
-            chance = _chance(own, at, before, after)
+            after = self.basis.components([*self.taken, *strengths], self.shapes)
+            at = sum(s.steady == strengths[0].steady for s in self.taken)
+            chance = _chance(strengths, at, before, after)
         else:
-            after = profile.found
-            chance = log_chance(_likelihood(own, after, before), (len(own) + 2) // 2)
+            after = profile.components
+            chance = log_chance(_likelihood(strengths, after, before), (len(strengths) + 2) // 2)
         self.chances[field] = chance
-        if profile is not None and self.taken and not own[0].steady:
+        if profile is not None and self.taken and not strengths[0].steady:
             # Jointly: the part of one that another absorbs still belongs to the effect.
             growth = after.likelihood - self.basis.components((), {}).likelihood
-            self.chances["all"] = log_chance(growth, (len(self.taken) + len(own) + 2) // 2)
+            self.chances["all"] = log_chance(growth, (len(self.taken) + len(strengths) + 2) // 2)
         if profile is None or not self.taken or sigmas(chance) > SIGNIFICANT:
-            self.taken += own
+            self.taken += strengths
             if profile is not None:
                 self.profiles[field] = profile, len(self.taken)
                 self.shapes[field] = profile.value
 
-    def _profiled(self, own: Sequence[Strength], before: Components) -> Profiled:
+    def _profiled(self, strengths: Sequence[Strength], before: Components) -> Profiled:
         """Best value of a field's shape parameter; zero if that is its default and suffices."""
-        field, steady, every = own[0].field, own[0].steady, [*self.taken, *own]
+        field, steady, every = strengths[0].field, strengths[0].steady, [*self.taken, *strengths]
 
         def fit(value: float, start: Components | None, steps: int = MAX_STEPS) -> Components:
             return self.basis.components(every, {**self.shapes, field: value}, start, steps)
 
-        start, trials = before if steady else None, self.basis.trials(own[0])
-        found = best_shape(fit, trials, steady, start)
-        if getattr(self.start, own[0].shape or "") == 0.0:
+        start, trials = before if steady else None, self.basis.trials(strengths[0])
+        profile = best_shape(fit, trials, steady, start)
+        if getattr(self.start, strengths[0].shape or "") == 0.0:
             plain = fit(0.0, None)
-            if sigmas(log_chance(_likelihood(own, found.found, plain))) < SIGNIFICANT:
+            if sigmas(log_chance(_likelihood(strengths, profile.components, plain))) < SIGNIFICANT:
                 return Profiled(0.0, self.basis.step_s, plain, ())
-        return found
+        return profile
 
     def values(self) -> tuple[ForwardModel, dict[str, float]]:
         """The model with the fitted sizes, and errors by parameter."""
-        found = self.basis.components(self.taken, self.shapes)
+        fit = self.basis.components(self.taken, self.shapes)
         random = [s for s in self.taken if not s.steady]
-        spread = found.shape_covariance(self.basis.slow(random, self.shapes))
+        spread = fit.shape_covariance(self.basis.slow(random, self.shapes))
         model, errors = self.start.scaled(0.0), {}
         for field, (profile, _) in self.profiles.items():
             name = next(s.shape for s in self.taken if s.field == field) or ""
@@ -322,10 +322,10 @@ class _Fit:
             if s.steady:
                 error = abs(s.unit) * float(np.sqrt(spread[n, n]))
             else:
-                size = max(float(found.size[n]), 0.0)
-                rough = size * self.basis.rough(s, self.shapes.get(s.field), found)
-                more = size + float(np.hypot(found.above(n), rough))
-                less = size - float(np.hypot(np.sqrt(found.covariance[n, n]), rough))
+                size = max(float(fit.size[n]), 0.0)
+                rough = size * self.basis.rough(s, self.shapes.get(s.field), fit)
+                more = size + float(np.hypot(fit.above(n), rough))
+                less = size - float(np.hypot(np.sqrt(fit.covariance[n, n]), rough))
                 here = s.value(size)
                 error = max(s.value(more) - here, here - s.value(max(less, 0.0)))
             # Errors from the shape parameters with which it was fitted.
@@ -335,7 +335,7 @@ class _Fit:
                 if number < fitted
             ]
             errors[s.key] = float(np.hypot(error, np.linalg.norm(owed)))
-            model = with_numbers(model, {s.key: self._value(s, found)})
+            model = with_numbers(model, {s.key: self._value(s, fit)})
         return model, {key: error for key, error in errors.items() if error > 0}
 
     def sets_differ(self) -> float:
@@ -353,18 +353,18 @@ class _Fit:
     def _place(self, of: Strength) -> int:
         return [s for s in self.taken if s.steady == of.steady].index(of)
 
-    def _value(self, of: Strength, found: Components) -> float:
-        sizes = found.beta if of.steady else found.size
+    def _value(self, of: Strength, fit: Components) -> float:
+        sizes = fit.beta if of.steady else fit.size
         return of.value(float(sizes[self._place(of)]))
 
 
 def _with_line(
-    model: ForwardModel, own: Sequence[Strength], line: Line, basis: FrameBasis
+    model: ForwardModel, strengths: Sequence[Strength], line: Line, basis: FrameBasis
 ) -> tuple[ForwardModel, dict[str, float]]:
     """The model with a line, with strengths set by its amplitude in the series."""
-    name = own[0].shape or ""
+    name = strengths[0].shape or ""
     model, errors = with_numbers(model, {name: line.hz}), {name: line.hz_error}
-    for s in own:
+    for s in strengths:
         # rms over draws of a random phase, in the channel of the line.
         drawn = [w.changes(s.at(line.hz), 8) for w in basis.every if w.recording is not None]
         rms = np.sqrt(np.mean([(v**2).mean(axis=(0, 1)) for v in drawn], axis=0))
@@ -375,17 +375,17 @@ def _with_line(
     return model, errors
 
 
-def _likelihood(own: Sequence[Strength], one: Components, other: Components) -> float:
+def _likelihood(strengths: Sequence[Strength], one: Components, other: Components) -> float:
     """Rise of the log-likelihood; not restricted if shapes differ."""
-    if own[0].steady:
+    if strengths[0].steady:
         return one.profile - other.profile
     return one.likelihood - other.likelihood
 
 
-def _chance(own: Sequence[Strength], at: int, before: Components, after: Components) -> float:
+def _chance(strengths: Sequence[Strength], at: int, before: Components, after: Components) -> float:
     """Log p-value of a field's sizes, from index ``at`` on, if they are zero."""
-    here, count = slice(at, at + len(own)), len(own)
-    if own[0].steady:
+    here, count = slice(at, at + len(strengths)), len(strengths)
+    if strengths[0].steady:
         beta, spread = after.beta[here], after.beta_covariance[here, here]
         if count == 1:
             return float(np.log(2) + log_ndtr(-abs(beta[0]) / np.sqrt(spread[0, 0])))

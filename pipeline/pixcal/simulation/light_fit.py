@@ -92,9 +92,9 @@ def fit_light(starts: Sequence[LightStart], evidence: Evidence, degree: int) -> 
     lit = _lit(evidence)
     best: LightFit | None = None
     for start in starts if lit else ():
-        found = _fitted(start, lit, degree)
-        if best is None or found.gain - best.gain >= max(APART, MODEL * found.gain):
-            best = found
+        fit = _fitted(start, lit, degree)
+        if best is None or fit.gain - best.gain >= max(APART, MODEL * fit.gain):
+            best = fit
     return best
 
 
@@ -121,26 +121,26 @@ class _Lit:
         return self.recording.set_name
 
     @classmethod
-    def of(cls, found: FringeEvidence, recording: Recording) -> "_Lit":
+    def of(cls, fringes: FringeEvidence, recording: Recording) -> "_Lit":
         """A set, placed in its whole window."""
-        (y0, x0), (ny, nx) = found.origin, found.good.shape
-        alpha = np.hypot(found.theta[1], found.theta[2])
-        good = found.good & (alpha > 0) & (found.theta[0] > 0)
-        iota = np.where(good, found.theta[0], 1.0)
+        (y0, x0), (ny, nx) = fringes.origin, fringes.good.shape
+        alpha = np.hypot(fringes.theta[1], fringes.theta[2])
+        good = fringes.good & (alpha > 0) & (fringes.theta[0] > 0)
+        iota = np.where(good, fringes.theta[0], 1.0)
         visibility = np.where(good, alpha, 1.0) / iota
-        data = np.stack([np.log(iota), np.log(visibility), np.nan_to_num(phase_map(found))])
+        data = np.stack([np.log(iota), np.log(visibility), np.nan_to_num(phase_map(fringes))])
         # What two Gaussian beams leave over of both is quadratic: see `two_beams`.
-        beams = np.log(contrast_surface(found.theta, found.good))
+        beams = np.log(contrast_surface(fringes.theta, fringes.good))
         data[0] += beams
         data[1] -= beams
         shared = _shared(data[0], data[1], good)
         data[0] -= shared * data[1]
-        plain = filled(np.where(good, found.theta, np.nan), found.k)
+        plain = filled(np.where(good, fringes.theta, np.nan), fringes.k)
         iota_all, sine, cosine = (np.pad(m, ((0, 0), (x0, 0)), "edge") for m in plain)
         nothing = np.zeros((ny, x0 + nx), np.float32)
         one = np.ones_like(nothing)
-        bench, window = recording.bench, (found.window[0], x0 + nx)
-        detector = replace(bench.detector, shape=window, chip=found.window, origin_px=(0, 0))
+        bench, window = recording.bench, (fringes.window[0], x0 + nx)
+        detector = replace(bench.detector, shape=window, chip=fringes.window, origin_px=(0, 0))
         return cls(
             replace(recording, bench=replace(bench, detector=detector)),
             (y0, y0 + ny),
@@ -148,7 +148,7 @@ class _Lit:
             good,
             data,
             shared,
-            gauge_terms(found),
+            gauge_terms(fringes),
             Light.of_fringes(iota_all, cosine + 1j * sine),
             DetectorMaps(
                 nothing, nothing, one, nothing, nothing, nothing, one, nothing.astype(np.uint8)
@@ -157,19 +157,19 @@ class _Lit:
 
     def change(self, model: ForwardModel) -> F64:
         """Change of the maps (3, y, x) by a model."""
-        own, light = model.light(self.light, self.recording, self.rows, self.maps), self.light
-        found = np.zeros((3, *light.mean.shape))
+        changed, light = model.light(self.light, self.recording, self.rows, self.maps), self.light
+        change = np.zeros((3, *light.mean.shape))
         lit = np.where(light.mean > 0, light.mean, np.inf)
-        same = own.beams is light.beams
-        mean = light.mean + (own.incoherent - light.incoherent) if same else own.mean
-        found[0] = np.log(np.maximum(mean / lit, 1e-9))
-        found[1] = -found[0]
+        same = changed.beams is light.beams
+        mean = light.mean + (changed.incoherent - light.incoherent) if same else changed.mean
+        change[0] = np.log(np.maximum(mean / lit, 1e-9))
+        change[1] = -change[0]
         if not same:
-            ratio = own.phasor / np.where(light.phasor == 0, 1e-9, light.phasor)
-            found[1] += np.log(np.maximum(np.abs(ratio), 1e-9))
-            found[2] = _bent(ratio)
-        found[0] -= self.shared * found[1]
-        return found[:, :, self.first :]
+            ratio = changed.phasor / np.where(light.phasor == 0, 1e-9, light.phasor)
+            change[1] += np.log(np.maximum(np.abs(ratio), 1e-9))
+            change[2] = _bent(ratio)
+        change[0] -= self.shared * change[1]
+        return change[:, :, self.first :]
 
 
 def _shared(light: F64, visibility: F64, good: Mask) -> float:
@@ -195,12 +195,12 @@ def _bent(turn: C128) -> F64:
 def _lit(evidence: Evidence) -> list[_Lit]:
     recordings = set_recordings(evidence)
     large = {
-        name: found
-        for name, found in evidence.fringes.items()
-        if np.count_nonzero(found.good) > MIN_PIXELS and min(found.good.shape) >= MIN_SIDE
+        name: fringes
+        for name, fringes in evidence.fringes.items()
+        if np.count_nonzero(fringes.good) > MIN_PIXELS and min(fringes.good.shape) >= MIN_SIDE
     }
-    lit = [_Lit.of(found, recordings[name]) for name, found in large.items()]
-    stitched = _stitched(lit, [found.k for found in large.values()]) if lit else None
+    lit = [_Lit.of(fringes, recordings[name]) for name, fringes in large.items()]
+    stitched = _stitched(lit, [fringes.k for fringes in large.values()]) if lit else None
     return [replace(one, stitched=stitched) for one in lit]
 
 
@@ -210,8 +210,8 @@ def _stitched(lit: Sequence[_Lit], vectors: Sequence[tuple[float, float]]) -> In
     axes: dict[tuple[float, ...], list[tuple[float, _Lit]]] = {}
     for one, vector in zip(lit, np.array(vectors), strict=True):
         unit = vector / np.linalg.norm(vector)
-        own = next((a for a in axes if abs(float(unit @ a)) > SAME_AXIS), tuple(unit))
-        axes.setdefault(own, []).append((float(vector @ own), one))
+        axis = next((a for a in axes if abs(float(unit @ a)) > SAME_AXIS), tuple(unit))
+        axes.setdefault(axis, []).append((float(vector @ axis), one))
     maps, gauges = [], []
     for sets in axes.values():
         offsets = [np.where(one.good, one.data[PHASE], np.nan) / k for k, one in sets]
@@ -229,14 +229,14 @@ def _fitted(start: LightStart, lit: Sequence[_Lit], degree: int) -> LightFit:
         values = {k: v for k, v in numbers(model).items() if field_of(k) in start.free}
         slopes = _slopes(model, values, lit, here, lengths)
         rest = [one.data - at for one, at in zip(lit, here, strict=True)]
-        found = _least_squares(lit, rest, slopes, degree)
-        step = dict(zip(values, found.values, strict=True))
-        errors = dict(zip(values, map(float, np.sqrt(np.diag(found.covariance))), strict=True))
+        fit = _least_squares(lit, rest, slopes, degree)
+        step = dict(zip(values, fit.values, strict=True))
+        errors = dict(zip(values, map(float, np.sqrt(np.diag(fit.covariance))), strict=True))
         model = with_numbers(model, {k: values[k] + v for k, v in step.items() if errors[k] > 0})
         there = [one.change(model) for one in lit]
         straight = [
-            _is_straight(b - a, np.tensordot(found.values, own, 1))
-            for a, b, own in zip(here, there, slopes, strict=True)
+            _is_straight(b - a, np.tensordot(fit.values, slope, 1))
+            for a, b, slope in zip(here, there, slopes, strict=True)
         ]
         here = there
         if all(straight):
@@ -253,7 +253,7 @@ def _slopes(
     lengths: dict[str, float],
 ) -> list[F64]:
     """Derivatives (n, 3, y, x) of the maps of each set by numbers; keeps the step lengths."""
-    found = [np.zeros((len(values), *at.shape)) for at in here]
+    slopes = [np.zeros((len(values), *at.shape)) for at in here]
     for n, (key, value) in enumerate(values.items()):
         step, of = lengths.get(key, STEP * max(abs(value), 1.0)), set_of(model, key)
         sets = [i for i, one in enumerate(lit) if of in ("", one.name)]
@@ -266,14 +266,14 @@ def _slopes(
             step *= 1.5 * SEEN / max(largest, SEEN / MOST)
         lengths[key] = step
         for i, change in changes.items():
-            found[i][n] = change / (size or 1.0)
-    return found
+            slopes[i][n] = change / (size or 1.0)
+    return slopes
 
 
 def _moved(model: Any, key: str, value: float, step: float) -> tuple[Any, float]:
     """The model with a number moved by a step (backwards at the end of its range), and the step."""
-    for own in (step, -step):
-        moved = with_numbers(model, {key: value + own})
+    for change in (step, -step):
+        moved = with_numbers(model, {key: value + change})
         size = numbers(moved)[key] - value
         if size > 0:
             break
@@ -298,28 +298,28 @@ def _least_squares(
     """Fit signals (n, 3, y, x) to maps (3, y, x) of all sets; undetermined ones have zero error."""
     parts = []
     whole, left = np.zeros((2, len(signals[0])))
-    for one, data, own in zip(lit, rest, signals, strict=True):
-        largest = np.abs(own).max(axis=(2, 3))
+    for one, data, signal in zip(lit, rest, signals, strict=True):
+        largest = np.abs(signal).max(axis=(2, 3))
         for kind in (k for k in kinds if (largest[:, k] > LEAST * largest.max(axis=1)).any()):
             free = np.concatenate([polynomial(one.good.shape, degree), one.gauge])
             stitched = one.stitched if kind == PHASE else None
             # A number of one set does not change the maps of other sets.
             some = largest[:, kind] > 0
-            part = MapPart.of(own[some, kind], data[kind], free, one.good, stitched)
-            shown = np.zeros((len(part.data), len(own)))
+            part = MapPart.of(signal[some, kind], data[kind], free, one.good, stitched)
+            shown = np.zeros((len(part.data), len(signal)))
             shown[:, some] = part.signals
             parts.append(replace(part, signals=shown))
-            whole[some] += (own[some, kind][:, one.good] ** 2).sum(axis=1)
+            whole[some] += (signal[some, kind][:, one.good] ** 2).sum(axis=1)
             left += (shown**2).sum(axis=0)
     determined = np.flatnonzero(left > ABSORBED * whole)
-    found = MapFit(np.zeros(len(whole)), np.zeros((len(whole),) * 2), 0.0)
+    full = MapFit(np.zeros(len(whole)), np.zeros((len(whole),) * 2), 0.0)
     if not len(determined):
-        return found
+        return full
     size = np.sqrt(left[determined])
     fit = fit_maps([replace(p, signals=p.signals[:, determined] / size) for p in parts])
-    found.values[determined] = fit.values / size
-    found.covariance[np.ix_(determined, determined)] = fit.covariance / np.outer(size, size)
-    return replace(found, gain=fit.gain)
+    full.values[determined] = fit.values / size
+    full.covariance[np.ix_(determined, determined)] = fit.covariance / np.outer(size, size)
+    return replace(full, gain=fit.gain)
 
 
 def _gain(
@@ -329,9 +329,9 @@ def _gain(
     data, signals = [one.data for one in lit], [change[None] for change in changes]
     gain, agreed = 0.0, {}
     for kind, name in enumerate(KINDS):
-        own = _least_squares(lit, data, signals, degree, (kind,))
-        share, error = float(own.values[0]), float(np.sqrt(own.covariance[0, 0]))
-        gain += own.gain * (share > 0)
+        fit = _least_squares(lit, data, signals, degree, (kind,))
+        share, error = float(fit.values[0]), float(np.sqrt(fit.covariance[0, 0]))
+        gain += fit.gain * (share > 0)
         if 0 < SHOWN * error < 1:
             agreed[name] = share
     return gain, agreed

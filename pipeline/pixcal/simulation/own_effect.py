@@ -44,14 +44,14 @@ def effect_of_file(path: Path) -> type[Effect]:
 
 def only_effect(module: ModuleType) -> type[Effect]:
     """The effect that a module defines; TypeError unless there is exactly one."""
-    own = [
+    classes = [
         cls
         for _, cls in inspect.getmembers(module, inspect.isclass)
         if issubclass(cls, Effect) and cls is not Effect and cls.__module__ == module.__name__
     ]
-    if len(own) != 1:
-        raise TypeError(f"{len(own)} effects found where one subclass of Effect is expected")
-    return own[0]
+    if len(classes) != 1:
+        raise TypeError(f"{len(classes)} effects found where one subclass of Effect is expected")
+    return classes[0]
 
 
 def checked(effect: type[Effect], file: Path) -> type[Effect]:
@@ -118,45 +118,45 @@ def _asked(name: str, method: Any, check: Callable[[Any, type[Effect]], None], f
 
     def asked(cls: type[Effect], evidence: Any) -> Any:
         try:
-            found = method.__func__(cls, evidence)
-            if found is not None:
-                check(found, cls)
+            answer = method.__func__(cls, evidence)
+            if answer is not None:
+                check(answer, cls)
         except (InputError, NotImplementedError):
             raise
         except (Exception, SystemExit) as error:
             raise PixcalError(f"{file}: {name}: {_reason(error)}; fix the file") from error
-        return found
+        return answer
 
     return classmethod(asked)
 
 
-def _check_starts(found: Any, effect: type[Effect]) -> None:
+def _check_starts(starts: Any, effect: type[Effect]) -> None:
     """Raise TypeError or ValueError unless a fit can start there."""
     fields = {field.name for field in dataclasses.fields(effect)}
-    for start in found:
+    for start in starts:
         if not isinstance(start, LightStart) or not isinstance(start.model, effect):
             raise TypeError(f"does not return a list of LightStart for {effect.__name__}")
         if unknown := set(start.free) - fields:
             raise ValueError(f"free: {', '.join(sorted(unknown))} is not a parameter")
 
 
-def _check_estimate(found: Any, effect: type[Effect]) -> None:
+def _check_estimate(estimate: Any, effect: type[Effect]) -> None:
     """Raise TypeError or ValueError unless all fields of an estimate are usable."""
-    if not isinstance(found, Estimate) or not isinstance(found.effect, effect):
+    if not isinstance(estimate, Estimate) or not isinstance(estimate.effect, effect):
         raise TypeError(f"does not return an Estimate of {effect.__name__}")
     try:
-        parse(effect, to_plain(found.effect), effect.__name__)
+        parse(effect, to_plain(estimate.effect), effect.__name__)
     except InputError as error:
         raise ValueError(str(error)) from error
     names = {field.name for field in dataclasses.fields(effect)}
-    for name, sigma in dict(found.errors).items():
+    for name, sigma in dict(estimate.errors).items():
         if name.partition("[")[0] not in names or not (np.isfinite(sigma) and sigma >= 0):
             raise ValueError(
                 f"errors: {name!r} is not a parameter, or {sigma!r} is not a valid error"
             )
-    if not np.isfinite(found.significance):
-        raise ValueError(f"significance is {found.significance!r}")
-    if not isinstance(found.why, str):
+    if not np.isfinite(estimate.significance):
+        raise ValueError(f"significance is {estimate.significance!r}")
+    if not isinstance(estimate.why, str):
         raise TypeError("why is not a text")
 
 

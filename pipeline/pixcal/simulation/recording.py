@@ -96,12 +96,12 @@ def recordings(bench: Bench) -> list[Recording]:
     for n, scan in enumerate(f.fringes):
         electrons = electrons_per_unit(bench, n)
         planned.append(("fringes", n, scan.name, scan.count, f.exptime_s, electrons))
-    found, clock = [], 0.0
+    recorded, clock = [], 0.0
     for kind, number, folder, count, exptime, electrons in planned:
         period = max(f.period_s, exptime)
         stem = f"{folder}-{number}" if kind in ("dark", "flat") else folder
-        found.append(
+        recorded.append(
             Recording(bench, kind, number, count, exptime, clock, period, electrons, folder, stem)
         )
         clock += count * period
-    return found
+    return recorded

@@ -161,21 +161,21 @@ def _fitted(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Fitted:
     return Fitted(maps, theta, tuple(s.k for s in sets), tuple(_states(s) for s in sets))
 
 
-def _states(found: FringeEvidence) -> FrameStates:
+def _states(fringes: FringeEvidence) -> FrameStates:
     """States of all frames of the recording; arbitrary for frames left out."""
 
     def every(values: F64, other: float) -> F64:
-        states = np.full(found.frame[-1] + 1, other)
-        states[found.frame] = values
+        states = np.full(fringes.frame[-1] + 1, other)
+        states[fringes.frame] = values
         return states
 
-    b, a = found.g[:, 0], np.hypot(found.g[:, 1], found.g[:, 2])
+    b, a = fringes.g[:, 0], np.hypot(fringes.g[:, 1], fringes.g[:, 2])
     return FrameStates(
-        phi=every(found.phi, 0.0),
+        phi=every(fringes.phi, 0.0),
         level=every(b, float(b.mean())),
         amplitude=every(a, float(a.mean())),
-        dkx=every(found.dk[:, 0], 0.0),
-        dky=every(found.dk[:, 1], 0.0),
+        dkx=every(fringes.dk[:, 0], 0.0),
+        dky=every(fringes.dk[:, 1], 0.0),
     )
 
 
@@ -191,16 +191,16 @@ def _starts(evidence: Evidence, sets: Sequence[FringeEvidence]) -> dict[str | in
     }
     spans |= {s.name: (s.start_s, float(s.time_s[-1]) + _period(s.time_s)) for s in sets}
     before = sum(span for start, span in spans.values() if not np.isfinite(start))
-    found, clock = {}, 0.0
+    starts, clock = {}, 0.0
     for name, (start, span) in spans.items():
-        found[name] = start + before if np.isfinite(start) else clock
+        starts[name] = start + before if np.isfinite(start) else clock
         clock += span * (not np.isfinite(start))
-    return found
+    return starts
 
 
-def _of_set(bench: Bench, number: int, found: FringeEvidence, start_s: float) -> Recording:
-    exposure = found.exptime_s if np.isfinite(found.exptime_s) else 0.0
-    count, period = int(found.frame[-1]) + 1, _period(found.time_s)
+def _of_set(bench: Bench, number: int, fringes: FringeEvidence, start_s: float) -> Recording:
+    exposure = fringes.exptime_s if np.isfinite(fringes.exptime_s) else 0.0
+    count, period = int(fringes.frame[-1]) + 1, _period(fringes.time_s)
     return Recording(bench, "fringes", number, count, exposure, start_s, period)
 
 

@@ -143,10 +143,10 @@ class _Fit:
 
     def result(self, start: ForwardModel) -> Scored | None:
         """The fit, from the default effect."""
-        shape, (size, error, found), tried = self._best_shape(start)
+        shape, (size, error, sigma), tried = self._best_shape(start)
         if not np.any(error > 0):
             return None
-        significance = sigmas(log_chance_of_any([float(log_ndtr(-found))] * tried))
+        significance = sigmas(log_chance_of_any([float(log_ndtr(-sigma))] * tried))
         model, errors = self._scaled(shape, size, error)
         if significance > HINT and not model.is_null:
             model, errors = self._fitted(model, errors)
@@ -177,7 +177,7 @@ class _Fit:
 
     def _best_shape(self, start: ForwardModel) -> tuple[ForwardModel, tuple[F64, F64, float], int]:
         """Best other parameters than strengths, one by one on a grid; and the number of trials."""
-        best, found, tried = start, self.amplitudes(self._each_strength(start)), 1
+        best, fit, tried = start, self.amplitudes(self._each_strength(start)), 1
         for name in _shapes(start):
             for factors in GRID:
                 value = numbers(best)[name]
@@ -187,11 +187,11 @@ class _Fit:
                         continue
                     tried += 1
                     other = self.amplitudes(self._each_strength(changed))
-                    if other[2] > found[2]:
-                        best, found = changed, other
-                if found[2] < HINT:
+                    if other[2] > fit[2]:
+                        best, fit = changed, other
+                if fit[2] < HINT:
                     break
-        return best, found, tried
+        return best, fit, tried
 
     def telling(self, model: ForwardModel) -> tuple[tuple[Key, ...], Template | None]:
         """Most informative deviations, and their change if it is valid for other frames."""

@@ -102,7 +102,7 @@ class Shot:
     def normals(self, effect: str) -> F32:
         """Standard normals (y, x) of an effect, independent of the range of rows; read only."""
         chain, frame = self._chain.of(self.frame)
-        own = chain.effects[self._at]
-        again = own.frames_back > 0 and effect.startswith(own.name)
+        acting = chain.effects[self._at]
+        again = acting.frames_back > 0 and effect.startswith(acting.name)
         normals: F32 = chain.normals(effect, frame, keep=again)
         return normals

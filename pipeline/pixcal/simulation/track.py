@@ -36,11 +36,11 @@ class Track(Scalable):
 
 def at(tracks: Iterable[Track], name: str, time_s: F64 | float) -> F64:
     """Sum of the tracks of a set at given times."""
-    found = np.zeros(np.shape(time_s))
+    total = np.zeros(np.shape(time_s))
     for track in tracks:
         if track.set == name and track.time_s:
-            found = found + np.interp(time_s, track.time_s, track.value)
-    return found
+            total = total + np.interp(time_s, track.time_s, track.value)
+    return total
 
 
 def vector_tracks(evidence: Evidence, *, slow: bool) -> list[tuple[Track, ...]]:
@@ -54,6 +54,6 @@ def moved(
     states: FrameStates, recording: Recording, change: F64, *along: Iterable[Track]
 ) -> FrameStates:
     """States whose fringe vectors change by (t, 2), and by tracks along x and along y, rad/px."""
-    tracks = [at(own, recording.set_name, recording.times_s) for own in along]
+    tracks = [at(track, recording.set_name, recording.times_s) for track in along]
     dkx, dky = (change + np.stack(tracks, axis=1)).T
     return replace(states, dkx=states.dkx + dkx, dky=states.dky + dky)

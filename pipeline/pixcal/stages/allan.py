@@ -80,8 +80,8 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     with working(run_dir, "fit") as inputs:
         facts = read_json(run_dir / "fit" / "fit.json")["sets"]
         sets = {
-            name: Batches.open(run_dir / "fit" / "fit.zarr" / name, found)
-            for name, found in facts.items()
+            name: Batches.open(run_dir / "fit" / "fit.zarr" / name, entry)
+            for name, entry in facts.items()
         }
         for batches in sets.values():
             for region in filter(None, (config.region, *config.regions)):
@@ -283,13 +283,13 @@ def quantiles_of_region(
 ) -> tuple[dict[int, tuple[float, float, float]], int]:
     """Central 68 % and median over a region, by index of the length, and count of pixels."""
     quiet = replace(runtime, quiet=True)
-    found = run_tasks(partial(_quantiles, path, region), usable, quiet, label="quantiles")
+    results = run_tasks(partial(_quantiles, path, region), usable, quiet, label="quantiles")
     quantiles = {
         n: (float(q[0]), float(q[1]), float(q[2]))
-        for n, (q, count) in zip(usable, found, strict=True)
+        for n, (q, count) in zip(usable, results, strict=True)
         if count
     }
-    return quantiles, max((count for _, count in found), default=0)
+    return quantiles, max((count for _, count in results), default=0)
 
 
 def _quantiles(path: Path, region: Region, n: int) -> tuple[F64, int]:

@@ -122,11 +122,11 @@ def _fringes(
     electrons = coding.electrons(codes)
     np.copyto(electrons, np.float32(np.nan), where=codes == coding.fill)
 
-    found = read_frames(swept)
+    fit = read_frames(swept)
     centre = ((y[0] + y[1] - 1) / 2, (x[0] + x[1] - 1) / 2)
-    start = FrameParameters(found.at(*centre)[frames], found.dk[frames], centre)
+    start = FrameParameters(fit.at(*centre)[frames], fit.dk[frames], centre)
     facts = read_json(run_dir / "fit" / "fit.json")["sets"][name]
-    theta = fitted_theta(swept, part, found.reference)
+    theta = fitted_theta(swept, part, fit.reference)
     good = (ArrayReader(swept / "mask").read(y, x) == 0) & np.isfinite(theta).all(axis=0)
     read = ArrayReader(source.folder / "read_variance").read(y, x).astype(float)
     shot = ArrayReader(source.folder / "shot_factor").read(y, x).astype(float)
@@ -175,7 +175,7 @@ def fitted_theta(swept: Local, part: Part, reference: tuple[float, float]) -> F6
 
 def _stacks(ingested: Ingested, part: Part) -> tuple[Stack, ...]:
     """Calibration frames of a part, by kind and exposure time."""
-    found = []
+    stacks = []
     for kind in ("bias", "dark", "flat"):
         if kind not in ingested.tables:
             continue
@@ -183,13 +183,13 @@ def _stacks(ingested: Ingested, part: Part) -> tuple[Stack, ...]:
         exposures = np.array(table["exptime_s"], float)
         frames = ingested.arrays[kind].read((0, len(exposures)), *part)
         times = np.asarray(table["time_s"], float)
-        for own in groups(table):
-            adu, start = frames[own].astype(np.float32), starts_of(ingested.tables)[kind]
-            step = int(table["step"][own[0]]) if table.get("step") else 0
-            exposure, numbers = float(exposures[own[0]]), frame_numbers(table)[own]
-            last = int(table["last"][own[0]]) if table.get("last") else -1
-            found.append(Stack(kind, exposure, numbers, times[own], adu, start, step, last))
-    return tuple(found)
+        for group in groups(table):
+            adu, start = frames[group].astype(np.float32), starts_of(ingested.tables)[kind]
+            step = int(table["step"][group[0]]) if table.get("step") else 0
+            exposure, numbers = float(exposures[group[0]]), frame_numbers(table)[group]
+            last = int(table["last"][group[0]]) if table.get("last") else -1
+            stacks.append(Stack(kind, exposure, numbers, times[group], adu, start, step, last))
+    return tuple(stacks)
 
 
 def groups(table: Mapping[str, list[Any]]) -> list[Indices]:

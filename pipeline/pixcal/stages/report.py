@@ -136,10 +136,10 @@ def _summaries(jobs: Jobs, columns: int, runtime: Runtime) -> dict[str, dict[str
     per_task = 64 * BAND_ROWS * columns + 128 * SEGMENT**2 + 8 * SAMPLE
     runtime = within_memory("the report", per_task, FIGURE_BYTES, runtime)
     results = run_tasks(call, list(jobs.values()), runtime, label="report maps")
-    found: dict[str, dict[str, Any]] = defaultdict(dict)
+    summaries: dict[str, dict[str, Any]] = defaultdict(dict)
     for (kind, name), result in zip(jobs, results, strict=True):
-        found[kind][name] = result
-    return found
+        summaries[kind][name] = result
+    return summaries
 
 
 def _offsets(path: Path, *, spectral: bool) -> MapContents:

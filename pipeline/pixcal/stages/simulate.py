@@ -90,8 +90,8 @@ def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
     for effect in effects:
         with naming(f"{bench}: effects.{effect.name}"):
             effect.check(plan)
-    own = {f"effect {file.name}": file_digest(file) for file in config.own}
-    key = artefact_key(STAGE.name, STAGE.format, to_plain(plan), own)
+    files = {f"effect {file.name}": file_digest(file) for file in config.own}
+    key = artefact_key(STAGE.name, STAGE.format, to_plain(plan), files)
     before = there.up_to_date(key)
     # Check both, so that other files at either place are refused.
     if apart.up_to_date(key) and before:

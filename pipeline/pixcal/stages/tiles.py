@@ -63,10 +63,10 @@ def centred(shape: tuple[int, int], side: int) -> Part:
 
 def strips(todo: Sequence[Index], width: int) -> list[Strip]:
     """Neighbouring columns, divided into strips of at most this number."""
-    found: list[list[Index]] = []
+    grouped: list[list[Index]] = []
     for i, j in todo:
-        if found and len(found[-1]) < width and found[-1][-1] == (i, j - 1):
-            found[-1].append((i, j))
+        if grouped and len(grouped[-1]) < width and grouped[-1][-1] == (i, j - 1):
+            grouped[-1].append((i, j))
         else:
-            found.append([(i, j)])
-    return [tuple(strip) for strip in found]
+            grouped.append([(i, j)])
+    return [tuple(strip) for strip in grouped]

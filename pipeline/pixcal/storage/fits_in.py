@@ -43,9 +43,9 @@ def inspect(source: SourceFile) -> FrameFile:
             if not packed:
                 return _inspect_stream(source, io.BufferedReader(handle), "plain")
             with gzip.GzipFile(fileobj=handle) as stream:
-                found = _inspect_stream(source, stream, "gzip")
-            _check_gzip_length(found, handle)
-            return found
+                file = _inspect_stream(source, stream, "gzip")
+            _check_gzip_length(file, handle)
+            return file
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
             raise damaged_gzip(source.path, error) from error
         except fits.VerifyError as error:

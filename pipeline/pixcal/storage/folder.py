@@ -175,10 +175,10 @@ class UrlFolder:
         with explained(self.path.url):
             system.invalidate_cache()
             try:
-                found = system.ls(root, detail=False)
+                listed = system.ls(root, detail=False)
             except FileNotFoundError:
                 return []
-        return sorted(path.rstrip("/").rpartition("/")[2] for path in found)
+        return sorted(path.rstrip("/").rpartition("/")[2] for path in listed)
 
     def remove(self, names: Sequence[str]) -> None:
         system, root = self.path.filesystem()
@@ -201,16 +201,16 @@ class UrlFolder:
     def _sizes(self, names: Sequence[str]) -> dict[str, int]:
         """Sizes (bytes) of the existing files among these, from fresh listings."""
         system, root = self.path.filesystem()
-        found: dict[str, Any] = {}
+        listed: dict[str, Any] = {}
         with explained(self.path.url):
             system.invalidate_cache()
             # Each listing is of all chunks of a range of frames, few enough for memory.
             for below in {"/".join(name.split("/")[:2]) for name in names}:
-                found |= system.find(f"{root}/{below}", detail=True)
+                listed |= system.find(f"{root}/{below}", detail=True)
             return {
                 name: facts["size"] if "size" in facts else system.size(f"{root}/{name}")
                 for name in names
-                if (facts := found.get(f"{root}/{name}")) is not None
+                if (facts := listed.get(f"{root}/{name}")) is not None
             }
 
 

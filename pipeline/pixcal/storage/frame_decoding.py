@@ -67,7 +67,7 @@ def read_rows(
     _, ny, nx = file.shape
     coding, within = file.coding, bands(rows)
     stored, each = coding.stored, rows_at_once(file) // BAND
-    found = np.full((len(planes), len(within), len(FACTS)), np.nan)
+    facts = np.full((len(planes), len(within), len(FACTS)), np.nan)
     scratch, spare = np.empty((2, min(each * BAND, rows[1] - rows[0]), nx), stored)
     direct = out is not None and coding.exact and out.dtype == coding.dtype
     with file.source.open() as handle:
@@ -79,7 +79,7 @@ def read_rows(
             start = file.offset + (plane * ny + y0) * nx * stored.itemsize
             _read_exactly(handle, start, raw, file.source.path)
             parts = [slice(a - y0, b - y0) for a, b in some]
-            of_bands = found[n, first : first + each]
+            of_bands = facts[n, first : first + each]
             of_bands[:, 0] = [google_crc32c.value(raw[part]) for part in parts]
             # In stored form: swapping bytes and sign bits takes longer than finding the facts.
             values, zero = raw.view(stored.newbyteorder(">")), coding.bzero
@@ -97,7 +97,7 @@ def read_rows(
                 of_bands[:, 1:] = [_largest_and_ending(values[part], zero) for part in parts]
         # A file written to since it was opened is invalid.
         file.source.check_read(handle)
-    return found
+    return facts
 
 
 def rows_at_once(file: FrameFile) -> int:
@@ -118,12 +118,12 @@ def _largest_and_ending(values: NDArray[Any], zero: float) -> tuple[float, float
 
 def _make_native(raw: NDArray[Any], coding: SampleFormat, native: NDArray[Any]) -> None:
     """Convert samples to native byte order, with the sign bit flipped if the values need it."""
-    bits, found = (samples.view(f"u{raw.itemsize}") for samples in (raw, native))
+    bits, flipped = (samples.view(f"u{raw.itemsize}") for samples in (raw, native))
     # In two steps: flipping bits and swapping bytes at once takes twice as long.
-    np.copyto(found, bits.view(bits.dtype.newbyteorder(">")))
+    np.copyto(flipped, bits.view(bits.dtype.newbyteorder(">")))
     if coding.exact and coding.bzero:
         # The BZERO that makes unsigned integers of signed ones, and the reverse.
-        found ^= found.dtype.type(1 << (8 * raw.itemsize - 1))
+        flipped ^= flipped.dtype.type(1 << (8 * raw.itemsize - 1))
 
 
 def _read_exactly(handle: io.FileIO, start: int, raw: NDArray[Any], path: Path) -> None:

@@ -110,9 +110,9 @@ class FrameReader:
 
     def _read_frame(self, t: int, rows: tuple[int, int], out: NDArray[Any]) -> None:
         file = self._files[t]
-        found = read_rows(file, [self._planes[t]], rows, out, crc_alone=True)[0, :, 0]
+        checksums = read_rows(file, [self._planes[t]], rows, out, crc_alone=True)[0, :, 0]
         first = rows[0] // BAND
-        if (found != self._checksums[t, first : first + len(found)]).any():
+        if (checksums != self._checksums[t, first : first + len(checksums)]).any():
             raise InputError(
                 f"{file.source.path}: its contents differ from those ingested (checksum), "
                 "although size and time agree; restore it, or touch it and run 'pixcal ingest' "
@@ -147,9 +147,9 @@ class ChosenFrames:
         times, *within = ranges or ((0, len(self.numbers)),)
         numbers = np.asarray(self.numbers[slice(*times)], int)
         parts = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
-        found = [self.reader.read((p[0], p[-1] + 1), *within) for p in parts if len(p)]
-        found = found or [self.reader.read((0, 0), *within)]
-        return np.concatenate(found, out=out)
+        blocks = [self.reader.read((p[0], p[-1] + 1), *within) for p in parts if len(p)]
+        blocks = blocks or [self.reader.read((0, 0), *within)]
+        return np.concatenate(blocks, out=out)
 
 
 # reader of frames (time, y, x) in any storage

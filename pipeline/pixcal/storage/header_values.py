@@ -25,8 +25,8 @@ class Header:
 
     def __init__(self, cards: Iterable[tuple[str, Any, str]]) -> None:
         self._cards: dict[str, tuple[Any, str]] = {}
-        for keyword, found, comment in cards:
-            self._cards.setdefault(keyword, (found, comment))
+        for keyword, entry, comment in cards:
+            self._cards.setdefault(keyword, (entry, comment))
 
     @classmethod
     def of_text(cls, text: str) -> "Header":
@@ -38,10 +38,10 @@ class Header:
 
     def get(self, key: str, default: Any = None) -> Any:
         """Value of a key; VerifyError when its card does not parse."""
-        found = self._cards.get(key, (default, ""))[0]
-        if isinstance(found, fits.VerifyError):
-            raise fits.VerifyError(*found.args)
-        return found
+        entry = self._cards.get(key, (default, ""))[0]
+        if isinstance(entry, fits.VerifyError):
+            raise fits.VerifyError(*entry.args)
+        return entry
 
     def comment(self, key: str) -> str:
         """Comment of a key."""
@@ -53,20 +53,20 @@ class Header:
 def _card(text: str) -> tuple[str, Any, str]:
     card = fits.Card.fromstring(text)
     try:
-        found = card.value
-        return card.keyword, None if isinstance(found, fits.card.Undefined) else found, card.comment
+        entry = card.value
+        return card.keyword, None if isinstance(entry, fits.card.Undefined) else entry, card.comment
     except fits.VerifyError as error:
         return card.keyword, error, ""
 
 
 def integer(header: Header, key: str, default: int | None = None) -> int:
     """Whole number of a key; ValueError when it is something else."""
-    found = header.get(key, default)
-    if isinstance(found, bool) or not isinstance(found, int):
+    entry = header.get(key, default)
+    if isinstance(entry, bool) or not isinstance(entry, int):
         raise ValueError(
             f"header key {key} is missing or not a whole number; copy the file again, or remove it"
         )
-    return found
+    return entry
 
 
 def value(header: Header, key: str, default: Any = None) -> Any:
@@ -79,9 +79,9 @@ def value(header: Header, key: str, default: Any = None) -> Any:
 
 def number(header: Header, key: str, default: float | None = None) -> float | None:
     """Finite number of a key; None when it is something else."""
-    found = value(header, key, default)
+    entry = value(header, key, default)
     try:
-        result = math.nan if isinstance(found, bool) else float(found)
+        result = math.nan if isinstance(entry, bool) else float(entry)
     except (ValueError, TypeError):
         return None
     return result if math.isfinite(result) else None
@@ -91,8 +91,8 @@ def _numbers(headers: tuple[Header, ...], *keys: str) -> Iterator[tuple[float, s
     """Finite numbers of some keys, and their comments in lower case."""
     for key in keys:
         for header in headers:
-            if (found := number(header, key)) is not None:
-                yield found, header.comment(key).lower()
+            if (parsed := number(header, key)) is not None:
+                yield parsed, header.comment(key).lower()
 
 
 def exposure_s(headers: tuple[Header, ...]) -> float | None:

@@ -49,16 +49,16 @@ class MemoryPath:
     @property
     def array(self) -> "MemoryArray":
         """The array stored at this path."""
-        found = self._kept[self.at]
-        assert isinstance(found, MemoryArray)
-        return found
+        stored = self._kept[self.at]
+        assert isinstance(stored, MemoryArray)
+        return stored
 
     def read_bytes(self) -> bytes:
         """Content of a file; FileNotFoundError if it does not exist."""
-        found = self._kept.get(self.at)
-        if not isinstance(found, bytes):
+        content = self._kept.get(self.at)
+        if not isinstance(content, bytes):
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self))
-        return found
+        return content
 
     def read_text(self, encoding: str) -> str:
         """Content of a file as text."""

@@ -49,8 +49,8 @@ class UrlPath:
         from fsspec.core import url_to_fs  # here: cubes on this machine do not need it
 
         with explained(self.url):
-            found: tuple[Any, str] = url_to_fs(self.url)
-        return found
+            located: tuple[Any, str] = url_to_fs(self.url)
+        return located
 
     def read_bytes(self, most: int | None = None) -> bytes:
         """Content of a file, ``most`` bytes of it; FileNotFoundError, or RemoteError if unknown."""

@@ -48,17 +48,17 @@ class FitsMap:
                 if header["NAXIS"] != 2 or "BSCALE" in header or "BZERO" in header:
                     raise ValueError("not a plain image of two axes")
                 shape = (int(header["NAXIS2"]), int(header["NAXIS1"]))
-                found = cls(path, shape, _TYPES[header["BITPIX"]], int(hdu.fileinfo()["datLoc"]))
-                if path.stat().st_size < found.data_at + found.n_bytes:
+                image = cls(path, shape, _TYPES[header["BITPIX"]], int(hdu.fileinfo()["datLoc"]))
+                if path.stat().st_size < image.data_at + image.n_bytes:
                     raise ValueError("cut short")
                 if "DATASUM" in header:
-                    filled = -(-found.n_bytes // BLOCK) * BLOCK
+                    filled = -(-image.n_bytes // BLOCK) * BLOCK
                     with path.open("rb") as file:
-                        if int(header["DATASUM"]) != word_sum(file, found.data_at, filled):
+                        if int(header["DATASUM"]) != word_sum(file, image.data_at, filled):
                             raise ValueError("altered: its checksum does not match")
         except (OSError, LookupError, TypeError, ValueError) as error:
             raise _not_a_map(path, error) from error
-        return found
+        return image
 
     @property
     def n_bytes(self) -> int:

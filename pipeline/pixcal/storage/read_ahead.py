@@ -27,8 +27,8 @@ class ReadAhead:
 
     def expected(self) -> dict[File, Future[bytes] | None]:
         """Files that this thread may read next, with their transfers if begun."""
-        found: dict[File, Future[bytes] | None] = self._thread.__dict__.setdefault("expected", {})
-        return found
+        files: dict[File, Future[bytes] | None] = self._thread.__dict__.setdefault("expected", {})
+        return files
 
     def read(self, file: File, following: Sequence[File]) -> bytes:
         """Content of a file, little more than its size; those ``following`` are read next."""

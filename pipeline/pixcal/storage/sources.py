@@ -36,7 +36,7 @@ def read_headers(folder: Path, names: Iterable[str]) -> dict[str, Header]:
     path = folder / HEADERS
     if not path.exists():
         return {}
-    found: dict[str, Header] = {}
+    headers: dict[str, Header] = {}
     names = list(names)
     try:
         with path.open(encoding="utf-8-sig", newline="") as handle:
@@ -54,14 +54,14 @@ def read_headers(folder: Path, names: Iterable[str]) -> dict[str, Header]:
                 if not matched:
                     raise InputError(f"{place}: {row['file']!r:.80} matches no frame; correct it")
                 for name in matched:
-                    if name in found:
+                    if name in headers:
                         raise InputError(f"{place}: {name} is matched by two lines; list it once")
-                    found[name] = header
+                    headers[name] = header
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(
             f"{path}: cannot be read ({reason_of(error)}); write it as UTF-8 text"
         ) from error
-    return found
+    return headers
 
 
 def _cards(place: str, row: dict[str, str | None]) -> Iterable[tuple[str, str | float]]:
@@ -143,7 +143,7 @@ def find_sources(frames: Frames, description: Path) -> dict[str, tuple[SourceFil
     Raises InputError if a glob leaves the folder or matches nothing, or a file is empty, unreadable
     or listed twice.
     """
-    found: dict[str, tuple[SourceFile, ...]] = {}
+    files: dict[str, tuple[SourceFile, ...]] = {}
     seen: dict[tuple[int, int], tuple[str, str]] = {}
     for array, key, globs in _globs(frames):
         if not globs:
@@ -151,12 +151,12 @@ def find_sources(frames: Frames, description: Path) -> dict[str, tuple[SourceFil
         names: set[str] = set()
         for number, pattern in enumerate(globs):
             names |= _matches(pattern, description, f"{description}: {key}[{number}]")
-        found[array] = tuple(_source(description.parent, name, key, seen) for name in sorted(names))
-    listed = {source.name for sources in found.values() for source in sources}
+        files[array] = tuple(_source(description.parent, name, key, seen) for name in sorted(names))
+    listed = {source.name for sources in files.values() for source in sources}
     headers = read_headers(description.parent, sorted(listed))
     return {
         array: tuple(replace(s, header=headers.get(s.name, ())) for s in sources)
-        for array, sources in found.items()
+        for array, sources in files.items()
     }
 
 

@@ -62,7 +62,7 @@ def inspect_picture(source: SourceFile) -> FrameFile:
                 f"{source.path}: samples of Pillow's mode {mode}; frames are greyscale of 8, 16 or "
                 f"32 bits: {remedy}"
             )
-        header = Header((key, found, "") for key, found in source.header)
+        header = Header((key, content, "") for key, content in source.header)
         exif = _exposure_s(picture)
     listed = exposure_s((header,))
     return FrameFile(
@@ -98,8 +98,8 @@ def picture_bytes(file: FrameFile) -> int:
 
 def _exposure_s(picture: Image.Image) -> float | None:
     exif = picture.getexif()
-    own = exif.get_ifd(ExifTags.IFD.Exif)
-    value = own.get(ExifTags.Base.ExposureTime, exif.get(ExifTags.Base.ExposureTime))
+    tags = exif.get_ifd(ExifTags.IFD.Exif)
+    value = tags.get(ExifTags.Base.ExposureTime, exif.get(ExifTags.Base.ExposureTime))
     try:
         return None if value is None else float(value)
     except (TypeError, ValueError, ZeroDivisionError):

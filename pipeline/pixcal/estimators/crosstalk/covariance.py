@@ -96,9 +96,9 @@ def products(
     return Products(right, normal, line, evidence.read_noise**2 / UNIT)
 
 
-def joined(found: Sequence[Products | None]) -> Products | None:
+def joined(parts: Sequence[Products | None]) -> Products | None:
     """Sum over several parts of the frames."""
-    some = [one for one in found if one is not None]
+    some = [one for one in parts if one is not None]
     if len(some) < 2:
         return some[0] if some else None
     names = "right", "normal", "line"
@@ -121,23 +121,23 @@ def share_sums(right: F64, normal: F64, read: float, per_ke: float = 0.0) -> tup
         every, right = np.einsum("it,ltuc,ju->lijc", terms, every, terms), terms @ right
         prior = prior[:1, :1]
     links, _, _, count = every.shape
-    own: F64 = np.zeros((links, count, 2, count, 2))
+    matrix: F64 = np.zeros((links, count, 2, count, 2))
     at = np.arange(count)
-    own[:, at, :, at] = np.moveaxis(every[:, :2, :2], -1, 0)
+    matrix[:, at, :, at] = np.moveaxis(every[:, :2, :2], -1, 0)
     cross = np.moveaxis(every[:, :2, 2:], -1, 1).reshape(links, 2 * count, -1)
     nuisance = every[:, 2:, 2:].sum(-1) + prior
     taken = cross @ np.linalg.inv(nuisance)
     shares = right[:, :2].swapaxes(1, 2).reshape(links, -1)
     rest = shares - np.einsum("lun,ln->lu", taken, right[:, 2:].sum(-1))
-    return own.reshape(links, 2 * count, -1) - taken @ cross.swapaxes(1, 2), rest
+    return matrix.reshape(links, 2 * count, -1) - taken @ cross.swapaxes(1, 2), rest
 
 
-def share_and_square(found: Products) -> tuple[F64, F64]:
+def share_and_square(sums: Products) -> tuple[F64, F64]:
     """Mean share of both pixels, and covariance over the product of the charges, 1/(10⁴ e-).
 
     With their covariance: (link, 2), (link, 2, 2).
     """
-    right, normal = (part.sum((-2, -1), dtype=float) for part in (found.right, found.normal))
+    right, normal = (part.sum((-2, -1), dtype=float) for part in (sums.right, sums.normal))
     mean = np.array([[0.5, 0.5, 0, 0], [0, 0, 0, 1]])
     covariance = mean @ inverse_normal(symmetric(normal))
     return np.einsum("lat,lt->la", covariance, right), covariance @ mean.T
@@ -171,10 +171,10 @@ def _add(parts: Sequence[Frames], terms: F32, links: Sequence[Place], sums: F32)
     time = sum(len(value) for value, *_ in parts)
     powers, first = np.zeros((ny, nx + 2 * reach, count, time), np.float32), 0
     for value, charge, good in parts:
-        own, inside = value.T, powers[:, reach : reach + nx, :, first : first + len(value)]
+        weighted, inside = value.T, powers[:, reach : reach + nx, :, first : first + len(value)]
         for power in range(count):
-            inside[:, :, power][good] = own
-            own = own * charge.T
+            inside[:, :, power][good] = weighted
+            weighted = weighted * charge.T
         first += len(value)
     for dy, x in product({dy for dy, _ in links}, range(0, nx, _BLOCK)):
         wide = min(_BLOCK, nx - x)
@@ -196,5 +196,5 @@ def _variance(part: Residuals) -> F64:
     weight, charge = part.weight, part.charge
     terms = np.stack([weight * charge, weight, weight * charge**2]).reshape(3, -1)
     square = (part.e**2 / np.where(weight > 0, weight, 1)).ravel()
-    own = terms[:, : weight[: part.count].size]
-    return np.column_stack([own @ own.T, terms @ square]).astype(float)
+    used = terms[:, : weight[: part.count].size]
+    return np.column_stack([used @ used.T, terms @ square]).astype(float)

@@ -54,13 +54,13 @@ class HotPixels:
         order = np.argsort(self.value, axis=0)
         value, sigma = (np.take_along_axis(a, order, 0) for a in (self.value, self.sigma))
         number = np.take_along_axis(classes.of(y, x), order, 0)
-        found = []
+        shares = []
         for n in range(classes.count):
             near = np.where(number == n, sigma, np.inf)
             alone = doubted | (np.isfinite(near).sum(axis=0) == 1)
             doubt = np.where(alone, DOUBT, 0.0) * value
-            found.append(_agreed(value, np.hypot(near, doubt), self.charge[order]))
-        return ClassShares(*np.stack(found, axis=2))
+            shares.append(_agreed(value, np.hypot(near, doubt), self.charge[order]))
+        return ClassShares(*np.stack(shares, axis=2))
 
 
 @dataclass(frozen=True)

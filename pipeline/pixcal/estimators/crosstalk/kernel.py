@@ -90,9 +90,9 @@ def measure(evidence: Evidence) -> tuple[Kernel | None, float] | None:
     for _ in range(STEPS):
         # A coupling stays: where shares rise steeply, those at small signals are uncertain.
         known |= np.abs(kernel.shares) > THERE * kernel.errors
-        found = sources_of([evidence], lambda _: near, tuple(compress(kernel.couplings, known)))
-        assert found is not None
-        before, kernel = kernel, _kernel(found, classes, *found.level_dependence())
+        updated = sources_of([evidence], lambda _: near, tuple(compress(kernel.couplings, known)))
+        assert updated is not None
+        before, kernel = kernel, _kernel(updated, classes, *updated.level_dependence())
         change = kernel.per_ke[0] - before.per_ke[0]
         moved = np.abs(kernel.shares - before.shares) * largest_outflow(kernel.couplings)
         if abs(change) < STILL * kernel.per_ke[1] and (moved < STILL * kernel.errors).all():
@@ -108,8 +108,8 @@ def dense_kernel(parts: Iterable[Evidence], start: tuple[Coupling, ...]) -> Kern
     """
     far = {(c.dy, c.dx) for c in start} | {(-c.dy, -c.dx) for c in start}
     rows, columns = (lcm(*(getattr(c, n) for c in start)) for n in ("every_rows", "every_columns"))
-    found = sources_of(parts, lambda shape: within(shape, far), start)
-    return None if found is None else _kernel(found, PixelClasses(rows, columns, found.first))
+    sources = sources_of(parts, lambda shape: within(shape, far), start)
+    return None if sources is None else _kernel(sources, PixelClasses(rows, columns, sources.first))
 
 
 def within(shape: tuple[int, ...], far: Collection[Place] = ()) -> tuple[Place, ...]:
@@ -123,7 +123,7 @@ def significant(kernel: Kernel) -> tuple[tuple[Coupling, ...], F64]:
     steps: dict[Place, list[int]] = {}
     for n, c in enumerate(kernel.couplings):
         steps.setdefault((c.dy, c.dx), []).append(n)
-    basis, found = [], []
+    basis, couplings = [], []
     for at in steps.values():
         precision = np.linalg.inv(kernel.covariance[np.ix_(at, at)])
         rest = kernel.shares[at] - precision.sum(axis=0) @ kernel.shares[at] / precision.sum()
@@ -131,15 +131,15 @@ def significant(kernel: Kernel) -> tuple[tuple[Coupling, ...], F64]:
         for group in [at] if alike else [[n] for n in at]:
             # Noise alone measures the sum of the shares there and back (neighbours in the list): a
             # pair whose sum is significant has both, as long as they cannot be distinguished.
-            own, back = (each[[n ^ way for n in group]].sum(axis=0) for way in (0, 1))
-            both, apart = _sigmas(kernel, own + back), _sigmas(kernel, own - back)
-            if _sigmas(kernel, own) > THERE or both > THERE > apart:
+            there, back = (each[[n ^ way for n in group]].sum(axis=0) for way in (0, 1))
+            both, apart = _sigmas(kernel, there + back), _sigmas(kernel, there - back)
+            if _sigmas(kernel, there) > THERE or both > THERE > apart:
                 one = kernel.couplings[group[0]]
                 if alike:
                     one = replace(one, every_rows=1, row=0, every_columns=1, column=0)
-                basis.append(own)
-                found.append(one)
-    if not found:
+                basis.append(there)
+                couplings.append(one)
+    if not couplings:
         return (), np.zeros((0, 0))
     precision, columns = np.linalg.inv(kernel.covariance), np.array(basis).T
     covariance = np.linalg.inv(columns.T @ precision @ columns)
@@ -147,7 +147,7 @@ def significant(kernel: Kernel) -> tuple[tuple[Coupling, ...], F64]:
     # Shares that may be equal keep their individual errors.
     for n, column in enumerate(columns.T > 0):
         covariance[n, n] = max(covariance[n, n], np.diag(kernel.covariance)[column].mean())
-    named = zip(found, shares.tolist(), strict=True)
+    named = zip(couplings, shares.tolist(), strict=True)
     return tuple(replace(c, share=share) for c, share in named), covariance
 
 
@@ -172,11 +172,11 @@ def _examined(evidence: Evidence) -> tuple[Evidence, Sources | None]:
 def best_period(sources: Sources) -> PixelClasses:
     """The classes of the period of the greatest evidence."""
 
-    def score(found: tuple[PixelClasses, F64, F64]) -> float:
-        classes, normal, right = found
-        own = shrunk(block_diag(*normal), right.ravel(), sources.links, classes.count, rounds=FEW)
+    def score(sums: tuple[PixelClasses, F64, F64]) -> float:
+        classes, normal, right = sums
+        fit = shrunk(block_diag(*normal), right.ravel(), sources.links, classes.count, rounds=FEW)
         pattern = 0.0 if sources.maps is None else sources.maps.pattern(classes)
-        return own[-1] + (pattern - WORTH * (classes.count - 1)) / 2
+        return fit[-1] + (pattern - WORTH * (classes.count - 1)) / 2
 
     return max(sources.every_period(), key=score)[0]
 

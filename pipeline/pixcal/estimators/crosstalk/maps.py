@@ -48,8 +48,8 @@ class Maps:
         y, x = min(REACH, rows // 8), min(REACH, columns // 8)
         good = np.zeros(evidence.good.shape, bool)
         good[y : rows - y, x : columns - x] = True
-        for found in sets:
-            good &= found.good & np.isfinite(found.delta)
+        for fringes in sets:
+            good &= fringes.good & np.isfinite(fringes.delta)
         return cls(sets, good, known) if sets and good.sum() >= MIN_PIXELS else None
 
     def sums(self, couplings: Sequence[Coupling], classes: PixelClasses) -> tuple[F64, F64]:
@@ -69,9 +69,11 @@ class Maps:
         normal = np.zeros((size + 2 * classes.count,) * 2)
         right = np.zeros(len(normal))
         slopes, values = [], []
-        for found, (delta, logs, spread) in zip(self.sets, self._values, strict=True):
-            k = float(np.hypot(*found.k))
-            turn = [np.exp(-1j * (found.k[0] * c.dx + found.k[1] * c.dy)) - 1 for c in couplings]
+        for fringes, (delta, logs, spread) in zip(self.sets, self._values, strict=True):
+            k = float(np.hypot(*fringes.k))
+            turn = [
+                np.exp(-1j * (fringes.k[0] * c.dx + fringes.k[1] * c.dy)) - 1 for c in couplings
+            ]
             slope = np.array(turn)[:, None] * each[receivers]
             # Pixels of a class may be wider than others by `WIDTH`.
             weight = spread**-2
@@ -79,7 +81,7 @@ class Maps:
             kept = weight * (np.eye(len(gram)) - gram @ np.linalg.inv(inner))
             normal[:size, :size] += slope.real @ kept @ gram @ slope.real.T
             right[:size] += slope.real @ kept @ (members @ logs)
-            axis = np.array(found.k) / k
+            axis = np.array(fringes.k) / k
             slopes.append(np.vstack([slope.imag / k, axis[0] * each, axis[1] * each]))
             values.append(members @ delta)
         weighted = np.tensordot(self._weight, np.stack(slopes), 1)
@@ -99,16 +101,16 @@ class Maps:
         good = self.good
         y, x = grid(good.shape)
         modes = [polynomial_basis(good.shape, DEGREE)[good.ravel()].T]
-        for found in self.sets:
-            psi = np.broadcast_to(found.k[0] * x + found.k[1] * y, good.shape)[good]
-            phasor = (found.theta[2] + 1j * found.theta[1])[good] * np.exp(-1j * psi)
+        for fringes in self.sets:
+            psi = np.broadcast_to(fringes.k[0] * x + fringes.k[1] * y, good.shape)[good]
+            phasor = (fringes.theta[2] + 1j * fringes.theta[1])[good] * np.exp(-1j * psi)
             modes += fringe_modes(psi + np.angle(phasor.sum()), np.ones(len(psi)))
         return np.asarray(np.linalg.qr(np.vstack(modes).T)[0].T)
 
     @cached_property
     def _values(self) -> list[tuple[F64, F64, float]]:
         """Of each set: offsets (pixel,), px, logarithms of the visibility and their scatter."""
-        found = []
+        values = []
         for one in self.sets:
             # Flagged pixels were fitted too, so their contribution to others is known.
             read = filled(one.theta / one.shot_factor, one.k)
@@ -116,8 +118,8 @@ class Maps:
             shift = phase_change(read, theta) / np.hypot(*one.k)
             iota, sine, cosine = theta[:, self.good]
             logs, spread = self._clipped(np.log(np.hypot(sine, cosine) / iota))
-            found.append((self._clipped((one.delta + shift)[self.good])[0], logs, spread))
-        return found
+            values.append((self._clipped((one.delta + shift)[self.good])[0], logs, spread))
+        return values
 
     @cached_property
     def _weight(self) -> F64:
@@ -127,8 +129,8 @@ class Maps:
         axes = k / length[:, None]
         noise = [np.median(one.sigma[self.good]) for one in self.sets] / length
         scatter = np.array([median_and_sigma(delta)[1] for delta, *_ in self._values])
-        own = np.maximum(scatter**2 - noise**2, 0).mean()
-        return np.linalg.inv(np.diag(noise**2) + own * axes @ axes.T)
+        variance = np.maximum(scatter**2 - noise**2, 0).mean()
+        return np.linalg.inv(np.diag(noise**2) + variance * axes @ axes.T)
 
     def _clipped(self, values: F64) -> tuple[F64, float]:
         """Values without modes, zero where they are outliers, and their robust scatter."""

@@ -81,29 +81,29 @@ def _of_stack(stack: Stack, evidence: Evidence, known: Sequence[Coupling]) -> Re
     return _noise(noise, every, read, np.ones((1, len(at)), np.float32), common, good, True)
 
 
-def _of_fringes(found: FringeEvidence, known: Sequence[Coupling]) -> Residuals:
+def _of_fringes(fringes: FringeEvidence, known: Sequence[Coupling]) -> Residuals:
     """Fringe frames less the fit, before division by the flat."""
-    at, good = _spread(len(found.g), found.good.size), found.good
-    flat = 1 / found.shot_factor
-    found = replace(found, electrons=found.electrons[at], g=found.g[at], dk=found.dk[at])
-    samples = found.electrons * flat.astype(np.float32)
-    theta = filled(np.where(good, found.theta, np.nan) * flat, found.k)
+    at, good = _spread(len(fringes.g), fringes.good.size), fringes.good
+    flat = 1 / fringes.shot_factor
+    fringes = replace(fringes, electrons=fringes.electrons[at], g=fringes.g[at], dk=fringes.dk[at])
+    samples = fringes.electrons * flat.astype(np.float32)
+    theta = filled(np.where(good, fringes.theta, np.nan) * flat, fringes.k)
     if known:
         seen = np.isfinite(samples)
-        samples = np.where(seen, samples, replace(found, theta=theta).model)
-        samples = uncouple(samples, known, found.origin, STEPS)
+        samples = np.where(seen, samples, replace(fringes, theta=theta).model)
+        samples = uncouple(samples, known, fringes.origin, STEPS)
         samples[~seen] = np.nan
-        theta = uncouple_fringes(theta, known, found.origin)
-    model = replace(found, theta=theta).model[:, good]
+        theta = uncouple_fringes(theta, known, fringes.origin)
+    model = replace(fringes, theta=theta).model[:, good]
     rest = (samples[:, good] - model) * np.float32(UNIT**-0.5)
     charge = np.maximum(model / np.float32(UNIT), 0)
-    read = (found.read_variance * flat**2)[good].astype(np.float32) / np.float32(UNIT)
+    read = (fringes.read_variance * flat**2)[good].astype(np.float32) / np.float32(UNIT)
     # Also changes along the window: a moving fringe vector, rows that are exposed later.
     y, x = grid((good.shape[0], good.shape[1]))
     places = np.concatenate([theta, x * theta, y * theta])[:, good] / np.abs(theta).max()
-    turn = np.exp(1j * np.outer(range(1, HARMONICS + 1), found.phi))
-    own = np.concatenate([np.ones((1, len(at))), turn.real, turn.imag])
-    of_time = np.ascontiguousarray(np.linalg.qr(own.T)[0].T, np.float32)
+    turn = np.exp(1j * np.outer(range(1, HARMONICS + 1), fringes.phi))
+    harmonics = np.concatenate([np.ones((1, len(at))), turn.real, turn.imag])
+    of_time = np.ascontiguousarray(np.linalg.qr(harmonics.T)[0].T, np.float32)
     return _noise(rest, charge, read, of_time, places.astype(np.float32), good, False)
 
 

@@ -94,8 +94,8 @@ class Sources:
             used = [there.any(axis=1)]
             by_boundaries = _left_by_boundaries(self.links, rises[0], covariance[:, 1, 1])
         if self.hot is not None:
-            found = self.hot.by_class(PixelClasses(1, 1, self.first), self.links)
-            share, rise, covariance = found.rises()
+            hot = self.hot.by_class(PixelClasses(1, 1, self.first), self.links)
+            share, rise, covariance = hot.rises()
             seen = covariance[..., 1, 1] < np.inf
             rise = rise + self._by_link(self.known, True)
             by_boundaries += float((rise**2 / covariance[..., 1, 1])[seen].sum())
@@ -137,7 +137,7 @@ class Sources:
     def _information(
         self, classes: PixelClasses, right: F64, normal: F64, doubted: bool, per_ke: float = 0.0
     ) -> Information:
-        found = {}
+        sums = {}
         # The change of the frames if the known shares changed by this.
         more = self._by_link(self.known, True) - per_ke * self._by_link(self.known)
         if self.noise is not None:
@@ -145,11 +145,11 @@ class Sources:
             right = right / self.noise.shot[0] + np.moveaxis(
                 squares * (20 * more.sum(axis=1))[:, None, None], -1, 1
             )
-            found["covariance"] = share_sums(right, normal, self.noise.read, per_ke)
+            sums["covariance"] = share_sums(right, normal, self.noise.read, per_ke)
         if self.hot is not None:
             hot = self.hot.by_class(classes, self.links, doubted)
-            found["hot pixels"] = hot.sums(more, per_ke)
-        return found
+            sums["hot pixels"] = hot.sums(more, per_ke)
+        return sums
 
 
 def _left_by_boundaries(links: Sequence[Place], value: F64, variance: F64) -> float:
@@ -180,15 +180,15 @@ def sources_of(
     given rows and columns. ``known``: couplings for which all data are corrected first.
     """
     noise: list[Products | None] = []
-    found: Sources | None = None
+    sources: Sources | None = None
     for part in parts:
-        if found is None:
+        if sources is None:
             shape, steps = part.good.shape, steps_in(part.good.shape)
             maps, hot = Maps.of(part.without_frames(), known), hot_pixels(part, steps, known)
-            found = Sources(None, hot, maps, steps, shape, part.origin, known)
-        noise.append(products(part, found.links, known))
+            sources = Sources(None, hot, maps, steps, shape, part.origin, known)
+        noise.append(products(part, sources.links, known))
         del part  # the next one is read only then
     total = joined(noise)
-    if found is None or (total is None and found.hot is None):
+    if sources is None or (total is None and sources.hot is None):
         return None
-    return replace(found, noise=total)
+    return replace(sources, noise=total)

@@ -43,39 +43,39 @@ class Trail:
 @cached_on_evidence
 def trails(evidence: Evidence) -> tuple[Trail, Trail] | None:
     """Trails along the columns and along the rows; None with few hot pixels in darks."""
-    found = hot_pixels(evidence, LINKS)
-    return None if found is None else trails_of(found, evidence.good.shape, evidence.origin)
+    hot = hot_pixels(evidence, LINKS)
+    return None if hot is None else trails_of(hot, evidence.good.shape, evidence.origin)
 
 
 def trails_of(
-    found: HotPixels, shape: tuple[int, ...], origin: tuple[int, int]
+    hot: HotPixels, shape: tuple[int, ...], origin: tuple[int, int]
 ) -> tuple[Trail, Trail] | None:
     """The same of hot pixels with shares at `LINKS`, of a window of that shape and origin."""
-    rows, columns = (_along(found, shape[axis], origin[axis], axis) for axis in (0, 1))
+    rows, columns = (_along(hot, shape[axis], origin[axis], axis) for axis in (0, 1))
     return None if rows is None or columns is None else (rows, columns)
 
 
 def trailing(evidence: Evidence) -> float:
     """Significance of trails along either axis; 0 without enough hot pixels."""
-    found = trails(evidence)
-    return 0.0 if found is None else sigmas_of_best(*(one.significance for one in found))
+    both = trails(evidence)
+    return 0.0 if both is None else sigmas_of_best(*(one.significance for one in both))
 
 
-def _along(found: HotPixels, size: int, start: int, axis: int) -> Trail | None:
+def _along(hot: HotPixels, size: int, start: int, axis: int) -> Trail | None:
     links = slice(axis * REACH, (axis + 1) * REACH)
-    value, sigma = found.value[:, links], found.sigma[:, links]
+    value, sigma = hot.value[:, links], hot.sigma[:, links]
     whole = np.isfinite(sigma).all(axis=(1, 2))
-    value, sigma, charge = value[whole], sigma[whole, 0, 0], found.charge[whole] * 1e3
+    value, sigma, charge = value[whole], sigma[whole, 0, 0], hot.charge[whole] * 1e3
     if len(value) < LEAST:
         return None
-    at = (found.y, found.x)[axis][whole] + start
+    at = (hot.y, hot.x)[axis][whole] + start
     apart = (value[:, :, 0] - value[:, :, 1]).sum(axis=1)
     back = bool(np.median(apart) < 0)
-    own = value[:, :, int(back)]
-    few = len(own) // 10
-    near = np.sort(own, axis=0)[few : len(own) - few].mean(axis=0)
+    trail = value[:, :, int(back)]
+    few = len(trail) // 10
+    near = np.sort(trail, axis=0)[few : len(trail) - few].mean(axis=0)
     ratio = float(np.clip(near[1:].sum() / max(near[:-1].sum(), 1e-12), _LEAST_RATIO, _MOST_RATIO))
-    shares, noise = own.sum(axis=1), np.sqrt(REACH) * sigma
+    shares, noise = trail.sum(axis=1), np.sqrt(REACH) * sigma
     level, power = float(np.median(charge)), (1.0, 1.0)
     output = start + size - 1 if back else start
     for _ in range(_TURNS):

@@ -79,17 +79,17 @@ def differing_outputs(
     if not used.any():
         return None
     ratio /= np.nanmean(ratio)
-    found = [_parts(response, ratio, axis) for axis in (0, 1)]
+    by_axis = [_parts(response, ratio, axis) for axis in (0, 1)]
     for axis, other in ((0, 1), (1, 0)):
         # The outputs of one half may differ more than the means of both.
-        label = _alike(found[other])[1]
-        for each in set(label.tolist()) if not found[axis] else ():
+        label = _alike(by_axis[other])[1]
+        for each in set(label.tolist()) if not by_axis[axis] else ():
             maps = [np.compress(label == each, v, axis=other) for v in (response, ratio)]
-            found[axis] = max(found[axis], _parts(maps[0], maps[1], axis), key=len)
-    if not any(found):
+            by_axis[axis] = max(by_axis[axis], _parts(maps[0], maps[1], axis), key=len)
+    if not any(by_axis):
         return None
     labels, names = [], []
-    for axis, patterns in enumerate(found):
+    for axis, patterns in enumerate(by_axis):
         at, label = _alike(patterns) if patterns else ([0], np.zeros(flat.shape[axis], int))
         labels.append(label)
         names.append([_name(patterns, place, first[axis], ("row", "column")[axis]) for place in at])
@@ -139,12 +139,12 @@ def _name(patterns: Sequence[Mask], place: int, first: int, line: str) -> str:
     """Words for the rows or columns in the same patterns (place,) as a given one."""
     if not patterns:
         return ""
-    own = np.flatnonzero(np.all([p == p[place] for p in patterns], axis=0))
-    count, every = len(patterns[0]), np.diff(own).max(initial=1) == 1
+    lines = np.flatnonzero(np.all([p == p[place] for p in patterns], axis=0))
+    count, every = len(patterns[0]), np.diff(lines).max(initial=1) == 1
     kind = f"{line}s" if every else f"{('even', 'odd')[place % 2]} {line}s"
     reach = 1 if every else 2
-    low, high = own[0] >= reach, own[-1] < count - reach
-    begin, end = first + own[0] - (0 if every else own[0] % 2), first + own[-1]
+    low, high = lines[0] >= reach, lines[-1] < count - reach
+    begin, end = first + lines[0] - (0 if every else lines[0] % 2), first + lines[-1]
     if low and high:
         return f"{kind} {begin} to {end}"
     return f"{kind} from {begin}" if low else f"{kind} up to {end}" if high else kind
@@ -181,10 +181,10 @@ def _of_cells(values: F64, cell: I64, used: Mask) -> tuple[F64, F64]:
 def _profile(values: F64, axis: int) -> F64:
     """Mean of each row (axis 0) or column (1); the median of all for empty ones."""
     count = np.isfinite(values).sum(axis=1 - axis)
-    found = np.full(values.shape[axis], np.nanmedian(values))
+    means = np.full(values.shape[axis], np.nanmedian(values))
     kept = np.compress(count > 0, values, axis=axis)
-    found[count > 0] = np.nanmean(kept, axis=1 - axis)
-    return found
+    means[count > 0] = np.nanmean(kept, axis=1 - axis)
+    return means
 
 
 def _boundaries(along: F64) -> list[int]:

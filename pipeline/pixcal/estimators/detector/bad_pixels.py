@@ -79,7 +79,7 @@ def _below_rings(flat: F64, where: Mask, factor: float) -> Mask:
     # Light falls steeply at the edge of the lit area, but pixels of a ring that lie along the edge
     # are equally bright. Around a cluster of dead pixels the widest ring reaches good ones.
     y, x = np.nonzero(where)
-    found = np.zeros(len(y), np.bool_)
+    below = np.zeros(len(y), np.bool_)
     for offsets in _RINGS:
         rows, columns = y[:, None] + offsets[:, 0], x[:, None] + offsets[:, 1]
         inside = (rows >= 0) & (rows < flat.shape[0]) & (columns >= 0) & (columns < flat.shape[1])
@@ -91,8 +91,8 @@ def _below_rings(flat: F64, where: Mask, factor: float) -> Mask:
         values[~pairs] = np.nan
         # Without pairs the block decides.
         values[~pairs.any(axis=1)] = np.inf
-        found |= flat[where] < factor * np.nanmedian(values, axis=1)
-    return found
+        below |= flat[where] < factor * np.nanmedian(values, axis=1)
+    return below
 
 
 def _around(values: F64) -> tuple[F64, F64]:
@@ -101,11 +101,11 @@ def _around(values: F64) -> tuple[F64, F64]:
     # boundary, as chunks do. A pixel with an empty block keeps its value.
     maps = np.stack([values, values])
     for y, x in np.ndindex(2, 2):
-        own = values[y::2, x::2]
-        if not own.size:
+        colour = values[y::2, x::2]
+        if not colour.size:
             continue
-        found = np.stack(_of_blocks(own))
-        maps[:, y::2, x::2] = np.where(np.isfinite(found), found, own)
+        blocks = np.stack(_of_blocks(colour))
+        maps[:, y::2, x::2] = np.where(np.isfinite(blocks), blocks, colour)
     return maps[0], maps[1]
 
 
@@ -183,10 +183,10 @@ def noisy_factor(
         return least
     if below or dof < _SPREAD_DOF:  # that scatter dominates, and is far from log-normal
         alike = chdtri(dof, (np.arange(_QUANTILES) + 0.5) / _QUANTILES)
-        own = max(spread**2 - median_and_sigma(np.log(alike))[1] ** 2, 0.0) ** 0.5
+        scatter = max(spread**2 - median_and_sigma(np.log(alike))[1] ** 2, 0.0) ** 0.5
         if below or dof**2 * usual < _COARSE * quantum**2:
-            own = _UNKNOWN_SPREAD
-        reach = math.hypot(_POPULATION * own, np.log(certainly_noisy(dof)))
+            scatter = _UNKNOWN_SPREAD
+        reach = math.hypot(_POPULATION * scatter, np.log(certainly_noisy(dof)))
     return max(least, math.exp(reach / 2))
 
 
@@ -236,8 +236,8 @@ def _departing(share: F64, error: F64, weight: F64, limit: float) -> Mask:
     # A step is part of the mean, so their difference varies less than the step alone.
     spread = np.sqrt(np.maximum(error**2 - 1 / total, 0))
     off = np.abs(share - mean)
-    found = (off > limit * np.abs(mean)) & (off > _MANY_SIGNIFICANT * spread) & (weight > 0)
-    return np.asarray(found)
+    departing = (off > limit * np.abs(mean)) & (off > _MANY_SIGNIFICANT * spread) & (weight > 0)
+    return np.asarray(departing)
 
 
 def _line_medians(values: F64, axis: int) -> F64:
@@ -264,8 +264,8 @@ def _common(off: F64, brightness: F64, used: Mask) -> F64:
     rests = off.reshape(len(off), -1)[:, some]
     usable = used.reshape(len(off), -1)[:, some] & np.isfinite(rests)
     curves = [_curve(picked, products, *one) for one in zip(rests, usable, strict=True)]
-    found = (np.array(curves) @ powers.T).reshape(off.shape)
-    return np.where(used & np.isfinite(off), found, 0.0)
+    common = (np.array(curves) @ powers.T).reshape(off.shape)
+    return np.where(used & np.isfinite(off), common, 0.0)
 
 
 def _curve(powers: F64, products: F64, values: F64, usable: Mask) -> F64:

@@ -66,10 +66,10 @@ def histogram(frames: Iterable[NDArray[np.generic]], good: Mask) -> F64 | None:
             samples = whole
         if not samples.size or samples.min() < 0 or samples.max() >= MAX_CODES:
             return None
-        found = np.bincount(samples.ravel().astype(np.int64), minlength=MAX_CODES)
-        highest = int(np.flatnonzero(found)[-1])
-        found[[0, highest]] = 0
-        counts += found
+        of_stack = np.bincount(samples.ravel().astype(np.int64), minlength=MAX_CODES)
+        highest = int(np.flatnonzero(of_stack)[-1])
+        of_stack[[0, highest]] = 0
+        counts += of_stack
     return counts
 
 
@@ -88,10 +88,10 @@ def step_of(counts: F64) -> tuple[float, float]:
     none = 1.0, 0.5 / float(codes[-1])
     if taken.all():
         return none
-    found = _period(codes, taken)
+    period = _period(codes, taken)
     # The step is often a simple fraction, which the spectrum does not give exactly.
-    simple = [float(Fraction(found).limit_denominator(n)) for n in (1, 2, 4, 16, 128, 1024)]
-    trials = [t for t in (*simple, found) if t >= 1]
+    simple = [float(Fraction(period).limit_denominator(n)) for n in (1, 2, 4, 16, 128, 1024)]
+    trials = [t for t in (*simple, period) if t >= 1]
     agreed = [_agreement(codes, taken, trial) for trial in trials]
     if max(agreed) < MIN_AGREEMENT:
         return none
@@ -124,13 +124,13 @@ def _period(codes: I64, there: Mask) -> float:
 
 
 def _highest(power: Callable[[float], float], start: float, width: float) -> float:
-    found = minimize_scalar(
+    maximum = minimize_scalar(
         lambda f: -power(f),
         bounds=(start - width, start + width),
         method="bounded",
         options={"xatol": 1e-6 * width},
     )
-    return float(found.x)
+    return float(maximum.x)
 
 
 def _agreement(codes: I64, there: Mask, step: float) -> float:
@@ -144,8 +144,8 @@ def _agreement(codes: I64, there: Mask, step: float) -> float:
     both = np.count_nonzero(two & there[1:] & there[:-1])
     gaps, foreseen = ~there, distance > 0.5 - TIE
     wrong = np.count_nonzero((distance > 0.5 + TIE) & there) + both
-    found = np.count_nonzero(foreseen & gaps) - neither
-    return float(found / max(gaps.sum(), 1) - wrong / max(there.sum(), 1))
+    predicted = np.count_nonzero(foreseen & gaps) - neither
+    return float(predicted / max(gaps.sum(), 1) - wrong / max(there.sum(), 1))
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ class CodeWidths:
         square = self.width**2
         few = float(np.median(square)) < _FEW * float(np.mean(square))
         few |= float(np.median(square / self.variance)) < _TOLD
-        found, unlikely = self._measured(displaced=True, few=few)
+        widths, unlikely = self._measured(displaced=True, few=few)
         if few:
             wide, unlikely_so = self._measured(displaced=False, few=True)
             if unlikely_so < unlikely:
@@ -254,7 +254,7 @@ class CodeWidths:
                     wide = np.maximum(wide - wide[self.number].mean() * above, -1)
                 return wide
         # A code that begins after a higher one is never reached.
-        ends = np.arange(1, len(found) + 1) + np.cumsum(found)
+        ends = np.arange(1, len(widths) + 1) + np.cumsum(widths)
         ends = np.maximum(np.minimum.accumulate(ends[::-1])[::-1], 0)
         return np.diff(ends, prepend=0) - 1
 
@@ -275,25 +275,25 @@ class CodeWidths:
         weight = diags_array(1 / self.variance)
         normal, data = design.T @ weight @ design, self.width
         chance = float(np.median(self.variance))
-        own = np.full(top, float(np.mean(self.width**2)) * (0.5 if displaced else 1.0))
+        prior = np.full(top, float(np.mean(self.width**2)) * (0.5 if displaced else 1.0))
         evidence = design.T @ weight
         for _ in range(_WIDTH_FITS):
-            solved = splu(csc_array(normal + diags_array(1 / own))).solve(evidence @ data)
-            found = widths_of @ solved
+            solved = splu(csc_array(normal + diags_array(1 / prior))).solve(evidence @ data)
+            widths = widths_of @ solved
             if few:
-                own = solved**2 + chance
-            raised = self._raised(np.where(self.gap[:top], 0.0, found))
+                prior = solved**2 + chance
+            raised = self._raised(np.where(self.gap[:top], 0.0, widths))
             raised = np.where(self.gap[:top], 1.0, raised)[self.number]
             data = self.width * raised
         # Likelihood of the counts: the data were scaled by ``raised``.
-        own = solved**2 + _FLOOR * chance
+        prior = solved**2 + _FLOOR * chance
         weight = diags_array(1 / (self.variance * raised**2))
         evidence = design.T @ weight
-        factors = splu(csc_array(evidence @ design + diags_array(1 / own)))
+        factors = splu(csc_array(evidence @ design + diags_array(1 / prior)))
         likeliest = factors.solve(evidence @ data)
-        determinant = np.log(own).sum() + np.log(np.abs(factors.U.diagonal())).sum()
+        determinant = np.log(prior).sum() + np.log(np.abs(factors.U.diagonal())).sum()
         misfit = data @ (weight @ data) - likeliest @ (evidence @ data)
-        return found, float(misfit + determinant)
+        return widths, float(misfit + determinant)
 
     @property
     def uneven_above(self) -> bool:
@@ -418,7 +418,7 @@ class CodeWidths:
         weight = ~self.gap[self.number] / (self.variance + max(scatter, 0.0))
         value = weight * self.width
         total, noise = float(weight.sum()), float(weight**2 @ self.variance)
-        own = float(weight @ weight) * max(scatter, 0.0)
+        scattered = float(weight @ weight) * max(scatter, 0.0)
 
         def line(frequency: float) -> complex:
             turn = np.exp(-2j * np.pi * frequency * self.number)
@@ -429,7 +429,7 @@ class CodeWidths:
 
         def level(frequency: float) -> float:
             """Mean power without a line: for displaced thresholds it rises with frequency."""
-            return noise + own * 2 * float(np.sin(np.pi * frequency)) ** 2
+            return noise + scattered * 2 * float(np.sin(np.pi * frequency)) ** 2
 
         count = int(np.ptp(self.number)) + 1
         spread = np.zeros(4 << (count - 1).bit_length())
@@ -438,7 +438,7 @@ class CodeWidths:
         frequency = np.arange(len(spectrum)) / len(spread)
         # The local fit absorbs lower lines; those close to 0.5 cannot be separated from 0.5.
         seen = (frequency > LOWEST_RIPPLE) & (frequency < 0.5 - 2 / count)
-        levels = noise + own * 2 * np.sin(np.pi * frequency[seen]) ** 2
+        levels = noise + scattered * 2 * np.sin(np.pi * frequency[seen]) ** 2
         best = float(frequency[seen][np.argmax(spectrum[seen] / levels)])
         best = _highest(power, best, 1 / len(spread))
         # At 0.5 (even and odd codes) there is only a cosine.
@@ -449,10 +449,10 @@ class CodeWidths:
             error = np.sqrt(level(0.5)) / total
             phase = 0.0 if ends > 0 else np.pi
             return Ripple(2.0, abs(ends) / total, float(error), phase, min(top + np.log(2), 0.0))
-        found = 2 * line(best) / total
+        amplitude = 2 * line(best) / total
         error = np.sqrt(2 * level(best)) / total / self.kept(best)
         chance = float(min(free + np.log(2), 0.0))
-        return Ripple(1 / best, abs(found), float(error), float(np.angle(found)), chance)
+        return Ripple(1 / best, abs(amplitude), float(error), float(np.angle(amplitude)), chance)
 
 
 def code_widths(

@@ -26,38 +26,38 @@ _HOT, _NOISY = 6.0, 10.0
 
 
 def without_cut_off(
-    found: Combined, frames: int, step: float, lowest: float = 0.0
+    dark: Combined, frames: int, step: float, lowest: float = 0.0
 ) -> tuple[Combined, float]:
     """Frames without light, corrected for clipping at their ``lowest`` code (ADU).
 
-    ``found``: of some pixels, ADU; ``step``: of the samples, ADU. Returns them with corrected means
+    ``dark``: of some pixels, ADU; ``step``: of the samples, ADU. Returns them with corrected means
     and variances, if the noise of most pixels is clipped, and the ratio of the true variance of a
     sample to that of the clipped samples.
     """
     if lowest:
-        above_lowest = replace(found, mean=found.mean - lowest)
+        above_lowest = replace(dark, mean=dark.mean - lowest)
         corrected, factor = without_cut_off(above_lowest, frames, step)
         return replace(corrected, mean=corrected.mean + lowest), factor
-    known = np.isfinite(found.mean) & np.isfinite(found.variance)
+    known = np.isfinite(dark.mean) & np.isfinite(dark.variance)
     if not known.any():
-        return found, 1.0
+        return dark, 1.0
     # Means, as medians do not follow the model; without hot and noisy pixels.
-    centre, spread = median_and_sigma(found.mean[known])
-    spread = max(spread, math.sqrt(float(found.variance[known].mean()) / frames))
-    most = (1 + _NOISY * math.sqrt(2 / (frames - 1))) * float(np.median(found.variance[known]))
-    usual = known & (abs(found.mean - centre) <= _HOT * spread) & (found.variance <= most)
-    mean, variance = found.mean[usual], found.variance[usual]
+    centre, spread = median_and_sigma(dark.mean[known])
+    spread = max(spread, math.sqrt(float(dark.variance[known].mean()) / frames))
+    most = (1 + _NOISY * math.sqrt(2 / (frames - 1))) * float(np.median(dark.variance[known]))
+    usual = known & (abs(dark.mean - centre) <= _HOT * spread) & (dark.variance <= most)
+    mean, variance = dark.mean[usual], dark.variance[usual]
     sample = math.sqrt(float(variance.mean())) if usual.any() else 0.0
     if not 0 < float(mean.mean()) < _CUT * sample:
-        return found, 1.0
+        return dark, 1.0
 
     # Means of few frames scatter more than the levels: shrunk so that their scatter is that of the
     # levels, and further, towards the mean of all, for each pixel's likely level.
     common, true = float(mean.mean()), 0.0
     if mean.var() > 0:
         true = max(1 - sample**2 / frames / float(mean.var()), 0.0)
-    alike = np.where(usual, common + math.sqrt(true) * (found.mean - common), found.mean)
-    likely = np.where(usual, common + true * (found.mean - common), found.mean)
+    alike = np.where(usual, common + math.sqrt(true) * (dark.mean - common), dark.mean)
+    likely = np.where(usual, common + true * (dark.mean - common), dark.mean)
 
     def excess(noise: float) -> float:
         table = _of_cut_off(_LEVELS * noise, noise, step)
@@ -65,16 +65,16 @@ def without_cut_off(
 
     low, high = (end * sample for end in _RANGE)
     if not excess(low) < 0 < excess(high):
-        return found, 1.0
+        return dark, 1.0
     noise = float(brentq(excess, low, high, rtol=1e-4))
     means, variances = _of_cut_off(_LEVELS * noise, noise, step)
-    above = found.mean > means[-1]
+    above = dark.mean > means[-1]
     whole = noise**2 + SHEPPARD * step**2
     seen = np.interp(likely, means, variances)
     corrected = replace(
-        found,
-        mean=np.where(above, found.mean, np.interp(likely, means, _LEVELS * noise)),
-        variance=np.where(above, 1.0, whole / seen) * found.variance,
+        dark,
+        mean=np.where(above, dark.mean, np.interp(likely, means, _LEVELS * noise)),
+        variance=np.where(above, 1.0, whole / seen) * dark.variance,
     )
     expected = np.interp(alike, means, variances)
     return corrected, whole / float(np.nanmean(np.where(above, whole, expected)))

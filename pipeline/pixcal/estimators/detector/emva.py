@@ -201,9 +201,9 @@ def dark_slope(times: F64, means: F64) -> Measure | None:
     slope = float(lever @ means) / square
     rest = means - means.mean() - slope * lever
     variance = float(rest @ rest) / (len(times) - 2)
-    every, own = np.unique(times, return_inverse=True)
+    every, group = np.unique(times, return_inverse=True)
     if len(every) > 2:
-        count = np.bincount(own)
-        off = np.bincount(own, rest) / count
+        count = np.bincount(group)
+        off = np.bincount(group, rest) / count
         variance = max(variance, float(count @ off**2) / (len(every) - 2))
     return slope, math.sqrt(variance / square)

@@ -117,10 +117,10 @@ def flicker(evidence: Evidence) -> tuple[float, float]:
     for stack in evidence.ladder:
         light = light_of(evidence, stack)
         if len(light) > 1 and light.mean() > 0:
-            own = np.diff(light) / light.mean() - rise
-            firsts.append(float(own[0]))
+            changes = np.diff(light) / light.mean() - rise
+            firsts.append(float(changes[0]))
             before.append(level_before(evidence, stack) / float(light.mean()))
-            steps += own[1:].tolist()
+            steps += changes[1:].tolist()
     pairs = np.array(firsts) - (np.median(firsts) if firsts else 0.0)
     if len(firsts) > _WITH_BEFORE and np.ptp(before) > 0:
         design = np.stack([np.ones_like(pairs), before], axis=1)
@@ -139,15 +139,15 @@ def straight_line(times: F64, levels: F64, at: F64) -> F64:
     """Levels at times ``at`` on the line of least squared relative distances."""
     terms = 1 + (len(times) >= _WITH_OFFSET)
     design = np.stack([times, np.ones_like(times)][:terms], axis=1)
-    found = np.linalg.lstsq(design / levels[:, None], np.ones(len(levels)))[0]
-    return np.asarray(np.stack([at, np.ones_like(at)][:terms], axis=1) @ found)
+    line = np.linalg.lstsq(design / levels[:, None], np.ones(len(levels)))[0]
+    return np.asarray(np.stack([at, np.ones_like(at)][:terms], axis=1) @ line)
 
 
 @cached_on_evidence
 def ladder(evidence: Evidence) -> Ladder | None:
     """The ladder of an acquisition; None where its noise contradicts the curve of its levels."""
-    found, curve = unproven_ladder(evidence), transfer_curve(evidence)
-    return found if found is None or curve is None or _agree(found, curve) else None
+    unproven, curve = unproven_ladder(evidence), transfer_curve(evidence)
+    return unproven if unproven is None or curve is None or _agree(unproven, curve) else None
 
 
 @cached_on_evidence
@@ -168,8 +168,8 @@ def unproven_ladder(evidence: Evidence) -> Ladder | None:
     # Where the flat varies, bright pixels are more nonlinear than the mean.
     flat = evidence.flat[evidence.good] / evidence.flat[evidence.good].mean()
     moments = float((flat**2).mean()), float((flat**2 * flat).mean())
-    found = _of_one_lamp(times, levels, error, moments)
-    return None if found is None or found.wander > STEADY else found
+    one_lamp = _of_one_lamp(times, levels, error, moments)
+    return None if one_lamp is None or one_lamp.wander > STEADY else one_lamp
 
 
 def _of_one_lamp(
@@ -183,9 +183,9 @@ def _of_one_lamp(
     best, off = whole, None
     for n in np.argsort(levels)[1:-1]:
         rest = np.arange(len(times)) != n
-        found = _bent(times[rest], levels[rest], error[rest], moments)
-        if found is not None and found.wander < best.wander:
-            best, off = found, n
+        fit = _bent(times[rest], levels[rest], error[rest], moments)
+        if fit is not None and fit.wander < best.wander:
+            best, off = fit, n
     if off is None or best.wander * OFF > whole.wander * np.sqrt(len(times)):
         return whole
     return replace(best, off=times[[off]])
@@ -223,9 +223,9 @@ def _bent(times: F64, levels: F64, error: F64, moments: tuple[float, float]) -> 
     return Ladder(times, levels, sizes, whole[2:, 2:], wander, times[:0])
 
 
-def _agree(found: Ladder, curve: TransferCurve) -> bool:
+def _agree(flats: Ladder, curve: TransferCurve) -> bool:
     """Whether noise agrees with levels: variance over level follows the slope squared."""
-    u = curve.levels / found.top
+    u = curve.levels / flats.top
 
     def slope(sizes: F64) -> float:
         rise = 1 + 2 * sizes[0] * u + 3 * sizes[1] * u**2
@@ -233,9 +233,9 @@ def _agree(found: Ladder, curve: TransferCurve) -> bool:
         line = np.polyfit(curve.levels / curve.top, share, 1, w=1 / curve.errors)
         return float(line[0] / line[1])
 
-    expected = slope(found.sizes)
-    change = np.array([slope(found.sizes + _SMALL * one) - expected for one in np.eye(2)]) / _SMALL
-    error = np.hypot(curve.slope_error / curve.share, np.sqrt(change @ found.covariance @ change))
+    expected = slope(flats.sizes)
+    change = np.array([slope(flats.sizes + _SMALL * one) - expected for one in np.eye(2)]) / _SMALL
+    error = np.hypot(curve.slope_error / curve.share, np.sqrt(change @ flats.covariance @ change))
     return bool(abs(curve.slope / curve.share - expected) < DISAGREE * error)
 
 
@@ -245,8 +245,8 @@ def ladder_response(evidence: Evidence, level_e: float) -> tuple[F64, F64] | Non
     Sizes (2,) of the first and the second power of the level, and covariance; None without a
     ladder.
     """
-    found = ladder(evidence)
-    if found is None:
+    flats = ladder(evidence)
+    if flats is None:
         return None
-    scale = (level_e / found.top) ** np.arange(1, 3)
-    return found.sizes * scale, found.covariance * np.outer(scale, scale)
+    scale = (level_e / flats.top) ** np.arange(1, 3)
+    return flats.sizes * scale, flats.covariance * np.outer(scale, scale)

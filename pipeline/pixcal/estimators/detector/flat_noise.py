@@ -44,7 +44,7 @@ def _straightened(curve: TransferCurve, sizes: F64, covariance: F64) -> tuple[fl
         straight = curve.shares * (1 + u * (sizes[0] + u * sizes[1])) / rise**2
         return float(np.average(straight, weights=weight))
 
-    found = share(sizes)
-    slope = np.array([share(sizes + step) - found for step in _STEP * np.eye(2)]) / _STEP
+    value = share(sizes)
+    slope = np.array([share(sizes + step) - value for step in _STEP * np.eye(2)]) / _STEP
     slope[sizes == 0] = 0  # a power that few levels do not constrain
-    return found, float(np.sqrt(1 / weight.sum() + slope @ covariance @ slope))
+    return value, float(np.sqrt(1 / weight.sum() + slope @ covariance @ slope))

@@ -43,14 +43,14 @@ class LagNonuniformity:
     @classmethod
     def of(cls, sets: Iterable[FringeEvidence]) -> "LagNonuniformity":
         """Weighted mean of all sets; 0 ± 1 without any."""
-        found = [(*one, f.good.sum()) for f in sets if (one := uneven_pixels(f)) is not None]
-        if not found:
+        measured = [(*one, f.good.sum()) for f in sets if (one := uneven_pixels(f)) is not None]
+        if not measured:
             return cls(0.0, 1.0)
-        value, error, pixels = np.array(found).T
+        value, error, pixels = np.array(measured).T
         weight = error**-2
         square = float(weight @ value / weight.sum())
         # All sets share the same pixels and their sampling error.
-        drawn = (1 - 1 / len(found)) * 2 * square**2 / pixels.min()
+        drawn = (1 - 1 / len(measured)) * 2 * square**2 / pixels.min()
         return cls(square, float(np.sqrt(1 / weight.sum() + drawn)))
 
     @property
@@ -120,18 +120,18 @@ def _squares_of_shares(
     for other, step in zip(others, steps, strict=True):
         other[:] = np.roll(fringes.g, step, axis=0).T
         other[:, ~follows(fringes.frame, step)] = 0
-    own, weight, theta = freedom.of_time, freedom.weight, fringes.theta[:, freedom.good]
+    of_time, weight, theta = freedom.of_time, freedom.weight, fringes.theta[:, freedom.good]
     count = weight.shape[1]
     upper = np.triu_indices(3)
 
     def summed(products: F32, samples: F32) -> F32:
         """Sums over time (..., n) of products (..., t) with samples (t, n): one matrix product."""
-        found = products.reshape(-1, products.shape[-1]) @ samples
-        return found.reshape(*products.shape[:-1], count)
+        sums = products.reshape(-1, products.shape[-1]) @ samples
+        return sums.reshape(*products.shape[:-1], count)
 
-    mixed = summed(own[:, None] * others[:, None], weight)
+    mixed = summed(of_time[:, None] * others[:, None], weight)
     rights = summed(others, weighted)
-    found = []
+    means = []
     for own_squares, own_mixed, own_right in zip(
         summed(others[:, upper[0]] * others[:, upper[1]], weight), mixed, rights, strict=True
     ):
@@ -143,8 +143,8 @@ def _squares_of_shares(
         taken = np.einsum("nij,jn->in", freedom.pixel_inverse, along)
         information = np.einsum("in,ijn,jn->n", theta, squares, theta)
         information -= np.einsum("kn,kn->n", along, taken)
-        found.append(_mean_square(np.einsum("in,in->n", theta, own_right), information))
-    return found
+        means.append(_mean_square(np.einsum("in,in->n", theta, own_right), information))
+    return means
 
 
 def _mean_square(right: F64, information: F64) -> tuple[float, float]:
@@ -173,9 +173,9 @@ def _contrast_steps(frames: F64, numbers: Indices) -> tuple[F64, F64] | None:
     contrast = contrast / np.median(contrast)
     terms = np.zeros((LAGS, count))
     for back in range(1, LAGS + 1):
-        own = np.flatnonzero(follows(numbers, back))
-        light = b[own - back] / b[own]
-        terms[back - 1, own] = light * (np.cos(phase[own - back] - phase[own]) - 1)
+        after = np.flatnonzero(follows(numbers, back))
+        light = b[after - back] / b[after]
+        terms[back - 1, after] = light * (np.cos(phase[after - back] - phase[after]) - 1)
     time = numbers / numbers[-1]
     # Changes of contrast by the fit's gauge freedom and by drift.
     other = [np.ones(count), time, time**2]
@@ -233,24 +233,24 @@ def common_lag(frames: Sequence[F64], numbers: Sequence[Indices]) -> CommonLag |
 
     ``numbers``: (t,) of the frames in their set.
     """
-    found = CommonLag(0.0, 0.0, 0.0, 0.0, 0.0)
+    lag = CommonLag(0.0, 0.0, 0.0, 0.0, 0.0)
     for _ in range(CONTRAST_ROUNDS):
         steps = []
-        for own, which in zip(frames, numbers, strict=True):
+        for of_set, which in zip(frames, numbers, strict=True):
             # Linearised about the current lag, which is removed from the frames first.
-            share = float(np.clip(found.share, 0, 0.5))
-            rest = without_lag(own.astype(np.float32), share, found.keep)
+            share = float(np.clip(lag.share, 0, 0.5))
+            rest = without_lag(of_set.astype(np.float32), share, lag.keep)
             fitted = _contrast_steps(rest.astype(float), which)
             if fitted is not None:
-                steps.append((share * found.release + fitted[0], fitted[1]))
+                steps.append((share * lag.release + fitted[0], fitted[1]))
         if not steps:
             return None
         information = np.sum([n for _, n in steps], axis=0)
         right = np.sum([n @ w for w, n in steps], axis=0)
-        before, found = found, _exponential(information, right)
-        if abs(found.share - before.share) < CONVERGED * found.share_error:
+        before, lag = lag, _exponential(information, right)
+        if abs(lag.share - before.share) < CONVERGED * lag.share_error:
             break
-    return _freely(found, information, right)
+    return _freely(lag, information, right)
 
 
 def _exponential(information: F64, right: F64) -> CommonLag:
@@ -281,17 +281,17 @@ def _exponential(information: F64, right: F64) -> CommonLag:
     return CommonLag(share, float(errors[0]), best, float(errors[1]), gain(best))
 
 
-def _freely(found: CommonLag, information: F64, right: F64) -> CommonLag:
+def _freely(lag: CommonLag, information: F64, right: F64) -> CommonLag:
     """The lag with a free release in each frame, where an exponential does not describe it."""
     free = np.linalg.solve(information, right)
-    away = free - found.share * found.release
+    away = free - lag.share * lag.release
     unlike = float(away @ information @ away) >= _NOT_EXPONENTIAL
-    if not unlike or found.share < CLEAR * found.share_error:
-        return found
+    if not unlike or lag.share < CLEAR * lag.share_error:
+        return lag
     kept = np.maximum(free, 0)
     total = float(kept.sum())
     error = float(np.sqrt(np.linalg.inv(information).sum()))
-    return replace(found, share=total, share_error=error, later=tuple(map(float, kept / total)))
+    return replace(lag, share=total, share_error=error, later=tuple(map(float, kept / total)))
 
 
 def lag_of_flats(evidence: Evidence) -> tuple[float, float, float] | None:
@@ -301,18 +301,18 @@ def lag_of_flats(evidence: Evidence) -> tuple[float, float, float] | None:
     cleared; the levels show which. The third number is 1 if that charge was added, 0 if the
     detector was cleared. None if the flats do not constrain it.
     """
-    found = [(s, f) for s in evidence.stacks if (f := _first_frame(s, evidence)) is not None]
-    if len(found) <= 2:
+    firsts = [(s, f) for s in evidence.stacks if (f := _first_frame(s, evidence)) is not None]
+    if len(firsts) <= 2:
         return None
-    level, step, error = np.array([f for _, f in found]).T
+    level, step, error = np.array([f for _, f in firsts]).T
     if np.ptp(level) < 10 * error.min():
         return None
-    before = np.array([level_before(evidence, s) for s, _ in found])
-    flat = np.array([s.kind == "flat" for s, _ in found])
+    before = np.array([level_before(evidence, s) for s, _ in firsts])
+    flat = np.array([s.kind == "flat" for s, _ in firsts])
     known = 1.0 if before.any() else 0.0
     lamp = warming(evidence)
     # from the first frame to the middle of the others
-    later = np.array([len(s.adu) / 2 * (s.kind == "flat") for s, _ in found]) * level
+    later = np.array([len(s.adu) / 2 * (s.kind == "flat") for s, _ in firsts]) * level
     fits = [_fit_steps(level - c * before, step, error, flat, (later, *lamp)) for c in (0.0, known)]
     carried, (share, of_share, _) = min(
         zip((0.0, known), fits, strict=True), key=lambda one: one[1][2]
@@ -335,11 +335,11 @@ def _fit_steps(
         variance = np.diag((error * scale) ** 2) + of_rise**2 * np.outer(later, later)
         weighted = np.linalg.solve(variance, design.T).T
         covariance = np.linalg.inv(weighted @ design.T)
-        found = covariance @ (weighted @ step)
-        squares = ((step - found @ design) / error) ** 2
+        fitted = covariance @ (weighted @ step)
+        squares = ((step - fitted @ design) / error) ** 2
         if flat.sum() >= _MANY_FLATS:
             scale = np.where(flat, np.sqrt(squares[flat].sum() / (flat.sum() - 1)), 1.0)
-    return float(found[0]), float(np.sqrt(covariance[0, 0])), float(squares.sum())
+    return float(fitted[0]), float(np.sqrt(covariance[0, 0])), float(squares.sum())
 
 
 def _first_frame(stack: Stack, evidence: Evidence) -> tuple[float, float, float] | None:

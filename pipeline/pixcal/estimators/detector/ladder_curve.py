@@ -46,15 +46,15 @@ def ladder_curve(
 
     ``linearised``: charge (e-) of levels by a significant polynomial of the response.
     """
-    curve, found = transfer_curve(evidence), unproven_ladder(evidence)
-    if curve is None or found is None or len(found.times) != len(curve.levels):
+    curve, unproven = transfer_curve(evidence), unproven_ladder(evidence)
+    if curve is None or unproven is None or len(unproven.times) != len(curve.levels):
         return None
     if len(curve.levels) < MIN_LEVELS:
         return None
-    off_levels = linearised is not None and _bends_by_levels(found, linearised)
+    off_levels = linearised is not None and _bends_by_levels(unproven, linearised)
     if not off_levels and not _bends_by_noise(curve):
         return None
-    return fit_levels(curve, found.times, evidence.flat[evidence.good])
+    return fit_levels(curve, unproven.times, evidence.flat[evidence.good])
 
 
 def _bends_by_noise(curve: TransferCurve) -> bool:
@@ -65,10 +65,10 @@ def _bends_by_noise(curve: TransferCurve) -> bool:
     return sigmas_of_chi2(float(rest @ rest), len(value) - 3) > SIGNIFICANT
 
 
-def _bends_by_levels(found: Ladder, linearised: Callable[[F32], F32]) -> bool:
+def _bends_by_levels(flats: Ladder, linearised: Callable[[F32], F32]) -> bool:
     """Whether levels depart from a polynomial by more than a lamp may cause."""
-    charge = linearised(found.levels.astype(np.float32)).astype(float)
-    rest = (charge / straight_line(found.times, charge, found.times) - 1) / LAMP
+    charge = linearised(flats.levels.astype(np.float32)).astype(float)
+    rest = (charge / straight_line(flats.times, charge, flats.times) - 1) / LAMP
     return sigmas_of_chi2(float(rest @ rest), len(rest) - 2) > SIGNIFICANT
 
 

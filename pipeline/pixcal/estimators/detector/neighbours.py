@@ -100,8 +100,8 @@ def _without_crosstalk(normal: F64, right: F64) -> tuple[F64, F64]:
     linear = [n + 1 for n in constant]
 
     def fall(terms: list[int]) -> float:
-        own = np.ix_(terms, terms)
-        return float(right[terms] @ inverse_normal(normal[own]) @ right[terms])
+        block = np.ix_(terms, terms)
+        return float(right[terms] @ inverse_normal(normal[block]) @ right[terms])
 
     kept = sorted(constant + squares)
     by_squares, by_level = fall(kept), fall(sorted(constant + linear))

@@ -76,8 +76,8 @@ def shared_by_blocks(difference: F32, quantum: float) -> float:
     light, of full blocks; outliers are excluded.
     """
     blocks = _clipped(difference, quantum).reshape(-1, BLOCK**2)
-    own = float(blocks.var(axis=1, ddof=1).mean()) / BLOCK**2
-    return float(blocks.mean(axis=1).var(ddof=1) - own) / 2
+    within = float(blocks.var(axis=1, ddof=1).mean()) / BLOCK**2
+    return float(blocks.mean(axis=1).var(ddof=1) - within) / 2
 
 
 def _clipped(difference: F32, quantum: float) -> F64:
@@ -155,14 +155,14 @@ def flat_pair_sums(
         # Full pixels beside those of an overscan would pass for half-full ones without noise.
         first[~lit(level) | (level + _NEARLY * noise > full)] = np.nan
         guess = {"gain": gain, "read_noise": read_noise, "quantum": quantum}
-        for without, own in blocks.items():
-            own.append(_blocks(first, second, without, **guess))
-    found = {}
-    for without, own in blocks.items():
-        every = np.concatenate(own)
+        for without, parts in blocks.items():
+            parts.append(_blocks(first, second, without, **guess))
+    joined = {}
+    for without, parts in blocks.items():
+        every = np.concatenate(parts)
         every[:, 1] += dark * (every[:, 0] > 0)
-        found[without] = line_noise.put_back(bin_pairs(every))
-    return np.stack([found[lines], found[also_rows]])
+        joined[without] = line_noise.put_back(bin_pairs(every))
+    return np.stack([joined[lines], joined[also_rows]])
 
 
 def without_bands(lit: F64, rest: F64) -> F64:

@@ -56,18 +56,18 @@ class _Sequence:
         """Charge (t,) released in each frame, for a share of one."""
         spans = self.period / decay if in_seconds else np.full(len(self.period), 1 / decay)
         after = np.exp(-self.pause / decay) if in_seconds else np.ones(len(spans))
-        found, held = np.empty(len(spans)), 0.0
+        released, held = np.empty(len(spans)), 0.0
         for n, kept in enumerate(np.exp(-spans)):
-            found[n] = (1 - kept) * held
+            released[n] = (1 - kept) * held
             held = (kept * held + self.charge[n]) * after[n]
-        return found
+        return released
 
     def late(self, lag: Persistence) -> F64:
         """Charge (t,) released in each frame, e-."""
-        found = (1 - lag.slow_part) * self.released(lag.decay, lag.in_seconds)
+        late = (1 - lag.slow_part) * self.released(lag.decay, lag.in_seconds)
         if lag.slow_part:
-            found = found + lag.slow_part * self.released(lag.slow, True)
-        return np.asarray(lag.share * found)
+            late = late + lag.slow_part * self.released(lag.slow, True)
+        return np.asarray(lag.share * late)
 
     def of_light(self, lag: Persistence) -> "_Sequence":
         """Without what the frames lose and gain; the light of a series is steady."""
@@ -86,10 +86,10 @@ def persistence(evidence: Evidence) -> Persistence | None:
     means = [frame_means(s.adu, used) for s in evidence.stacks]
     bias = evidence.bias[used].mean()
     levels = [
-        (s, (own - bias) * evidence.gain) for s, own in zip(evidence.stacks, means, strict=True)
+        (s, (level - bias) * evidence.gain) for s, level in zip(evidence.stacks, means, strict=True)
     ]
-    found = released_late(levels, evidence.read_noise**2 / used.sum())
-    return None if found is None else found[0]
+    fit = released_late(levels, evidence.read_noise**2 / used.sum())
+    return None if fit is None else fit[0]
 
 
 def released_late(levels: Levels, least: float) -> tuple[Persistence, list[F64]] | None:
@@ -113,11 +113,11 @@ def released_late(levels: Levels, least: float) -> tuple[Persistence, list[F64]]
     freedom = sum(len(at) - 1 for at, _, _ in dark) - _PARAMETERS
     if freedom < 1:
         return None
-    found = [_fit(sequence, dark, mode, freedom, least) for mode in (False, True)]
-    left = np.array([[_misfit(sequence, of, one) for of in (dark, lit)] for one in found])
+    fits = [_fit(sequence, dark, mode, freedom, least) for mode in (False, True)]
+    left = np.array([[_misfit(sequence, of, one) for of in (dark, lit)] for one in fits])
     scale = np.maximum(left.min(axis=0), [freedom * least, 1e-12])
     count = np.array([freedom, sum(len(at) - 1 for at, _, _ in lit)])
-    best = found[int(np.argmin((left / scale) @ count))]
+    best = fits[int(np.argmin((left / scale) @ count))]
     for _ in range(_ROUNDS):
         best = _fit(sequence.of_light(best), dark, best.in_seconds, freedom, least)
     best = _of_two_kinds(sequence, dark, best, freedom - _PARAMETERS, least) or best
@@ -143,18 +143,18 @@ def told_from_drift(levels: Levels, late: Sequence[F64], least: float) -> bool:
     start = min(float(s.start_s + s.time_s[0]) for s, _ in levels if _placed(s))
     light = min(float(s.start_s + s.time_s[0]) for s, _ in levels if s.kind == "flat")
     unlit = [
-        (s.start_s + s.time_s - start, means, own)
-        for (s, means), own in zip(levels, late, strict=True)
+        (s.start_s + s.time_s - start, means, released)
+        for (s, means), released in zip(levels, late, strict=True)
         if s.kind != "flat" and _placed(s)
     ]
-    rest = np.concatenate([_about_mean(means - own) for _, means, own in unlit])
+    rest = np.concatenate([_about_mean(means - released) for _, means, released in unlit])
     freedom = len(rest) - len(unlit) - _PARAMETERS
     if freedom < 1:
         return False
     left, drift = float(rest @ rest), _left_by_drift([(at, means) for at, means, _ in unlit])
     if drift - left < _SURE**2 * max(left / freedom, least):
         return False
-    after = [(means, own) for at, means, own in unlit if start + at[0] > light]
+    after = [(means, released) for at, means, released in unlit if start + at[0] > light]
     step, expected = (
         np.concatenate([np.diff(one) for one in of]) for of in zip(*after, strict=True)
     )
@@ -206,16 +206,16 @@ def _sequence(levels: Levels) -> _Sequence | None:
     follows = [*(float(times[n][at[0]]) for n, at in runs[1:]), 0.0]
     at = [np.zeros(len(own), int) for own in times]
     charge, period, pause, series = np.zeros((4, 0))
-    for (n, own), following in zip(runs, follows, strict=True):
+    for (n, frames), following in zip(runs, follows, strict=True):
         stack, means = levels[n]
-        number = stack.frame[own] - stack.frame[own[0]]
-        first = float(times[n][own[0]])
+        number = stack.frame[frames] - stack.frame[frames[0]]
+        first = float(times[n][frames[0]])
         # Time stamps may be whole seconds: the period is that of the whole run.
-        span = (times[n][own[-1]] - first) / number[-1] if number[-1] else stack.exptime_s
+        span = (times[n][frames[-1]] - first) / number[-1] if number[-1] else stack.exptime_s
         span = float(span) if np.isfinite(span) and span > 0 else _SHORTEST
-        ends = own[-1] == len(times[n]) - 1
-        count = int(max(number[-1], (stack.last - stack.frame[own[0]]) * ends)) + 1
-        at[n][own] = len(charge) + number
+        ends = frames[-1] == len(times[n]) - 1
+        count = int(max(number[-1], (stack.last - stack.frame[frames[0]]) * ends)) + 1
+        at[n][frames] = len(charge) + number
         charge = np.append(charge, [max(float(means.mean()), 0.0)] * count)
         period = np.append(period, [span] * count)
         series = np.append(series, [n] * count)
@@ -239,8 +239,8 @@ def _fit(
     dark = np.concatenate([at for at, _, _ in series])
     unit = float(np.median(sequence.period[dark])) if in_seconds else 1.0
     bounds = tuple(float(np.log(unit * d)) for d in (_SHORTEST, LONGEST))
-    found = minimize_scalar(lambda x: share(float(np.exp(x)))[1], bounds=bounds, method="bounded")
-    decay = float(np.exp(found.x))
+    best = minimize_scalar(lambda x: share(float(np.exp(x)))[1], bounds=bounds, method="bounded")
+    decay = float(np.exp(best.x))
     size, left, model = share(decay)
     turned = (share(decay * (1 + _STEP))[2] - model) * size / (_STEP * decay)
     design = np.stack([model, turned], axis=1)
@@ -288,14 +288,14 @@ def _of_two_kinds(
 
 def _decays(sequence: _Sequence, series: Series, start: F64, limits: tuple[float, float]) -> F64:
     """Two decays (s) of least squares, ascending, from ``start`` on."""
-    found = minimize(
+    best = minimize(
         lambda x: _shares(sequence, series, np.exp(x))[2],
         np.log(start),
         method="Nelder-Mead",
         bounds=[np.log(limits)] * 2,
         options={"xatol": 1e-4, "fatol": np.inf},
     )
-    return np.asarray(np.exp(np.sort(found.x)))
+    return np.asarray(np.exp(np.sort(best.x)))
 
 
 def _shares(sequence: _Sequence, series: Series, decays: F64) -> tuple[F64, F64, float]:
@@ -307,11 +307,11 @@ def _shares(sequence: _Sequence, series: Series, decays: F64) -> tuple[F64, F64,
     return sizes, models, float(rest @ rest)
 
 
-def _misfit(sequence: _Sequence, series: Series, found: Persistence) -> float:
+def _misfit(sequence: _Sequence, series: Series, lag: Persistence) -> float:
     """Sum of squares that a persistence leaves of the levels about their means."""
     if not series:
         return 0.0
-    late, levels = _centred(sequence.late(found), series)
+    late, levels = _centred(sequence.late(lag), series)
     return float(((levels - late) ** 2).sum())
 
 

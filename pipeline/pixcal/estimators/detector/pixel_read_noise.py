@@ -53,9 +53,9 @@ class PixelNoise:
         half = freedom / 2
         # Bias and variance of the logarithm of a variance of normal samples.
         bias, error = float(digamma(half) - np.log(half)), float(polygamma(1, half))
-        own = good[measured]
-        seen -= float(np.median(seen[own]))
-        spread = robust_sigma(seen[own]) ** 2
+        used = good[measured]
+        seen -= float(np.median(seen[used]))
+        spread = robust_sigma(seen[used]) ** 2
         step = max(np.sqrt(error) / FINENESS, float(np.ptp(seen)) / (MOST - 3))
         log = np.arange(np.floor(seen.min() / step) - 1, np.ceil(seen.max() / step) + 2) * step
         # Bins of measured variances are centred on grid points.
@@ -67,7 +67,7 @@ class PixelNoise:
         start = (1 - BROAD) * start / start.sum() + BROAD / len(log)
         posterior = chance * _likeliest(chance, np.bincount(bins, minlength=len(log)), start)
         posterior /= posterior.sum(axis=1, keepdims=True)
-        ordinary = own & (np.abs(seen) <= OUTLIER * np.sqrt(max(spread, error)))
+        ordinary = used & (np.abs(seen) <= OUTLIER * np.sqrt(max(spread, error)))
         mean = float(np.mean((posterior @ np.exp(log))[bins[ordinary]]))
         binned = np.full(good.shape, -1)
         binned[measured] = bins
@@ -76,11 +76,11 @@ class PixelNoise:
     def drawn(self, rng: np.random.Generator) -> F32:
         """Read noise (y, x) of every pixel before rounding, over that of the detector."""
         known = self.bin >= 0
-        own, n = self.bin[known], len(self.log)
+        bins, n = self.bin[known], len(self.log)
         chance, within = rng.random((2, *self.bin.shape))
         # One search in the concatenated distributions.
         order = (self.cumulative + np.arange(len(self.cumulative))[:, None]).ravel()
-        index = np.clip(np.searchsorted(order, own + chance[known]) - own * n, 0, n - 1)
+        index = np.clip(np.searchsorted(order, bins + chance[known]) - bins * n, 0, n - 1)
         log = np.zeros(self.bin.shape)
         log[known] = self.log[index] + (within[known] - 0.5) * (self.log[1] - self.log[0])
         before = (np.exp(log) - self.rounding) / (1 - self.rounding)
@@ -108,7 +108,7 @@ def squares_without_hits(frames: F32) -> F64:
 def _likeliest(chance: F64, count: Indices, start: F64) -> F64:
     """Distribution (n,) of true values that makes the counts (bin,) likeliest."""
     # By expectation maximisation from a start; ``chance``: (bin, n) likelihood of each true value.
-    found = start
+    share = start
     for _ in range(STEPS):
-        found = found * (chance.T @ (count / np.maximum(chance @ found, 1e-300))) / count.sum()
-    return np.asarray(found)
+        share = share * (chance.T @ (count / np.maximum(chance @ share, 1e-300))) / count.sum()
+    return np.asarray(share)

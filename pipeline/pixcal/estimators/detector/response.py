@@ -209,11 +209,11 @@ def _joint(sums: Sequence[tuple[F64, F64]]) -> tuple[F64, F64]:
 def _alone(sums: Sequence[tuple[F64, F64]]) -> F64:
     """Shift, variance, chi-square explained, and that by an added response; axis ratio, error."""
     joint, right = _joint(sums)
-    own, rights = joint[POWERS:, POWERS:], right[POWERS:]
+    normal, rights = joint[POWERS:, POWERS:], right[POWERS:]
     if len(sums) > 1:
-        apart = np.array([1.0, -1.0]) * np.trace(own) / (_RATIO_ERROR * rights.sum())
-        own += np.outer(apart, apart)
-    covariance = np.linalg.inv(own)
+        apart = np.array([1.0, -1.0]) * np.trace(normal) / (_RATIO_ERROR * rights.sum())
+        normal += np.outer(apart, apart)
+    covariance = np.linalg.inv(normal)
     sizes = covariance @ rights
     gain = sizes @ rights
     beside = right @ inverse_normal(joint) @ right - gain

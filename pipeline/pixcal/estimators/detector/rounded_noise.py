@@ -85,10 +85,10 @@ class _Codes:
         above = codes - low
         counts = np.stack([(above == k).sum(axis=0) for k in range(above.max() + 1)])
         weights = (len(codes) + 1) ** np.arange(len(counts))
-        _, first, own = np.unique(weights @ counts, return_index=True, return_inverse=True)
+        _, first, which = np.unique(weights @ counts, return_index=True, return_inverse=True)
         self.counts = counts[:, first].T
         self.orders = gammaln(len(codes) + 1) - gammaln(self.counts + 1).sum(axis=1)
-        both, number = np.unique(own * self.round + low % self.round, return_counts=True)
+        both, number = np.unique(which * self.round + low % self.round, return_counts=True)
         self.kind, self.low = both // self.round, both % self.round
         self.number = number.astype(float)
         self._tables: dict[int, F64] = {}

@@ -84,27 +84,27 @@ def straightness(
     change = 0.0
     if drift is not None:
         means = means / np.array([one.mean() for one in drift])
-        light = [one / own for one, own in zip(light, drift, strict=True)]
+        light = [one / lamp for one, lamp in zip(light, drift, strict=True)]
         # At saturated levels the drift is extrapolated.
         change = float(np.ptp(np.concatenate([drift[n] for n in np.flatnonzero(used)])))
         # A response that is not straight changes the drift that is seen, too.
         of_drift = float(np.hypot(of_drift, change * line.max_deviation))
     ratios = [o.var(ddof=1) / o.mean() ** 2 / len(o) for o in light if len(o) > 1 and o.mean() > 0]
     error = float(np.hypot(np.sqrt(np.mean(ratios)), of_drift)) if ratios else None
-    found = Straightness(line, line.max_deviation, error, change)
+    verdict = Straightness(line, line.max_deviation, error, change)
     if line.max_deviation < LAMP or (not of_drift and line.max_deviation < SURE * (error or 0.0)):
-        return found
+        return verdict
     # Levels that do not vanish at no exposure are late by a constant time, or bent.
     favour = max(
         _noise_favours_levels(charge[used], means[used], transfer, read_variance)
         for charge in (times, times + line.late[0])
     )
     if favour < -(SURE**2):
-        found = _without_times(found, times[used], means[used])
-    if not found.rounded and not found.scatter and drift is None and favour < SURE**2:
+        verdict = _without_times(verdict, times[used], means[used])
+    if not verdict.rounded and not verdict.scatter and drift is None and favour < SURE**2:
         told = error is not None and line.max_deviation > _WORTH
-        return replace(found, lamp=told and _may_drift(levels))
-    return found
+        return replace(verdict, lamp=told and _may_drift(levels))
+    return verdict
 
 
 def _one_lamp(rates: F64, line: Linearity) -> bool:
@@ -121,11 +121,11 @@ def _at_a_steady_lamp(
     # light is None.
     once = len(set(times[used])) == used.sum()
     line = linearity(times, means, used) if once else None
-    found = _drift(levels)
-    if found is None:
+    drifts = _drift(levels)
+    if drifts is None:
         return line, None, 0.0
     steady, *shifted = (
-        linearity(times, means / [one.mean() for one in light], used) for light in found
+        linearity(times, means / [one.mean() for one in light], used) for light in drifts
     )
     if steady is None:
         return line, None, 0.0
@@ -136,7 +136,7 @@ def _at_a_steady_lamp(
         return None, None, 0.0
     changes = [one.deviation - steady.deviation for one in shifted if one is not None]
     worst = np.nanargmax(np.abs(steady.deviation))
-    return steady, found[0], float(np.linalg.norm([one[worst] for one in changes]))
+    return steady, drifts[0], float(np.linalg.norm([one[worst] for one in changes]))
 
 
 def _apart(times: F64, deviation: F64) -> float:
@@ -158,12 +158,12 @@ def _drift(levels: Sequence[Level]) -> list[list[F64]] | None:
     powers = [((one.time - middle) / half)[:, None] ** np.arange(1, _DEGREE + 1) for one in levels]
     design, value = [np.zeros((0, _DEGREE))], [np.zeros(0)]
     for t in {one.exptime for one in levels if one.usable}:
-        own = [n for n, one in enumerate(levels) if one.exptime == t and one.usable]
-        rest = [slice(int(len(levels[n].light) > 2 or not repeated), None) for n in own]
-        light = np.concatenate([levels[n].light[one] for n, one in zip(own, rest, strict=True)])
+        same = [n for n, one in enumerate(levels) if one.exptime == t and one.usable]
+        rest = [slice(int(len(levels[n].light) > 2 or not repeated), None) for n in same]
+        light = np.concatenate([levels[n].light[one] for n, one in zip(same, rest, strict=True)])
         if len(light) < 2 or light.mean() <= 0:
             continue
-        terms = np.concatenate([powers[n][one] for n, one in zip(own, rest, strict=True)])
+        terms = np.concatenate([powers[n][one] for n, one in zip(same, rest, strict=True)])
         # Photon noise falls with the root of the light.
         weight = np.sqrt(light.mean())
         design.append(weight * (terms - terms.mean(axis=0)))
@@ -187,7 +187,7 @@ def _polynomial(design: F64, value: F64, freedom: int) -> tuple[F64, F64] | None
     """Coefficients (n,) of the degree with most evidence, and shifts (n, n) by each error."""
     # None without a significant one. The degree has the least Bayesian information criterion.
     best: float = np.inf
-    found: tuple[F64, F64] | None = None
+    fit: tuple[F64, F64] | None = None
     whole = float(value @ value)
     for degree in range(1, min(_DEGREE, freedom // 2) + 1):
         terms = design[:, :degree]
@@ -202,8 +202,8 @@ def _polynomial(design: F64, value: F64, freedom: int) -> tuple[F64, F64] | None
         ratio = (whole - rest) / degree / scatter
         if criterion < best and fdtrc(degree, freedom - degree, ratio) < _BY_CHANCE:
             errors = np.linalg.cholesky(scatter * np.linalg.inv(normal))
-            best, found = criterion, (np.asarray(sizes), np.asarray(errors.T))
-    return found
+            best, fit = criterion, (np.asarray(sizes), np.asarray(errors.T))
+    return fit
 
 
 def _noise_favours_levels(charge: F64, levels: F64, transfer: F64, read_variance: float) -> float:
@@ -231,32 +231,32 @@ def _noise_favours_levels(charge: F64, levels: F64, transfer: F64, read_variance
     return misfit(np.ones_like(level)) - misfit(bent)
 
 
-def _without_times(found: Straightness, times: F64, levels: F64) -> Straightness:
+def _without_times(verdict: Straightness, times: F64, levels: F64) -> Straightness:
     """The response from levels that scatter because of exposure times or the lamp."""
     step = _rounded_to(times, levels)
     u = levels / levels.max()
-    own = step / np.sqrt(12) / times if step else np.ones_like(times)
+    sigma = step / np.sqrt(12) / times if step else np.ones_like(times)
     # Over the straight line; where times are not rounded an offset of theirs counts as straight.
     terms = [np.ones_like(u), u, *([] if step else [1 / u])]
-    design, value = np.stack(terms, axis=1) / own[:, None], levels / times / own
+    design, value = np.stack(terms, axis=1) / sigma[:, None], levels / times / sigma
     freedom = len(times) - len(terms)
     if freedom < 2:
-        return found
+        return verdict
     normal = design.T @ design
     sizes = np.linalg.solve(normal, design.T @ value)
     rest = value - design @ sizes
     scatter = np.sqrt(rest @ rest / freedom) / sizes[0]
-    if not step and scatter < _ROUGH * found.line.max_deviation:
-        return found
+    if not step and scatter < _ROUGH * verdict.line.max_deviation:
+        return verdict
     bent = linearity(times, times * (1 + 1e-3 * u), np.ones(len(u), np.bool_))
     assert bent is not None
     unit = bent.max_deviation / 1e-3
     largest = unit * abs(float(sizes[1] / sizes[0]))
     error = unit * max(scatter, 1.0 if step else 0.0) * np.sqrt(np.linalg.inv(normal)[1, 1])
     return replace(
-        found,
+        verdict,
         largest=largest,
-        error=float(np.hypot(error, found.error or 0.0)),
+        error=float(np.hypot(error, verdict.error or 0.0)),
         rounded=step,
         scatter=0.0 if step else float(scatter),
     )

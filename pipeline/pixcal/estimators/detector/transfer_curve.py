@@ -79,9 +79,9 @@ def transfer_curve(evidence: Evidence, *, whole: bool = False) -> TransferCurve 
     if np.linalg.cond(normal) > _ALIKE:
         return None
     covariance = np.linalg.inv(normal)
-    found = covariance @ (design @ weights @ share)
+    line = covariance @ (design @ weights @ share)
     errors = np.sqrt(np.diag(covariance))
-    at_zero, rise = zip(found.tolist(), errors.tolist(), strict=True)
+    at_zero, rise = zip(line.tolist(), errors.tolist(), strict=True)
     return TransferCurve(
         *at_zero, *rise, top, level, share, np.hypot(error, common / level), common
     )
@@ -92,8 +92,8 @@ def _read_alone(sums: F64) -> F64:
     # Dark signal is low, where the response has another slope than at the levels of flats.
     n, _, s12, s22, _, p2, square = sums.T
     none = np.zeros_like(n)
-    own = np.arange(len(n)) == 0
-    return np.stack([n, none, none, s22, none, p2 - s12 * own, square], axis=1)
+    first = np.arange(len(n)) == 0
+    return np.stack([n, none, none, s22, none, p2 - s12 * first, square], axis=1)
 
 
 def shot_share(
@@ -109,16 +109,16 @@ def shot_share(
         return None
     share = variance = 0.0
     for number, (n, s11, s12, s22, p1, p2, square) in enumerate(total):
-        own = number == 0
+        is_variance = number == 0
         if counted is not None and not counted[number]:
             continue
         normal, right = np.array([[s11, s12], [s12, s22]]), np.array([p1, p2])
-        scatter = square / n - own
-        prior = scatter / (known if own and known is not None else _READ_KNOWN) ** 2
+        scatter = square / n - is_variance
+        prior = scatter / (known if is_variance and known is not None else _READ_KNOWN) ** 2
         normal[1, 1] += prior
-        right[1] += prior * own
+        right[1] += prior * is_variance
         inverse = np.linalg.inv(normal)
-        times = 1 if own else 2
+        times = 1 if is_variance else 2
         share += times * (inverse @ right)[0]
         variance += times**2 * scatter * inverse[0, 0]
     # Negative if levels are too similar to separate shot noise from read noise.
@@ -144,11 +144,11 @@ def read_known(evidence: Evidence) -> float | None:
 
 def _without_light(evidence: Evidence) -> list[F64]:
     """Sums of bias and dark frames; their variance is left out if it is not that of flats."""
-    found = _of_stacks((s for s in evidence.stacks if s.kind != "flat"), evidence)
+    unlit = _of_stacks((s for s in evidence.stacks if s.kind != "flat"), evidence)
     if read_known(evidence) is None:
-        return found
+        return unlit
     other = np.arange(len(STEPS))[:, None] > 0
-    return [sums * other for sums in found]
+    return [sums * other for sums in unlit]
 
 
 def _of_stacks(stacks: Iterable[Stack], evidence: Evidence) -> list[F64]:

@@ -85,11 +85,11 @@ class FramesByPixels:
             sums = np.zeros_like(share)
             for first in range(0, len(rest), _AT_ONCE):
                 frames = slice(first, first + _AT_ONCE)
-                rows, own, times = rest[frames], self.weight[frames], self.of_time[:, frames]
+                rows, weight, times = rest[frames], self.weight[frames], self.of_time[:, frames]
                 rows -= times.T @ share
-                dots = (own * rows) @ self.of_place.T
+                dots = (weight * rows) @ self.of_place.T
                 rows -= np.einsum("tij,tj->ti", covariance[frames], dots) @ self.of_place
-                sums += times @ (own * rows)
+                sums += times @ (weight * rows)
             share = np.einsum("ikn,kn->in", inverse, sums)
         rest -= self.of_time.T @ share
         rest[self.weight == 0] = 0
@@ -228,9 +228,9 @@ def _agreement(fits: Sequence["_SetFit"], rights: Sequence[F64]) -> Agreement:
     def explained(normal: F64, right: F64) -> float:
         return float(right @ inverse_normal(normal, 1e-7) @ right)
 
-    own = [explained(fit.normal, right) for fit, right in zip(fits, rights, strict=True)]
+    each = [explained(fit.normal, right) for fit, right in zip(fits, rights, strict=True)]
     common = explained(np.sum([fit.normal for fit in fits], axis=0), np.sum(rights, axis=0))
-    return Agreement(common, sum(own), len(rights[0]) * (len(fits) - 1))
+    return Agreement(common, sum(each), len(rights[0]) * (len(fits) - 1))
 
 
 class _SetFit:

@@ -324,8 +324,8 @@ def free_frames(
         step = np.einsum("tij,tj->ti", covariance, right)
         return np.hstack([g, dk]) + step, covariance
 
-    own = stripes(good.shape)
-    one, other = sums(good & own), sums(good & ~own)
+    half = stripes(good.shape)
+    one, other = sums(good & half), sums(good & ~half)
     return solved(one[0] + other[0], one[1] + other[1]), solved(*one), solved(*other)
 
 

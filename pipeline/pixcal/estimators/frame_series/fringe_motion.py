@@ -51,14 +51,14 @@ class Motion:
 @cached_on_evidence
 def motion_of(evidence: Evidence) -> Motion | None:
     """Motion of the fringes in all sets with enough frames; None without any."""
-    found = [s for s in map(motion_series, evidence.fringes.values()) if s is not None]
-    if not found:
+    series = [s for s in map(motion_series, evidence.fringes.values()) if s is not None]
+    if not series:
         return None
-    hops = {s.name: find_hops(s) for s in found}
+    hops = {s.name: find_hops(s) for s in series}
     # A hop affects all modes, so shapes that follow the phase are fitted after its removal.
-    still = [_with_hops(s, hops[s.name], -1.0).cleaned() for s in found]
+    still = [_with_hops(s, hops[s.name], -1.0).cleaned() for s in series]
     line, cleared = without_line(still, _level)
-    angles = [np.arctan2(s.k[1], s.k[0]) for s in found]
+    angles = [np.arctan2(s.k[1], s.k[0]) for s in series]
     return Motion(
         series=cleared,
         raw=tuple(_with_hops(s, hops[s.name], 1.0) for s in still),
@@ -73,7 +73,7 @@ def vector_changes(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
 
     Walk modes, each reduced by its share of noise (Wiener); the fast part keeps its power.
     """
-    found = []
+    of_sets = []
     for fringes in evidence.fringes.values():
         series = motion_series(fringes, every=True)
         if series is None:
@@ -90,9 +90,9 @@ def vector_changes(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
         near = np.where(near > level * (1 + SLOW_SIGMAS * np.sqrt(2 / few)), near, level)
         of_slow = np.where(slow, 1 - level / power, 0)
         of_fast = np.where(slow, 0, np.sqrt(np.maximum(1 - noise / near, 0)))
-        courses = basis.series(modes * of_slow), basis.series(modes * of_fast)
-        found.append((series.name, series.time_s, *courses))
-    return found
+        changes = basis.series(modes * of_slow), basis.series(modes * of_fast)
+        of_sets.append((series.name, series.time_s, *changes))
+    return of_sets
 
 
 def _around(modes: F64, low: float, high: float, beside: int = 0) -> tuple[F64, F64]:
@@ -125,7 +125,7 @@ def find_hops(series: FrameSeries) -> tuple[Hop, ...]:
     # narrowest significant difference locates the hop.
     k, along = np.array(series.k), colour_of(series)
     across = series.values @ np.array([-k[1], k[0]]) / (k @ k)
-    rest, found = along, dict[int, float]()
+    rest, hops = along, dict[int, float]()
     for width in HOP_WINDOWS:
         if len(along) < 6 * width:
             break
@@ -142,9 +142,9 @@ def find_hops(series: FrameSeries) -> tuple[Hop, ...]:
             if not _is_step(rest, at, width, float(change[at])):
                 smooth[max(0, at - width) : at + width] = True
                 continue
-            found[at + width] = max(sharpness, found.get(at + width, 0.0))
+            hops[at + width] = max(sharpness, hops.get(at + width, 0.0))
             rest = rest - change[at] * (np.arange(len(rest)) >= at + width)
-    return _measured(along, found)
+    return _measured(along, hops)
 
 
 def _is_step(values: F64, at: int, width: int, size: float) -> bool:
@@ -157,21 +157,21 @@ def _is_step(values: F64, at: int, width: int, size: float) -> bool:
     return bool(same and abs(steps[at]) > SIGNIFICANT_STEP * scatter)
 
 
-def _measured(along: F64, found: dict[int, float]) -> tuple[Hop, ...]:
+def _measured(along: F64, sharpness: dict[int, float]) -> tuple[Hop, ...]:
     """Sizes of hops from the frames between each and its neighbours."""
-    if not found:
+    if not sharpness:
         return ()
     width = max(HOP_WINDOWS)
     steps = np.diff(along)
     slope = float(np.median(along[width:] - along[:-width])) / width if len(along) > width else 0.0
     scatter = robust_sigma(steps - np.median(steps)) / np.sqrt(2)
-    hops, frames = [], sorted(found)
+    hops, frames = [], sorted(sharpness)
     for at, before, after in zip(frames, [0, *frames[:-1]], [*frames[1:], len(along)], strict=True):
         first, last = max(before, at - width), min(after, at + width)
         apart = (last - first) / 2
         size = along[at:last].mean() - along[first:at].mean() - slope * apart
         error = scatter * np.sqrt(1 / (at - first) + 1 / (last - at))
-        hops.append(Hop(at, float(size), float(error), found[at]))
+        hops.append(Hop(at, float(size), float(error), sharpness[at]))
     return tuple(hops)
 
 

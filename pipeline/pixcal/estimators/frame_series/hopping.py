@@ -61,24 +61,24 @@ def find_hopping(
     begin, unit = np.array(start), np.array(usual)
 
     def loss(steps: F64) -> float:
-        (size, log_rate), own = np.split(begin + steps * unit, [2])
-        every = zip(values, times, own.reshape(-1, 3), strict=True)
+        (size, log_rate), of_series = np.split(begin + steps * unit, [2])
+        every = zip(values, times, of_series.reshape(-1, 3), strict=True)
         return -sum(_likelihood(v, t, size, np.exp(log_rate), *numbers) for v, t, numbers in every)
 
     limits = [(low, None) for low in (np.array(least) - begin) / unit]
     options = {"eps": STEP, "maxiter": 1000}
     best = minimize(loss, np.zeros(len(begin)), method="L-BFGS-B", bounds=limits, options=options).x
-    found, errors = begin + best * unit, unit * _errors(loss, best)
+    fitted, errors = begin + best * unit, unit * _errors(loss, best)
     # The posterior of a rate, without prior, has one hop more: few hops do not constrain it well.
-    rate, relative = float(np.exp(found[1])), float(errors[1])
+    rate, relative = float(np.exp(fitted[1])), float(errors[1])
     weight = errors[3::3] ** -2
     return Hopping(
-        float(found[0]),
+        float(fitted[0]),
         float(errors[0]),
         rate,
         rate * float(np.hypot(relative, relative**2)),
-        tuple(np.exp(found[4::3]).tolist()),
-        float(found[3::3] @ weight / weight.sum()),
+        tuple(np.exp(fitted[4::3]).tolist()),
+        float(fitted[3::3] @ weight / weight.sum()),
         float(weight.sum() ** -0.5),
     )
 

@@ -82,7 +82,7 @@ class FrameLight:
 
 def light_changes(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
     """Of every set: name, times (t,), relative intensity and contrast (t,), Wiener-filtered."""
-    found = []
+    of_sets = []
     for f in evidence.fringes.values():
         series = light_series(f)
         if series is None:
@@ -91,27 +91,27 @@ def light_changes(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
         for channel, values in enumerate(_levels(f)):
             noise, seen = float(series.noise[channel, channel]), float(np.var(values))
             changes.append((values - 1) * np.sqrt(max(1 - noise / max(seen, 1e-300), 0.0)))
-        found.append((f.name, f.time_s, changes[0], changes[1]))
-    return found
+        of_sets.append((f.name, f.time_s, changes[0], changes[1]))
+    return of_sets
 
 
-def _levels(found: FringeEvidence) -> tuple[F64, F64]:
+def _levels(fringes: FringeEvidence) -> tuple[F64, F64]:
     """Intensity over its mean and contrast over its median (t,), of independent frames."""
-    b, a = found.free[:, 0], np.hypot(found.free[:, 1], found.free[:, 2])
+    b, a = fringes.free[:, 0], np.hypot(fringes.free[:, 1], fringes.free[:, 2])
     return b / b.mean(), a / b / np.median(a / b)
 
 
 def ambient_shares(evidence: Evidence) -> list[tuple[float, float]]:
     """Share of each set's mean light that does not follow the laser, and its error."""
-    found = dict.fromkeys(evidence.fringes, (0.0, 1.0))
+    shares = dict.fromkeys(evidence.fringes, (0.0, 1.0))
     for name, _, level, contrast in light_changes(evidence):
         square = float(level @ level)
         if square > 0:
             slope = float(level @ contrast) / square
             rest = contrast - slope * level
             error = np.sqrt(float(rest @ rest) / max(len(rest) - 1, 1) / square)
-            found[name] = slope / (1 + slope), float(error) / (1 + slope) ** 2
-    return list(found.values())
+            shares[name] = slope / (1 + slope), float(error) / (1 + slope) ** 2
+    return list(shares.values())
 
 
 def gain_share(evidence: Evidence) -> tuple[float, float]:
@@ -160,8 +160,8 @@ def separate_powers(evidence: Evidence) -> float:
 @cached_on_evidence
 def light_of(evidence: Evidence) -> FrameLight | None:
     """Light of all sets with enough frames; None without any."""
-    found = {f.name: light_series(f) for f in evidence.fringes.values()}
-    sets = [s.cleaned() for s in found.values() if s is not None]
+    by_set = {f.name: light_series(f) for f in evidence.fringes.values()}
+    sets = [s.cleaned() for s in by_set.values() if s is not None]
     if not sets:
         return None
     every = evidence.fringes.values()
@@ -180,21 +180,21 @@ def light_of(evidence: Evidence) -> FrameLight | None:
 
 def _dark_series(stack: Stack, number: int, evidence: Evidence) -> FrameSeries | None:
     """Mean level of frames without light, as the first of two quantities."""
-    found = dark_offsets(stack, evidence.good, evidence.gain, evidence.read_noise)
-    if found is None or len(found) < FEWEST_DARK:
+    offsets = dark_offsets(stack, evidence.good, evidence.gain, evidence.read_noise)
+    if offsets is None or len(offsets) < FEWEST_DARK:
         return None
-    nothing = np.zeros(len(found))
+    nothing = np.zeros(len(offsets))
     return FrameSeries(
         name=f"{stack.kind}:{number}",
         k=(0.0, 0.0),
         frame=stack.frame,
         time_s=stack.time_s,
         exptime_s=stack.exptime_s,
-        values=np.stack([found.values[:, 0], nothing], axis=1),
-        apart=np.stack([found.values[:, 1], nothing], axis=1),
-        shapes=np.zeros((len(found), 0)),
-        noise=np.diag([found.noise[0], 1.0]),
-        apart_noise=np.diag([found.noise[1], 1.0]),
+        values=np.stack([offsets.values[:, 0], nothing], axis=1),
+        apart=np.stack([offsets.values[:, 1], nothing], axis=1),
+        shapes=np.zeros((len(offsets), 0)),
+        noise=np.diag([offsets.noise[0], 1.0]),
+        apart_noise=np.diag([offsets.noise[1], 1.0]),
     )
 
 
@@ -202,7 +202,7 @@ def fringe_offset_series(light: FrameLight) -> tuple[list[TimedValues], float]:
     """Slow offsets of every set, from changes of B but not A; then the remainder, e- rms."""
     light = replace(light, dark=())
     drifts, every = ("offset_walk", "offset_smooth"), (*LIGHT_PARTS, "offset_smooth")
-    found, jitter = [], []
+    offsets, jitter = [], []
     for series in light.sets:
         modes = replace(light, sets=(series,)).modes(every)
         size = np.maximum(estimate_components(modes).size, 0.0)
@@ -212,6 +212,6 @@ def fringe_offset_series(light: FrameLight) -> tuple[list[TimedValues], float]:
         drift = light.level[series.name] * sum(parts[every.index(name)] for name in drifts)
         offset = series.walk_modes.series(wiener(parts, drift[:, :, 0], modes.values[:n]))
         some = np.unique(np.linspace(0, n, min(KNOTS, n + 1)).astype(int))
-        found.append((series.name, series.time_s[some], offset[some]))
+        offsets.append((series.name, series.time_s[some], offset[some]))
         jitter.append(size[every.index("offset")])
-    return found, float(np.sqrt(np.mean(jitter)))
+    return offsets, float(np.sqrt(np.mean(jitter)))

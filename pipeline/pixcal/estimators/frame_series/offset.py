@@ -62,22 +62,24 @@ def dark_offsets(stack: Stack, good: Mask, gain: float, read_noise: float) -> Of
     return _series(stack.kind, stack.time_s, stack.start_s, means, np.array(noise), nothing)
 
 
-def fringe_offsets(found: FringeEvidence, flat: F64) -> OffsetSeries | None:
+def fringe_offsets(fringes: FringeEvidence, flat: F64) -> OffsetSeries | None:
     """Offsets of fringe frames: ``1 / flat`` after division by the flat, with B, A, phi free."""
-    masks = _quarters(found.good)
-    if len(found.g) < FEWEST or masks is None:
+    masks = _quarters(fringes.good)
+    if len(fringes.g) < FEWEST or masks is None:
         return None
-    quarters = _sums(found, flat, masks)
+    quarters = _sums(fringes, flat, masks)
     whole = tuple(np.sum(part, axis=0) for part in zip(*quarters, strict=True))
     fits = [_constant(*sums) for sums in (whole, *quarters)]
     if not all(np.isfinite(f).all() for f in fits):
         return None
     means = np.stack([value for value, _ in fits])
     noise = np.array([variance.mean() for _, variance in fits])
-    phi = found.phi
+    phi = fringes.phi
     # A nonlinear response: harmonics of the phase, and the level of the light.
-    shapes = [np.cos(phi), np.sin(phi), np.cos(2 * phi), np.sin(2 * phi), found.g[:, 0]]
-    return _series(found.name, found.time_s, found.start_s, means, noise, np.stack(shapes, axis=1))
+    shapes = [np.cos(phi), np.sin(phi), np.cos(2 * phi), np.sin(2 * phi), fringes.g[:, 0]]
+    return _series(
+        fringes.name, fringes.time_s, fringes.start_s, means, noise, np.stack(shapes, axis=1)
+    )
 
 
 def offset_modes(every: Sequence[OffsetSeries], shapes: Sequence[F64]) -> Modes:
@@ -100,13 +102,13 @@ def offset_modes(every: Sequence[OffsetSeries], shapes: Sequence[F64]) -> Modes:
         designs.append(design)
         parts.append(part)
         least = np.maximum(least, -BELOW * s.noise[0] / np.array([1.0, basis.walk.max()]))
-    own = [MIN_NOISE, -BELOW * MIN_NOISE, -BELOW * MIN_NOISE]
+    limits = [MIN_NOISE, -BELOW * MIN_NOISE, -BELOW * MIN_NOISE]
     return Modes(
         values=np.concatenate(values),
         known=np.concatenate(designs),
         parts=np.concatenate(parts, axis=1),
         start=np.concatenate([np.zeros(2), np.tile([1.0, 0.0, 0.0], len(every))]),
-        least=np.concatenate([least, np.tile(own, len(every))]),
+        least=np.concatenate([least, np.tile(limits, len(every))]),
     )
 
 
@@ -118,12 +120,12 @@ def _quarters(good: Mask) -> list[Mask] | None:
     return masks if min(int(mask.sum()) for mask in masks) >= FEWEST_PIXELS else None
 
 
-def _sums(found: FringeEvidence, flat: F64, masks: Sequence[Mask]) -> list[tuple[F64, F64]]:
+def _sums(fringes: FringeEvidence, flat: F64, masks: Sequence[Mask]) -> list[tuple[F64, F64]]:
     """Normal matrices (t, 4, 4) and right sides (t, 4) of light, fringes and offset; by mask."""
-    maps = np.concatenate([found.theta, 1 / flat[None]]).reshape(4, -1)
+    maps = np.concatenate([fringes.theta, 1 / flat[None]]).reshape(4, -1)
     rows, columns = np.triu_indices(len(maps))
-    variance = np.maximum(found.variance, np.float32(_MIN_VARIANCE))
-    pull, weight = (own.reshape(len(own), -1) for own in (found.residual, 1 / variance))
+    variance = np.maximum(fringes.variance, np.float32(_MIN_VARIANCE))
+    pull, weight = (own.reshape(len(own), -1) for own in (fringes.residual, 1 / variance))
     missing = np.isnan(pull)
     if missing.any():
         pull, weight = np.where(missing, 0, pull), np.where(missing, 0, weight)
@@ -168,7 +170,7 @@ def unlit_stacks(evidence: Evidence, *kinds: str) -> list[Stack]:
 
 def dark_offset_series(evidence: Evidence) -> list[TimedValues]:
     """Changes of the level of bias and dark frames, where these have one exposure time."""
-    found = []
+    drift = []
     for kind in ("bias", "dark"):
         stacks = unlit_stacks(evidence, kind)
         if len(stacks) != 1:
@@ -180,5 +182,5 @@ def dark_offset_series(evidence: Evidence) -> list[TimedValues]:
         size = np.maximum(estimate_components(modes).size, 0.0)
         parts = size[:, None, None, None] * modes.parts
         smooth = wiener(parts, parts[:2].sum(axis=0)[:, :, 0], modes.values)
-        found.append((f"{kind} frames", stacks[0].time_s, walk_modes(series.time_s).series(smooth)))
-    return found
+        drift.append((f"{kind} frames", stacks[0].time_s, walk_modes(series.time_s).series(smooth)))
+    return drift

@@ -22,7 +22,7 @@ class Profiled:
 
     value: float
     error: float
-    found: Components
+    components: Components
     sides: tuple[Components, ...]  # a little below and above
     log_width: float = 0.0  # from the value to either side, of the logarithm
 
@@ -42,27 +42,27 @@ def best_shape(
     Likelihoods of a ``steady`` one, of known shapes, are compared without restriction.
     """
 
-    def high(found: Components) -> float:
-        return found.profile if steady else found.likelihood
+    def high(components: Components) -> float:
+        return components.profile if steady else components.likelihood
 
     fits: list[Components] = []
     for value in trials:
         fits.append(fit(float(value), fits[-1] if fits else start, *((0,) if start else ())))
-    best = int(np.argmax([high(found) for found in fits]))
+    best = int(np.argmax([high(one) for one in fits]))
     log_value = float(np.log(trials[best]))
-    found = fit(float(trials[best]), fits[best])
+    peak = fit(float(trials[best]), fits[best])
     width = float(np.log(trials[1] / trials[0]))
     for _ in range(HALVINGS):
         # A parabola through the three, ever closer; its curvature is the information.
-        sides = tuple(fit(float(np.exp(log_value + w)), found) for w in (-width, width))
-        below, above = (high(side) - high(found) for side in sides)
+        sides = tuple(fit(float(np.exp(log_value + w)), peak) for w in (-width, width))
+        below, above = (high(side) - high(peak) for side in sides)
         curvature = -(below + above)
         error = width / np.sqrt(curvature) if curvature > 0 else np.inf
         shift = float(np.clip((above - below) / (2 * max(curvature, 1e-9)), -1, 1)) * width
-        moved = fit(float(np.exp(log_value + shift)), found)
-        if high(moved) > high(found):
-            log_value, found = log_value + shift, moved
+        moved = fit(float(np.exp(log_value + shift)), peak)
+        if high(moved) > high(peak):
+            log_value, peak = log_value + shift, moved
         width /= 2
     value = float(np.exp(log_value))
     error = min(float(error), FARTHEST) * value
-    return Profiled(value, error, found, sides, log_width=2 * width)
+    return Profiled(value, error, peak, sides, log_width=2 * width)

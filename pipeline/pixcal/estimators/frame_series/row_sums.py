@@ -32,36 +32,36 @@ CLEAR, FINEST = 4.0, 0.01
 OWN_ORDERS = 4  # harmonics of a frame's own phase that are removed from steps
 
 
-def enough_frames(found: FringeEvidence) -> bool:
+def enough_frames(fringes: FringeEvidence) -> bool:
     """Whether a set has enough frames and pixels for rows."""
-    return bool(np.count_nonzero(found.good) > _MIN_PIXELS and len(found.g) >= _MIN_FRAMES)
+    return bool(np.count_nonzero(fringes.good) > _MIN_PIXELS and len(fringes.g) >= _MIN_FRAMES)
 
 
 @dataclass(frozen=True)
 class RowSums:
     """Sums for the frames of a set that have both neighbours."""
 
-    found: FringeEvidence
+    fringes: FringeEvidence
     inside: Indices  # (t,) places of these frames in it
     rows: F64  # (y,) of the window
     right: F64  # (t, y, 3) weighted products of the maps with the residuals
     normal: F64  # (t, y, 3, 3) of the maps with each other
 
     @classmethod
-    def of(cls, found: FringeEvidence) -> "RowSums":
+    def of(cls, fringes: FringeEvidence) -> "RowSums":
         """Of a fringe set."""
-        theta = np.where(found.good, found.theta, 0).astype(np.float32).transpose(1, 2, 0)
-        inside = with_neighbours(found.frame)
-        rest, variance = found.residual[inside], found.variance[inside]
-        used = np.isfinite(rest) & found.good
+        theta = np.where(fringes.good, fringes.theta, 0).astype(np.float32).transpose(1, 2, 0)
+        inside = with_neighbours(fringes.frame)
+        rest, variance = fringes.residual[inside], fringes.variance[inside]
+        used = np.isfinite(rest) & fringes.good
         weight = np.divide(np.float32(1), variance, out=np.zeros_like(rest), where=used)
         weighted = weight * np.where(used, rest, np.float32(0))
         upper = np.triu_indices(3)
         by_row = weight.transpose(1, 0, 2) @ (theta[..., upper[0]] * theta[..., upper[1]])
         return cls(
-            found,
+            fringes,
             inside,
-            found.origin[0] + np.arange(len(theta), dtype=float),
+            fringes.origin[0] + np.arange(len(theta), dtype=float),
             (weighted.transpose(1, 0, 2) @ theta).transpose(1, 0, 2).astype(float),
             symmetric(by_row.transpose(1, 0, 2)),
         )
@@ -71,11 +71,11 @@ class RowSums:
         """Modes (t, y, m, 3) that are free in each frame: the maps, and phase slopes along y."""
         t, y = self.right.shape[:2]
         modes = np.broadcast_to(np.eye(3), (t, y, 3, 3))
-        if not np.any(self.found.dk):
+        if not np.any(self.fringes.dk):
             return modes
-        _, c, s = self.found.g[self.inside].T
+        _, c, s = self.fringes.g[self.inside].T
         turned = np.stack([np.zeros(t), -s, c], axis=1)
-        turns = grid(self.found.good.shape)[0][None] * turned[:, None]
+        turns = grid(self.fringes.good.shape)[0][None] * turned[:, None]
         return np.concatenate([modes, turns[:, :, None]], axis=2)
 
     @cached_property
@@ -90,19 +90,19 @@ class RowSums:
         Without the part that pixels and frames absorb. ``other``: (t, 3) the light's parameters in
         the frames inside. ``factors``: (y, 3) factors of these parameters in each row.
         """
-        g = self.found.g[self.inside]
-        own = (other - g @ (np.linalg.pinv(g) @ other))[:, None]
+        g = self.fringes.g[self.inside]
+        light = (other - g @ (np.linalg.pinv(g) @ other))[:, None]
         # Pixels absorb more noise than light, by their degrees of freedom.
         left = 1 - g.shape[1] / len(g)
         if factors is not None:
-            own = own * factors
-        beside = np.einsum("tyij,tyj->tyi", self.normal, np.broadcast_to(own, self.right.shape))
+            light = light * factors
+        beside = np.einsum("tyij,tyj->tyi", self.normal, np.broadcast_to(light, self.right.shape))
         across = np.einsum("tymi,tyi->tym", self._modes, beside)
         of_rest = np.einsum("tymi,tyi->tm", self._modes, self.right)
         taken = across @ self._covariance
         flat, taken_flat = (a.swapaxes(0, 1).reshape(len(self.rows), -1) for a in (across, taken))
-        normal = np.diag(np.sum(own * beside, axis=(0, 2))) - taken_flat @ flat.T
-        return left * normal, np.sum(own * self.right, axis=(0, 2)) - taken_flat @ of_rest.ravel()
+        normal = np.diag(np.sum(light * beside, axis=(0, 2))) - taken_flat @ flat.T
+        return left * normal, np.sum(light * self.right, axis=(0, 2)) - taken_flat @ of_rest.ravel()
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class RowRamp:
         knee = float(minimize_scalar(lambda k: -gain(k), bounds=near, method="bounded").x)
         slope = float(_slope(sets, ramps(knee))[0][0])
         # The second term moves the knee.
-        terms = [np.hstack([own, -way * slope * (own > 0)]) for own in ramps(knee)]
+        terms = [np.hstack([ramp, -way * slope * (ramp > 0)]) for ramp in ramps(knee)]
         errors = np.sqrt(np.diag(_slope(sets, terms)[1]))
         return cls(way, slope, float(errors[0]), knee, float(errors[1]))
 
@@ -161,10 +161,10 @@ def _slope(sets: Sequence[tuple[F64, F64, F64]], terms: Sequence[F64]) -> tuple[
     """Sizes of terms (row, n) of the share, covariance; the frames absorb the mean share."""
     n = terms[0].shape[1]
     normal, right = np.zeros((n, n)), np.zeros(n)
-    for (_, own, vector), term in zip(sets, terms, strict=True):
+    for (_, matrix, vector), term in zip(sets, terms, strict=True):
         apart = term - term.mean(axis=0)
         right += apart.T @ vector
-        normal += apart.T @ own @ apart
+        normal += apart.T @ matrix @ apart
     covariance: F64 = np.linalg.pinv(normal + 1e-30 * np.eye(n), hermitian=True).astype(float)
     return covariance @ right, covariance
 
@@ -172,7 +172,7 @@ def _slope(sets: Sequence[tuple[F64, F64, F64]], terms: Sequence[F64]) -> tuple[
 def _rows(sums: RowSums, way: int, share: F64) -> tuple[F64, F64, F64]:
     """Rows of the window, normal matrix and right-hand side of a share in each row."""
     # Parameters of the frames, less the mean share of those of the frame before or after.
-    g, mean = sums.found.g.copy(), float(share.mean())
+    g, mean = sums.fringes.g.copy(), float(share.mean())
     for t in range(len(g) - 2, -1, -1) if way > 0 else range(1, len(g)):
         g[t] = (g[t] - mean * g[t + way]) / (1 - mean)
     lost = 1 / (1 - (share - share.mean()))
@@ -201,9 +201,9 @@ def steps_of(phi: F64, way: int, origin_rad: float | None) -> F64:
     """Phase (t,) of the previous (way -1) or next (1) frame less its own, rad; 0 at the ends."""
     place = phi if origin_rad is None else np.mod(phi - origin_rad, 2 * np.pi)
     step = np.zeros(len(phi))
-    own = slice(1, None) if way < 0 else slice(None, -1)
+    frames = slice(1, None) if way < 0 else slice(None, -1)
     apart = place[:-1] - place[1:] if way < 0 else place[1:] - place[:-1]
-    step[own] = apart if origin_rad is not None else np.angle(np.exp(1j * apart))
+    step[frames] = apart if origin_rad is not None else np.angle(np.exp(1j * apart))
     return step
 
 
@@ -224,17 +224,17 @@ def find_settling(sets: Sequence[RowSums]) -> Settling:
     """The likeliest profile, of the last step or the next, in either direction of rotation."""
     origins = [None, *(2 * np.pi * n / ORIGINS for n in range(ORIGINS))]
     ways = [(way, origin) for way in (-1, 1) for origin in origins]
-    found = {one: _fit(sets, *one) for one in ways}
+    fits = {one: _fit(sets, *one) for one in ways}
     width = np.pi / ORIGINS
     while True:
-        way, origin = max(found, key=lambda one: found[one][0])
-        gain, share, error = found[way, origin]
+        way, origin = max(fits, key=lambda one: fits[one][0])
+        gain, share, error = fits[way, origin]
         chance = _significance(gain, len(ways))
         if origin is None or chance < CLEAR or width < FINEST:
             return Settling(way, origin, share, error, chance)
         # A step taken in the wrong direction is off by the share of one turn.
         for near in (origin - width / 2, origin + width / 2):
-            found[way, near] = _fit(sets, way, near)
+            fits[way, near] = _fit(sets, way, near)
         width /= 2
 
 
@@ -253,14 +253,14 @@ def _fit(sets: Sequence[RowSums], way: int, origin: float | None) -> tuple[float
     normal, right = np.zeros((KNOTS, KNOTS)), np.zeros(KNOTS)
     slopes = []
     for sums in sets:
-        f = sums.found
+        f = sums.fringes
         _, cosine, sine = f.g.T
         step = without_own_harmonics(steps_of(f.phi, way, origin), f.phi)
         # Derivative of B, A cos phi and A sin phi by the phase, times the step.
         other = step[:, None] * np.stack([np.zeros(len(step)), -sine, cosine], axis=1)
-        own, vector = sums.share(other[sums.inside])
+        matrix, vector = sums.share(other[sums.inside])
         terms = _terms(len(vector))
-        normal += terms.T @ own @ terms
+        normal += terms.T @ matrix @ terms
         right += terms.T @ vector
         if np.any(f.dk):
             slopes.append(_weighted_slope(f, step[sums.inside], f.free[sums.inside, 4]))
@@ -282,15 +282,15 @@ def _fit(sets: Sequence[RowSums], way: int, origin: float | None) -> tuple[float
 def without_own_harmonics(step: F64, phi: F64) -> F64:
     """Steps (t,) without harmonics of the frames' own phases."""
     turns = np.outer(phi, np.arange(OWN_ORDERS + 1))
-    own = np.hstack([np.cos(turns), np.sin(turns[:, 1:])])
-    return np.asarray(step - own @ np.linalg.lstsq(own, step, rcond=1e-9)[0])
+    harmonics = np.hstack([np.cos(turns), np.sin(turns[:, 1:])])
+    return np.asarray(step - harmonics @ np.linalg.lstsq(harmonics, step, rcond=1e-9)[0])
 
 
-def _weighted_slope(found: FringeEvidence, step: F64, turn: F64) -> tuple[float, float]:
+def _weighted_slope(fringes: FringeEvidence, step: F64, turn: F64) -> tuple[float, float]:
     """Change of the share from first to last row, from fringe vectors, and its weight."""
     size, moved = step - step.mean(), turn - turn.mean()
     value = float(size @ moved / (size @ size))
     left = moved - value * size
     variance = float(left @ left) / max(len(left) - 2, 1) / float(size @ size)
-    rows = found.good.shape[0] - 1
+    rows = fringes.good.shape[0] - 1
     return value * rows, 1 / (variance * rows**2)

@@ -83,18 +83,18 @@ class FrameSeries:
         )
 
 
-def motion_series(found: FringeEvidence, *, every: bool = False) -> FrameSeries | None:
+def motion_series(fringes: FringeEvidence, *, every: bool = False) -> FrameSeries | None:
     """Change (x, y) of the fringe vector, rad/px; ``every``: also of frames without neighbours."""
     slopes = np.eye(5)[3:]
     return _series(
-        found,
+        fringes,
         lambda free: free[:, 3:5],
         lambda free: np.broadcast_to(slopes, (len(free), 2, 5)),
         every=every,
     )
 
 
-def light_series(found: FringeEvidence) -> FrameSeries | None:
+def light_series(fringes: FringeEvidence) -> FrameSeries | None:
     """B over its mean less one, and the logarithm of A/B; None with too few usable frames."""
 
     def values(free: F64) -> F64:
@@ -109,14 +109,14 @@ def light_series(found: FringeEvidence) -> FrameSeries | None:
         jacobian[:, 1, 1:3] = free[:, 1:3] / square[:, None]
         return jacobian
 
-    mean = float(found.free[_lit(found), 0].mean()) if _lit(found).any() else 1.0
-    return _series(found, values, slopes)
+    mean = float(fringes.free[_lit(fringes), 0].mean()) if _lit(fringes).any() else 1.0
+    return _series(fringes, values, slopes)
 
 
-def _lit(found: FringeEvidence) -> Mask:
+def _lit(fringes: FringeEvidence) -> Mask:
     """Frames with light, fringes and samples in both halves of the pixels."""
-    usable = np.ones(len(found.free), bool)
-    for free, covariance in ((found.free, found.free_covariance), *found.halves):
+    usable = np.ones(len(fringes.free), bool)
+    for free, covariance in ((fringes.free, fringes.free_covariance), *fringes.halves):
         known = np.einsum("tii->ti", covariance)[:, :3] > 0
         usable &= np.isfinite(free).all(axis=1) & known.all(axis=1)
         b, a = free[:, 0], np.hypot(free[:, 1], free[:, 2])
@@ -125,25 +125,25 @@ def _lit(found: FringeEvidence) -> Mask:
 
 
 def _series(
-    found: FringeEvidence,
+    fringes: FringeEvidence,
     values: Callable[[F64], F64],
     slopes: Callable[[F64], F64],
     *,
     every: bool = False,
 ) -> FrameSeries | None:
-    use = _lit(found)
+    use = _lit(fringes)
     if use.sum() < FEWEST:
         return None
     taken, noises = [], []
-    for free, covariance in ((found.free, found.free_covariance), *found.halves):
+    for free, covariance in ((fringes.free, fringes.free_covariance), *fringes.halves):
         jacobian = slopes(free[use])
         taken.append(values(free[use]))
         noises.append(np.einsum("tai,tij,tbj->ab", jacobian, covariance[use], jacobian) / use.sum())
     # A window of one row does not constrain ky.
     if min(np.diag(noise).min() for noise in noises) <= 0:
         return None
-    frame, time = found.frame[use], found.time_s[use]
-    phase = np.arctan2(found.free[use, 2], found.free[use, 1])
+    frame, time = fringes.frame[use], fringes.time_s[use]
+    phase = np.arctan2(fringes.free[use, 2], fringes.free[use, 1])
     # Effects of neighbouring frames are measured in frames that have both.
     inside = np.arange(len(frame)) if every else with_neighbours(frame)
     if len(inside) < FEWEST // 2:
@@ -152,11 +152,11 @@ def _series(
     if not every:
         shapes = _follows_phase(phase, inside, walk_modes(time[inside]))
     return FrameSeries(
-        name=found.name,
-        k=found.k,
+        name=fringes.name,
+        k=fringes.k,
         frame=frame[inside],
         time_s=time[inside],
-        exptime_s=found.exptime_s,
+        exptime_s=fringes.exptime_s,
         values=taken[0][inside],
         apart=((taken[1] - taken[2]) / 2)[inside],
         shapes=shapes,
@@ -187,13 +187,13 @@ def without(values: F64, shapes: F64, basis: WalkModes) -> F64:
 
 def _follows_phase(phase: F64, inside: Indices, basis: WalkModes) -> F64:
     """Shapes (n, p) of n frames inside, functions of phases (t,) and steps; likeliest first."""
-    own = phase[inside]
-    steps = phase[inside - 1] - own, phase[inside + 1] - own
-    angles = [own, 2 * own, *steps, 3 * own, 4 * own]
+    here = phase[inside]
+    steps = phase[inside - 1] - here, phase[inside + 1] - here
+    angles = [here, 2 * here, *steps, 3 * here, 4 * here]
     for order in range(1, HARMONICS + 1):
-        angles += [(order + 4) * own] * (order + 4 <= HARMONICS)
-        angles += [step + turns * own for step in steps for turns in (order, -order)]
-    angles = angles[: max(1, int(len(own) * SPENT / 2))]
+        angles += [(order + 4) * here] * (order + 4 <= HARMONICS)
+        angles += [step + turns * here for step in steps for turns in (order, -order)]
+    angles = angles[: max(1, int(len(here) * SPENT / 2))]
     shapes = np.stack([turn(angle) for angle in angles for turn in (np.cos, np.sin)], axis=1)
     power = basis.of(shapes) ** 2
     fast = power[SLOW:].sum(axis=0) > np.maximum(power.sum(axis=0) / 2, 1e-9)

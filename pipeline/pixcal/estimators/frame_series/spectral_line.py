@@ -82,14 +82,14 @@ def without_line(
 
 
 def _without_line(every: Sequence[FrameSeries], line: Line) -> tuple[FrameSeries, ...]:
-    found = []
+    cleared = []
     for s in every:
         turn = 2 * np.pi * line.hz * s.time_s
         # Equal weights: the power around a line is its own.
         swing = np.stack([np.ones_like(turn), np.cos(turn), np.sin(turn)], axis=1)
         sizes = np.linalg.lstsq(swing, s.values)[0]
-        found.append(replace(s, values=s.values - swing @ sizes))
-    return tuple(found)
+        cleared.append(replace(s, values=s.values - swing @ sizes))
+    return tuple(cleared)
 
 
 def _spectrum(s: FrameSeries, level: F64, channels: Sequence[int], grid: F64) -> tuple[F64, F64]:
@@ -102,11 +102,11 @@ def _spectrum(s: FrameSeries, level: F64, channels: Sequence[int], grid: F64) ->
     white[place] = basis.series(basis.of(s.values[:, list(channels)]) / np.sqrt(level))
     size = 1 << int(np.ceil(np.log2(2 * OVERSAMPLING * len(white))))
     power = np.abs(np.fft.rfft(white, size, axis=0)) ** 2 / n
-    own = np.arange(len(power)) / (size * s.step_s)
+    frequency = np.arange(len(power)) / (size * s.step_s)
     at = np.arange(1, n) / (2 * n * s.step_s)
     levels = [np.interp(grid, at, column) for column in level.T]
-    found = [np.interp(grid, own, column) for column in power.T]
-    return np.stack(found, axis=1), np.stack(levels, axis=1)
+    powers = [np.interp(grid, frequency, column) for column in power.T]
+    return np.stack(powers, axis=1), np.stack(levels, axis=1)
 
 
 def _peak(grid: F64, power: F64, at: int) -> tuple[float, float]:

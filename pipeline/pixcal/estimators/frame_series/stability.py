@@ -115,9 +115,9 @@ def shared_noise(grams: Sequence[F64], pixels: int) -> F64:
         if pairs:
             correlation = gram[np.triu_indices(len(power), 1)] ** 2
             correlation /= np.outer(power, power)[np.triu_indices(len(power), 1)]
-            found = pixels * float(correlation.mean())
-            if found > 1 + 3 * np.sqrt(2 / pairs):
-                excess = max(excess, found)
+            measured = pixels * float(correlation.mean())
+            if measured > 1 + 3 * np.sqrt(2 / pairs):
+                excess = max(excess, measured)
         shares.append(min(1.0, excess / pixels))
     return np.array(shares)
 

@@ -31,8 +31,8 @@ SHORTEST = 0.1  # least step in time, over the median one
 
 def trace_products(weight: F64, parts: F64) -> F64:
     """Sum over modes of tr(W D_i W D_j), (m, m), of weights (n, c, c) and parts (c, c, m, n)."""
-    own, each = np.ascontiguousarray(weight.transpose(1, 2, 0)), range(len(parts))
-    products = [[sum(own[a, k] * parts[k, b] for k in each) for b in each] for a in each]
+    weights, each = np.ascontiguousarray(weight.transpose(1, 2, 0)), range(len(parts))
+    products = [[sum(weights[a, k] * parts[k, b] for k in each) for b in each] for a in each]
     return np.asarray(sum(products[a][b] @ products[b][a].T for a in each for b in each))
 
 
@@ -75,10 +75,10 @@ class Components:
     @cached_property
     def covariance(self) -> F64:
         """Covariance (m, m) of ``size``; zero for fixed sizes."""
-        found = np.zeros((len(self.size),) * 2)
+        covariance = np.zeros((len(self.size),) * 2)
         inside = np.ix_(self.free, self.free)
-        found[inside] = inverse_normal(_State(self.modes, self.size).information()[inside])
-        return found
+        covariance[inside] = inverse_normal(_State(self.modes, self.size).information()[inside])
+        return covariance
 
     def above(self, part: int) -> float:
         """Upper 1-sigma error of a size, at which the likelihood has fallen by exp(-1/2)."""
@@ -210,17 +210,17 @@ class _State:
 def _swept(covariance: F64) -> tuple[F64, float]:
     """Inverses (n, c, c) of covariances, and the summed logarithms of their determinants."""
     # By the sweep operator over all modes at once (Goodnight 1979, American Statistician 33, 149).
-    own, log_determinant = np.ascontiguousarray(covariance.transpose(1, 2, 0)), 0.0
-    for k in range(len(own)):
-        pivot, row = own[k, k].copy(), own[k].copy()
+    matrix, log_determinant = np.ascontiguousarray(covariance.transpose(1, 2, 0)), 0.0
+    for k in range(len(matrix)):
+        pivot, row = matrix[k, k].copy(), matrix[k].copy()
         if not pivot.min(initial=np.inf) > 0:
             raise np.linalg.LinAlgError("a covariance is not positive")
         log_determinant += float(np.log(pivot).sum())
         scaled = row / pivot
-        own -= row[:, None] * scaled
-        own[k] = own[:, k] = scaled
-        own[k, k] = -1 / pivot
-    return np.ascontiguousarray(-own.transpose(2, 0, 1)), log_determinant
+        matrix -= row[:, None] * scaled
+        matrix[k] = matrix[:, k] = scaled
+        matrix[k, k] = -1 / pivot
+    return np.ascontiguousarray(-matrix.transpose(2, 0, 1)), log_determinant
 
 
 def _log_determinant(matrix: F64) -> float:

@@ -95,15 +95,15 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
             "long for the window of {shape[1]} x {shape[0]} px ; check the frames, and which "
             "files the set lists"
         )
-    found = _refined(light, start)
-    cosine = found @ np.array(nominal) / max(np.hypot(*found) * np.hypot(*nominal), 1e-300)
+    vector = _refined(light, start)
+    cosine = vector @ np.array(nominal) / max(np.hypot(*vector) * np.hypot(*nominal), 1e-300)
     if abs(cosine) < MOST_TURNED:
         raise InputError(
             f"the fringes are {np.degrees(np.arccos(abs(cosine))):.0f} degrees from the "
             "direction of baseline_mm; correct it, or list the files of the right set"
         )
     sign = np.sign(cosine)
-    return float(sign * found[0]), float(sign * found[1])
+    return float(sign * vector[0]), float(sign * vector[1])
 
 
 def _peak(light: F64, nominal: tuple[float, float]) -> F64 | None:

@@ -37,14 +37,14 @@ def gauge_matrix(tiles: list[tuple[F64, Mask, C128]]) -> F64:
             continue
         rest = np.angle(z[good] * s.conj())
         ux, uy = (x - x.mean()) / (np.ptp(x) + 1), (y - y.mean()) / (np.ptp(y) + 1)
-        own = np.stack([np.ones(n), ux, uy, ux * ux, ux * uy, uy * uy], axis=1)
+        terms = np.stack([np.ones(n), ux, uy, ux * ux, ux * uy, uy * uy], axis=1)
         psi, ratio = np.angle(s), 1 / np.abs(s)
         modes = np.stack(fringe_modes(psi, ratio), axis=1)
         light = np.stack([np.cos(psi), np.sin(psi)], axis=1)
         # Light is smooth. Clip it, lest a few pixels of unknown response dominate the fit.
         level = np.clip(iota[good] / np.median(iota[good]), 0.0, 2.0)
         # Each tile has its own smooth phase and light: remove them before joining the tiles.
-        q, _ = np.linalg.qr(own)
+        q, _ = np.linalg.qr(terms)
         rows.append(modes - q @ (q.T @ modes))
         rights.append(rest - q @ (q.T @ rest))
         light_rows.append(light - q @ (q.T @ light))

@@ -180,12 +180,12 @@ class Scout:
         """First frame parameters: three components, transformed by means of the fringe vector."""
 
         def gram_of(n: int) -> F64:
-            own: F64 = np.zeros((len(codes[n]), len(codes[n])))
+            gram: F64 = np.zeros((len(codes[n]), len(codes[n])))
             picked = self._picked(self.tiles[n])
             for part in _parts(len(picked)):
                 electrons = self._electrons(codes[n], picked[part])
-                own += electrons @ electrons.T
-            return own
+                gram += electrons @ electrons.T
+            return gram
 
         gram = np.sum(self.each(gram_of, range(len(self.tiles))), axis=0)
         last = len(gram) - 1
@@ -301,8 +301,8 @@ class Scout:
             yy, xx = np.divmod(picked, tile.shape[1])
             y = (yy + tile.y[0] - self.reference[0]).astype(np.float32)
             x = (xx + tile.x[0] - self.reference[1]).astype(np.float32)
-            own = np.ascontiguousarray(theta[:, yy, xx], np.float32)
-            pixels = (y, x, own, tile.read[yy, xx], tile.shot[yy, xx])
+            maps = np.ascontiguousarray(theta[:, yy, xx], np.float32)
+            pixels = (y, x, maps, tile.read[yy, xx], tile.shot[yy, xx])
             frame_sums(codes.astype(np.float32), *self.coding, g, dk, *pixels, packed, right)
             return packed, right
 

@@ -165,11 +165,11 @@ def phase_bound(tile: Tile, theta: F64, frames: FrameParameters, number: int = B
     picked = where[(spread * len(where)).astype(int)]
     bounds = []
     for y, x in zip(*np.unravel_index(picked, tile.shape), strict=True):
-        own = theta[:, y, x]
+        maps = theta[:, y, x]
         g = frames.at(y + tile.y[0], x + tile.x[0])
-        variance = tile.shot[y, x] * np.maximum(g @ own, 0) + tile.read[y, x]
+        variance = tile.shot[y, x] * np.maximum(g @ maps, 0) + tile.read[y, x]
         information = g.T @ (g / variance[:, None])
-        gradient = np.array([0.0, own[2], -own[1]]) / (own[1] ** 2 + own[2] ** 2)
+        gradient = np.array([0.0, maps[2], -maps[1]]) / (maps[1] ** 2 + maps[2] ** 2)
         try:
             bounds.append(np.sqrt(gradient @ np.linalg.solve(information, gradient)))
         except np.linalg.LinAlgError:

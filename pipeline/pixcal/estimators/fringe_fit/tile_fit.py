@@ -23,9 +23,9 @@ class Coding(NamedTuple):
 
     def electrons(self, codes: U16) -> F32:
         """Electrons of codes, as float32 numbers."""
-        found = codes * np.float32(self.scale)
-        found += np.float32(self.offset)
-        return found
+        charge = codes * np.float32(self.scale)
+        charge += np.float32(self.offset)
+        return charge
 
 
 @dataclass

@@ -112,7 +112,7 @@ def find_waves(evidence: Evidence) -> Waves | None:
     allowed = {f.name: _allowed(f) for f in sets}
     light, flats = (_gains(ways[still], allowed) for still in (False, True))
     # A pattern common to light and flats is in flats and visibility, not in light over flat.
-    in_flats = all(own > other + APART for own, other in zip(flats, light, strict=True))
+    in_flats = all(flat > other + APART for flat, other in zip(flats, light, strict=True))
     best = _strongest(ways[in_flats], allowed, in_flats)
     waves = list(best.waves)
     if best.significance > SIGNIFICANT:
@@ -152,17 +152,17 @@ def _maps(fringes: FringeEvidence, evidence: Evidence, in_flats: bool) -> list[_
 
 def _gains(maps: Maps, allowed: Mapping[str, Mask]) -> tuple[float, float]:
     """Chi-square of the strongest wave in the light or flats, and in its second-best map."""
-    q = _vector(_common({name: _power(own, allowed[name]) for name, own in maps.items()}))
+    q = _vector(_common({name: _power(of_set, allowed[name]) for name, of_set in maps.items()}))
     gains: dict[str, float] = {}
-    for own in maps.values():
-        for m in own:
+    for of_set in maps.values():
+        for m in of_set:
             gains[m.kind] = gains.get(m.kind, 0.0) + _plain_gain(m, q)
     return next(iter(gains.values())), sorted(gains.values())[-2]
 
 
 def _strongest(maps: Maps, allowed: Mapping[str, Mask], in_flats: bool) -> Waves:
     """The strongest wave of each set, with a common vector if that fits as well."""
-    power = {name: _power(own, allowed[name]) for name, own in maps.items()}
+    power = {name: _power(of_set, allowed[name]) for name, of_set in maps.items()}
     apart = sum(float(p.max()) for p in power.values()) - float(_common(power).max())
     groups = [[name] for name in maps] if apart > APART and len(maps) > 1 else [list(maps)]
     trials = 0.0
@@ -172,10 +172,10 @@ def _strongest(maps: Maps, allowed: Mapping[str, Mask], in_flats: bool) -> Waves
     for names in groups:
         together = _common({n: power[n] for n in names})
         start, trials = _vector(together), trials + 3 * np.count_nonzero(together) / 4
-        own = [(n, m) for n in names for m in maps[n]]
-        fitted, q = _fitted(own, names, start)
+        pairs = [(n, m) for n in names for m in maps[n]]
+        fitted, q = _fitted(pairs, names, start)
         waves += fitted
-        for _, m in own:
+        for _, m in pairs:
             gains[m.kind] = gains.get(m.kind, 0.0) + _plain_gain(m, q)
     by_map = {kind: sigmas_of_chi2(gain, dof) for kind, gain in gains.items()}
     order = sorted(by_map, key=lambda kind: -by_map[kind])
@@ -251,14 +251,14 @@ def _fitted(
         parts = []
         for name, m in maps:
             y, x = grid(m.good.shape)
-            own = slice(6 * names.index(name), 6 * names.index(name) + 6)
+            place = slice(6 * names.index(name), 6 * names.index(name) + 6)
             signals = np.zeros((size + 2, *m.good.shape))
-            signals[own] = m.signals(q)
+            signals[place] = m.signals(q)
             # d/dq of Re(row s e) is the same with s rotated by 90 degrees, times x or y.
-            turned = six[own].view(complex) * [1j, 1j, -1j]
-            slope = np.tensordot(turned.view(float), signals[own], 1)
+            turned = six[place].view(complex) * [1j, 1j, -1j]
+            slope = np.tensordot(turned.view(float), signals[place], 1)
             signals[size], signals[size + 1] = x * slope, y * slope
-            model = np.tensordot(six[own], signals[own], 1)
+            model = np.tensordot(six[place], signals[place], 1)
             parts.append(
                 MapPart.of(signals if turn else signals[:size], m.data - model, m.free, m.good)
             )
@@ -269,10 +269,10 @@ def _fitted(
     errors = np.sqrt(np.diag(map_fit.fit_maps(parts).covariance))
     waves = []
     for n, name in enumerate(names):
-        own = slice(6 * n, 6 * n + 6)
-        spread = errors[own].reshape(3, 2).max(axis=1)
+        place = slice(6 * n, 6 * n + 6)
+        spread = errors[place].reshape(3, 2).max(axis=1)
         every = (*spread.tolist(), *errors[size:].tolist())
-        static, forward, backward = six[own].view(complex).tolist()
+        static, forward, backward = six[place].view(complex).tolist()
         waves.append(WaveFit(name, (float(q[0]), float(q[1])), static, forward, backward, every))
     return waves, q
 

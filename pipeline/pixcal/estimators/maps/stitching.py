@@ -38,7 +38,7 @@ def fields(maps: Sequence[F64], free: Sequence[F64]) -> Indices:
     lines: Lines = ((), ())
     while (more := _with_line(maps, free, lines, (0, 1))) != lines:
         lines = more
-        if any(len(own) * USUAL_SIDE > n for own, n in zip(lines, shape, strict=True)):
+        if any(len(places) * USUAL_SIDE > n for places, n in zip(lines, shape, strict=True)):
             return _numbers(shape, ((), ()))
     for _ in range(_ROUNDS):
         before = lines
@@ -52,8 +52,8 @@ def fields(maps: Sequence[F64], free: Sequence[F64]) -> Indices:
     return _numbers(shape, lines)
 
 
-def _replaced(lines: Lines, axis: int, own: Iterable[int]) -> Lines:
-    ordered = tuple(sorted(own))
+def _replaced(lines: Lines, axis: int, places: Iterable[int]) -> Lines:
+    ordered = tuple(sorted(places))
     return (ordered, lines[1]) if axis == 0 else (lines[0], ordered)
 
 
@@ -63,9 +63,9 @@ def _with_line(
     """Lines, and the best further one along given axes if it is significant."""
     field = _numbers(maps[0].shape, lines)
     fits = [FieldFit.of(values, terms, field) for values, terms in zip(maps, free, strict=True)]
-    found = {axis: _best_line(fits, lines, axis) for axis in axes}
-    axis = min(found, key=lambda one: found[one])
-    log_chance, _, place = found[axis]
+    by_axis = {axis: _best_line(fits, lines, axis) for axis in axes}
+    axis = min(by_axis, key=lambda one: by_axis[one])
+    log_chance, _, place = by_axis[axis]
     if log_chance > np.log(FALSE_ALARM_RATE):
         return lines
     return _replaced(lines, axis, {*lines[axis], place})
@@ -74,14 +74,14 @@ def _with_line(
 def within(columns: F64, field: Indices) -> F64:
     """Columns (pixel, n) less their means in each field (pixel,)."""
     count = np.maximum(np.bincount(field), 1)
-    means = np.stack([np.bincount(field, own) / count for own in columns.T], axis=1)
+    means = np.stack([np.bincount(field, column) / count for column in columns.T], axis=1)
     return np.asarray(columns - means[field])
 
 
 def _numbers(shape: tuple[int, ...], lines: Lines) -> Indices:
     row, column = (
-        np.searchsorted(own, np.arange(n), side="right")
-        for own, n in zip(lines, shape, strict=True)
+        np.searchsorted(places, np.arange(n), side="right")
+        for places, n in zip(lines, shape, strict=True)
     )
     return np.asarray(row[:, None] * (len(lines[1]) + 1) + column)
 
@@ -107,7 +107,7 @@ class FieldFit:
         columns = np.concatenate([np.where(good, values, 0.0)[None], terms]).reshape(-1, good.size)
         columns[1:] *= used
         count = np.bincount(number, used)
-        sums = np.stack([np.bincount(number, own) for own in columns])
+        sums = np.stack([np.bincount(number, column) for column in columns])
         means = sums / np.maximum(count, 1)
         columns -= means[:, number] if len(count) > 1 else means
         columns *= used
@@ -147,8 +147,8 @@ class FieldFit:
         normal = np.eye(len(begin)) * ((1 + _STEADY) * size.T + _PIXELS)[:, None, :]
         normal -= shared.swapaxes(1, 2) @ (self.covariance @ shared)
         right = step[:, 0, :, None]
-        found = (right * np.linalg.solve(normal, right)).sum(axis=(1, 2))
-        return np.asarray(found / max(self.variance, 1e-300))
+        gains = (right * np.linalg.solve(normal, right)).sum(axis=(1, 2))
+        return np.asarray(gains / max(self.variance, 1e-300))
 
 
 def _best_line(fits: Sequence[FieldFit], lines: Lines, axis: int) -> tuple[float, float, int]:

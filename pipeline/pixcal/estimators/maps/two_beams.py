@@ -64,12 +64,12 @@ def contrast_surface(theta: F64, good: Mask) -> F64:
         by_ratio = -np.tanh(values[1:] @ of_terms / 2) / 2
         return np.asarray(weight * np.vstack([np.ones_like(weight), by_ratio * of_terms])).T
 
-    found = []
+    fits = []
     for start in _STARTS:
         first = np.zeros(_TERMS + 1)
         first[0], first[1:4] = data.max(), start
-        found.append(least_squares(off, first, slopes, method="lm", max_nfev=_STEPS))
-    best = min(found, key=lambda one: float(one.cost))
+        fits.append(least_squares(off, first, slopes, method="lm", max_nfev=_STEPS))
+    best = min(fits, key=lambda one: float(one.cost))
     left = max(2 * float(best.cost) - smooth, 0.0)
     if left - free > _LEFT * misfit and chdtrc(free, left) < _OFF:
         return np.asarray(np.exp(alike))

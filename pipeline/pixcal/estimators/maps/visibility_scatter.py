@@ -17,7 +17,7 @@ Products = tuple[list[tuple[int, int]], F64, F64]
 def visibility_products(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Products:
     """Mean products per pixel, without noise: of each set with itself, then of pairs of sets."""
     # Structure that neighbours share is removed, and so is the noise of the subtracted bias.
-    maps = [_two_halves(found) for found in sets]
+    maps = [_two_halves(fringes) for fringes in sets]
     both = [(one + other) / 2 for one, other, _ in maps]
     pairs = [(m, m) for m in range(len(sets))] + list(combinations(range(len(sets)), 2))
     products, errors = np.empty((2, len(pairs)))
@@ -35,29 +35,29 @@ def visibility_products(evidence: Evidence, sets: Sequence[FringeEvidence]) -> P
     return pairs, products, errors
 
 
-def mean_light(found: FringeEvidence) -> float:
+def mean_light(fringes: FringeEvidence) -> float:
     """Mean light of a set's good pixels, e-, as reference for a charge common to all of them."""
-    light = found.theta[0][found.good]
+    light = fringes.theta[0][fringes.good]
     # Of the inverse squares, since pixels in little light change most; dead corners do not count.
     return float(np.mean(np.maximum(light, 0.1 * np.median(light)) ** -2.0) ** -0.5)
 
 
-def _two_halves(found: FringeEvidence) -> tuple[F64, F64, Mask]:
+def _two_halves(fringes: FringeEvidence) -> tuple[F64, F64, Mask]:
     """Visibility of the pixels in two halves of the frames; where both are known."""
-    one, other = (_visibility(found, half) for half in (0, 1))
+    one, other = (_visibility(fringes, half) for half in (0, 1))
     kept = np.isfinite(one) & np.isfinite(other)
     return _structure(one, kept), _structure(other, kept), kept
 
 
-def _visibility(found: FringeEvidence, half: int) -> F64:
+def _visibility(fringes: FringeEvidence, half: int) -> F64:
     """Logarithm of the visibility (y, x) of half the frames, without fringes; outliers are NaN."""
-    good = found.good
-    theta = half_theta(found, half, good)
+    good = fringes.good
+    theta = half_theta(fringes, half, good)
     rest = np.full(good.shape, np.nan)
     rest[good] = np.log(np.maximum(np.hypot(theta[1], theta[2]), 1e-9) / np.maximum(theta[0], 1e-9))
     rest = without_outliers(rest)
     used = np.isfinite(rest)
-    rest[used] = without(rest[used][:, None], gauge_terms(found)[:, used].T)[:, 0]
+    rest[used] = without(rest[used][:, None], gauge_terms(fringes)[:, used].T)[:, 0]
     return rest
 
 

@@ -100,8 +100,8 @@ def family(
     def mark(measure: Callable[[Any, Any], Curve | None]) -> tuple[Statistic, ...]:
         made = []
         for words in members:
-            own = {key: filled(option, words) for key, option in options.items()}
-            one = statistic(*(filled(text, words) for text in texts), **own)
+            named = {key: filled(option, words) for key, option in options.items()}
+            one = statistic(*(filled(text, words) for text in texts), **named)
             made.append(replace(one(partial(measure, words[0])), name=filled(name, words)))
         return tuple(made)
 
@@ -111,19 +111,19 @@ def family(
 @cache
 def known_statistics() -> Mapping[str, Statistic]:
     """All statistics, by name."""
-    found: dict[str, Statistic] = {}
+    by_name: dict[str, Statistic] = {}
     for module in pkgutil.iter_modules(__path__):
         contents = vars(importlib.import_module(f"{__name__}.{module.name}"))
         for value in contents.values():
             for one in value if isinstance(value, tuple) else (value,):
                 if isinstance(one, Statistic):
-                    found[one.name] = one
-    return found
+                    by_name[one.name] = one
+    return by_name
 
 
 def measure(evidence: Evidence) -> dict[Key, Curve]:
     """Every statistic for which an acquisition has the frames."""
-    found: dict[Key, Curve] = {}
+    curves: dict[Key, Curve] = {}
     sets = {name: FringeSetData(fringes, evidence) for name, fringes in evidence.fringes.items()}
     every: tuple[tuple[str, Any], ...] = ((DETECTOR, tuple(sets.values())),)
     for name, one in known_statistics().items():
@@ -131,5 +131,5 @@ def measure(evidence: Evidence) -> dict[Key, Curve]:
         for of, what in sets.items() if one.of_set else whole:
             curve = one.measure(what)
             if curve is not None and len(curve.value) and np.isfinite(curve.value).all():
-                found[name, of] = curve
-    return found
+                curves[name, of] = curve
+    return curves

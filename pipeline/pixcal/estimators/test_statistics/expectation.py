@@ -86,20 +86,20 @@ class Reference:
             stack = np.stack([s[key].value for s in simulated])
             power = statistic_named(key[0]).kind == "power"
             usual[key] = np.median(stack, axis=0) if power else None
-            own = usual[key]
-            values[key] = stack if own is None else scaled(stack, own)
+            scale = usual[key]
+            values[key] = stack if scale is None else scaled(stack, scale)
         floors = {key: statistic_named(key[0]).floor for key in values}
         independent = {key: independent_values(v, floors[key]) for key, v in values.items()}
         return cls(usual, values, independent)
 
     def on_scale(self, curves: Curves) -> dict[Key, F64]:
         """Curves on the scales of the reference, where it has them."""
-        found = {}
+        rescaled = {}
         for key, usual in self.usual.items():
             curve = curves.get(key)
             if curve is not None and len(curve.value) == self.values[key].shape[1]:
-                found[key] = curve.value if usual is None else scaled(curve.value, usual)
-        return found
+                rescaled[key] = curve.value if usual is None else scaled(curve.value, usual)
+        return rescaled
 
 
 @dataclass(frozen=True)
@@ -147,8 +147,8 @@ def expect_with(
             pairs[key] = np.stack([scaled_ones[n][key] for n in having]), values[having]
     mean, variance = dict(nominal.mean), dict(nominal.variance)
     usual = _usual_scatter(pairs, nominal)
-    for key, (own, same_seeds) in pairs.items():
-        change, count, noise = own - same_seeds, len(own), nominal.noise[key]
+    for key, (stack, same_seeds) in pairs.items():
+        change, count, noise = stack - same_seeds, len(stack), nominal.noise[key]
         paired = change.var(axis=0, ddof=1) if count > 1 else usual * noise
         # Variance not shared between equal seeds, over the noise: 2 if none is shared.
         apart = min(float(np.mean(paired / noise)), 2.0)
@@ -160,7 +160,7 @@ def expect_with(
         if count > 1:
             # Scatter added by the effects, beyond the sampling error of few seeds.
             chance = noise * np.sqrt(4 * apart * (1 - apart / 4) / (count - 1))
-            excess = own.var(axis=0, ddof=1) - same_seeds.var(axis=0, ddof=1) - chance
+            excess = stack.var(axis=0, ddof=1) - same_seeds.var(axis=0, ddof=1) - chance
             more += np.maximum(excess, 0)
         variance[key] = nominal.variance[key] + more
     return replace(nominal, mean=mean, variance=variance)
@@ -185,9 +185,9 @@ def _certain(shift: F64, chance: F64) -> F64:
 
 def _variance(values: F64, floor: float) -> F64:
     """Variance (n,), shrunk towards that of the curve so that none is tiny by chance."""
-    own = values.var(axis=0, ddof=1)
+    scatter = values.var(axis=0, ddof=1)
     rounding = (1e-9 * np.abs(values).max(axis=0)) ** 2
-    leaning = 0.9 * own + 0.1 * np.median(own) + rounding + 1e-300
+    leaning = 0.9 * scatter + 0.1 * np.median(scatter) + rounding + 1e-300
     return np.asarray(np.maximum(leaning, floor**2))
 
 

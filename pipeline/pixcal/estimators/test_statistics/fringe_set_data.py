@@ -218,10 +218,10 @@ def _pairs(good: Mask, steps: Sequence[tuple[int, int]]) -> tuple[F32, F64]:
     """Pairs of good pixels (step, y, x), by the place of the first, and their number (step, y)."""
     ny, nx = good.shape
     pairs = np.zeros((len(steps), ny, nx), np.float32)
-    for own, (dy, dx) in zip(pairs, steps, strict=True):
+    for pair, (dy, dx) in zip(pairs, steps, strict=True):
         here = (slice(0, ny - dy), slice(max(0, -dx), nx - max(0, dx)))
         there = (slice(dy, ny), slice(max(0, dx), nx + min(0, dx)))
-        own[: ny - dy, : nx - abs(dx)] = good[here] & good[there]
+        pair[: ny - dy, : nx - abs(dx)] = good[here] & good[there]
     return pairs, pairs.sum(axis=2, dtype=float)
 
 

@@ -129,10 +129,10 @@ class Gap:
     def of_domain(self, domain: str) -> tuple[float, float]:
         """Weight of a domain, and of its remaining part, over the whole initial gap."""
         whole = sum(self.weights.values()) or 1.0
-        own = [k for k in self.left if statistic_named(k[0]).domain == domain]
+        keys = [k for k in self.left if statistic_named(k[0]).domain == domain]
         return (
-            sum(self.weights.get(k, 0.0) for k in own) / whole,
-            sum(self.weights.get(k, 0.0) * self.left[k] for k in own) / whole,
+            sum(self.weights.get(k, 0.0) for k in keys) / whole,
+            sum(self.weights.get(k, 0.0) * self.left[k] for k in keys) / whole,
         )
 
 
@@ -156,9 +156,9 @@ def gap_of(
     """Remaining gap: shares ``left`` of weighted curves, and the weights of ``new`` curves."""
     whole = sum(weights.values())
     total = sum(weights[k] * left[k] for k in left)
-    for own in new.values():
-        total += own
-    every = {**left, **{k: own / max(whole, 1e-12) for k, own in new.items()}}
+    for size in new.values():
+        total += size
+    every = {**left, **{k: size / max(whole, 1e-12) for k, size in new.items()}}
     return Gap(total / whole if whole else 0.0, weights, every)
 
 

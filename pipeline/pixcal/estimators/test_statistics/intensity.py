@@ -19,13 +19,13 @@ ORDERS = (2, 3, 4)  # harmonics
 
 def _harmonics(data: FringeSetData) -> C128:
     """Two to four times the phase in the residuals (order, pixel), over the fringe amplitude."""
-    found, good = data.fringes, data.good
-    alpha = float(np.median(np.hypot(found.theta[1], found.theta[2])[good]))
-    turns = np.exp(-1j * np.outer(ORDERS, found.phi)).astype(np.complex64)
+    fringes, good = data.fringes, data.good
+    alpha = float(np.median(np.hypot(fringes.theta[1], fringes.theta[2])[good]))
+    turns = np.exp(-1j * np.outer(ORDERS, fringes.phi)).astype(np.complex64)
     # The signal goes with sin(phi + psi).
     moments = (turns.real @ data.electrons + 1j * (turns.imag @ data.electrons))[:, good.ravel()]
     return np.asarray(
-        2 * moments * np.exp(-1j * np.outer(ORDERS, data.psi[good])) / len(found.phi) / alpha
+        2 * moments * np.exp(-1j * np.outer(ORDERS, data.psi[good])) / len(fringes.phi) / alpha
     )
 
 
@@ -102,11 +102,11 @@ def photon_transfer_shape(evidence: Evidence) -> Curve | None:
 )
 def flat_ladder(evidence: Evidence) -> Curve | None:
     """Departure of each level of one lamp from the line over exposure time."""
-    found = ladder(evidence)
-    if found is None:
+    flats = ladder(evidence)
+    if flats is None:
         return None
-    line = straight_line(found.times, found.levels, found.times)
-    return Curve(found.times, found.levels / line - 1)
+    line = straight_line(flats.times, flats.levels, flats.times)
+    return Curve(flats.times, flats.levels / line - 1)
 
 
 @of_intensity("frequency of each bit in the samples", "frequency − ½", x="bit")

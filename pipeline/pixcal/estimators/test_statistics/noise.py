@@ -225,12 +225,12 @@ def jumping(frames: F32) -> Mask:
 
 def ranges_about(values: F64, quantiles: Sequence[float]) -> F64:
     """Mean around each quantile q, over ranks within min(q, 1 - q) / 2, as integers jump."""
-    ordered, found = np.sort(values), []
+    ordered, means = np.sort(values), []
     for q in quantiles:
         apart = min(q, 1 - q) / 2
         first = int((q - apart) * len(ordered))
-        found.append(float(ordered[first : max(int((q + apart) * len(ordered)), first + 1)].mean()))
-    return np.array(found)
+        means.append(float(ordered[first : max(int((q + apart) * len(ordered)), first + 1)].mean()))
+    return np.array(means)
 
 
 @of_noise(

@@ -44,9 +44,9 @@ def tone_sigmas(noise: F32, good: Mask) -> Curve:
     # frame.
     highest = highest_ordinate(noise, good)
     ninth = 1 / (9 * len(noise))
-    own = (float(np.cbrt(highest.value[0])) - (1 - ninth)) / np.sqrt(ninth)
+    normal = (float(np.cbrt(highest.value[0])) - (1 - ninth)) / np.sqrt(ninth)
     count = (noise.shape[1] - 1) * (noise.shape[2] // 2)
-    return Curve(highest.x, np.array([sigmas_of_largest(own, count)]))
+    return Curve(highest.x, np.array([sigmas_of_largest(normal, count)]))
 
 
 def strongest(sizes: F64) -> float:

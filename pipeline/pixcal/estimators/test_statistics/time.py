@@ -79,9 +79,9 @@ def contrast_by_step(data: FringeSetData) -> Curve:
     slow = np.stack([np.ones(len(phi)), np.linspace(-1, 1, len(phi))], axis=1)
     values = []
     for lag in LAGS[:3]:
-        own = np.flatnonzero(follows(data.fringes.frame, lag))
-        terms = np.column_stack([slow[own], np.cos(phi[own] - phi[own - lag])])
-        values.append(float(np.linalg.lstsq(terms, contrast[own], rcond=DISTINCT)[0][-1]))
+        later = np.flatnonzero(follows(data.fringes.frame, lag))
+        terms = np.column_stack([slow[later], np.cos(phi[later] - phi[later - lag])])
+        values.append(float(np.linalg.lstsq(terms, contrast[later], rcond=DISTINCT)[0][-1]))
     return Curve(np.array(LAGS[:3], float), np.array(values))
 
 
@@ -107,18 +107,18 @@ def frames_by_phase(data: FringeSetData) -> Curve:
 )
 def allan_of_batches(data: FringeSetData) -> Curve | None:
     """Allan variance of the pixels' offsets, over lengths of one, two and four batches."""
-    found = data.fringes
-    size = len(found.g) // BATCHES
+    fringes = data.fringes
+    size = len(fringes.g) // BATCHES
     if size < 8:
         return None
-    k = float(np.hypot(*found.k))
+    k = float(np.hypot(*fringes.k))
     good = data.good.ravel()
     _, of_sine, of_cosine = data.theta[:, good].astype(float)
     shifts = []
     for n in range(BATCHES):
-        own = slice(n * size, (n + 1) * size)
-        inverse = np.linalg.pinv(found.g[own])[1:].astype(np.float32)
-        c, s = (inverse @ data.electrons[own])[:, good]
+        batch = slice(n * size, (n + 1) * size)
+        inverse = np.linalg.pinv(fringes.g[batch])[1:].astype(np.float32)
+        c, s = (inverse @ data.electrons[batch])[:, good]
         # theta = (iota, alpha sin psi, alpha cos psi): a turn of psi moves along (cos, -sin).
         shifts.append((c * of_cosine - s * of_sine) / (of_sine**2 + of_cosine**2) / k)
     values = np.stack(shifts)

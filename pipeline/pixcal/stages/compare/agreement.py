@@ -228,5 +228,5 @@ def three_cornered_hat(
     design = np.zeros((len(pairs), 1 + max(map(max, pairs))))
     np.put_along_axis(design, np.array(pairs), 1 / np.maximum(errors, 1e-300)[:, None], axis=1)
     inverse = np.linalg.pinv(design)
-    own, errors = inverse @ (values * design.max(axis=1)), np.hypot.reduce(inverse, axis=1)
-    return [VarianceEstimate(float(v), float(e)) for v, e in zip(own, errors, strict=True)]
+    variances, errors = inverse @ (values * design.max(axis=1)), np.hypot.reduce(inverse, axis=1)
+    return [VarianceEstimate(float(v), float(e)) for v, e in zip(variances, errors, strict=True)]

@@ -178,8 +178,8 @@ def _summary(pairs: list[dict[str, Any]], components: Iterable[str]) -> dict[str
         facts = [pair["components"][name] for pair in pairs]
         beyond = (f["beyond_noise"] for f in facts)
         excess = [VarianceEstimate(e["variance_px2"], e["variance_error_px2"]) for e in beyond]
-        own = three_cornered_hat([pair["sides"] for pair in pairs], excess)
-        summary[name] = {"ratio": [f["ratio"] for f in facts], "own": [e.facts() for e in own]}
+        hat = three_cornered_hat([pair["sides"] for pair in pairs], excess)
+        summary[name] = {"ratio": [f["ratio"] for f in facts], "own": [e.facts() for e in hat]}
     return summary
 
 

@@ -104,13 +104,13 @@ def worsened(sets: Mapping[str, Any], pairs: Sequence[Mapping[str, Any]]) -> str
     # measure the same offsets.
     for name, facts in sets.items():
         for lines in ("rows", "columns"):
-            own = facts[lines]
-            if own is None or None in (own["before_px"], own["after_px"]):
+            change = facts[lines]
+            if change is None or None in (change["before_px"], change["after_px"]):
                 continue
-            if own["after_px"] > np.hypot(own["before_px"], WORSE * own["chance_px"]):
+            if change["after_px"] > np.hypot(change["before_px"], WORSE * change["chance_px"]):
                 return (
-                    f"in set {name} the pattern of {lines} grows from {own['before_px']:.2g} to "
-                    f"{own['after_px']:.2g} px"
+                    f"in set {name} the pattern of {lines} grows from {change['before_px']:.2g} to "
+                    f"{change['after_px']:.2g} px"
                 )
     for pair in pairs:
         before, after = (

@@ -68,10 +68,10 @@ class Candidate:
 
         ``share``: fraction of its significance that the accepted causes do not produce.
         """
-        found = self.estimate
-        assert found is not None
+        measured = self.estimate
+        assert measured is not None
         laws = [self.law] if self.law else []
-        variants = list(dict.fromkeys([found.effect, found.significant_part, *laws]))
+        variants = list(dict.fromkeys([measured.effect, measured.significant_part, *laws]))
         if share < NEARLY_ALL:
             variants += [one.scaled(share) for one in variants]
         if self.replay is not None:
@@ -100,9 +100,9 @@ class Considered:
         """The same, with candidates measured on evidence; replays are of the unseen one."""
         there = {effect.name for effect in self.base}
         tried = {name: kind for name, kind in self.kinds.items() if name not in there}
-        found = each_of(tried, partial(estimate, evidence), runtime, "estimate effects")
+        estimates = each_of(tried, partial(estimate, evidence), runtime, "estimate effects")
         candidates = {}
-        for name, one in found.items():
+        for name, one in estimates.items():
             if isinstance(one, Estimate):
                 candidates[name] = Candidate(name, one, one.refused, replay=_replayed(one, unseen))
             else:
@@ -129,14 +129,14 @@ class Considered:
 NO_EFFECTS = Considered()
 
 
-def _replayed(found: Estimate, unseen: Evidence) -> Effect | None:
+def _replayed(measured: Estimate, unseen: Evidence) -> Effect | None:
     """The effect as measured, in full or frame by frame; None if its law is complete."""
-    if found.refused or found.significance < SIGNIFICANT:
+    if measured.refused or measured.significance < SIGNIFICANT:
         return None
-    if found.in_full is not None:
-        return found.in_full
+    if measured.in_full is not None:
+        return measured.in_full
     try:
-        replay = found.effect.replayed(unseen)
+        replay = measured.effect.replayed(unseen)
     except (InputError, np.linalg.LinAlgError, ValueError, ArithmeticError):
         return None
     return None if replay is None or replay.is_null else replay

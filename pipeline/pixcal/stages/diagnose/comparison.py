@@ -142,13 +142,13 @@ class Comparison:
         with_it, without = (self.allowing_for_laws(t, fewer) for t in (trial, fewer))
         return with_it.log_likelihood - without.log_likelihood
 
-    def gain_where_differing(self, start: Trial, trial: Trial, own: Key) -> float:
-        """Rise of the log-likelihood in curves that differ in ``start``, and in ``own``."""
+    def gain_where_differing(self, start: Trial, trial: Trial, key: Key) -> float:
+        """Rise of the log-likelihood in curves that differ in ``start``, and in ``key``."""
         gains = likelier(self.data, start.expected, trial.expected)
         differences = compare(self.data, start.expected)
         where = flagged(differences)
-        if own in differences and differences[own].log_chance < np.log(FALSE_ALARM_RATE):
-            where.add(own)
+        if key in differences and differences[key].log_chance < np.log(FALSE_ALARM_RATE):
+            where.add(key)
         return sum(gains[key] for key in where)
 
     def differs(self, trial: Trial) -> bool:
@@ -186,10 +186,10 @@ class Comparison:
         """Test statistics that make up the gap for any of these benches."""
         return set().union(*(differing(self.nominal, trial, self.data) for trial in trials))
 
-    def settles(self, own: Key, fewer: Trial, trial: Trial) -> bool:
+    def settles(self, key: Key, fewer: Trial, trial: Trial) -> bool:
         """Whether the data show all that a cause, added to ``fewer``, changes in simulations.
 
-        It leaves almost no difference and causes almost no new one. Not only ``own``, its
+        It leaves almost no difference and causes almost no new one. Not only ``key``, its
         significance, differed: fitted and held-out frames agree in that, whatever the true cause.
         """
         moved = compare(trial.expected.mean, fewer.expected)
@@ -201,7 +201,7 @@ class Comparison:
         )
         left = _squares(after, flagged(after))
         return all(
-            (where := flagged(old)) - {own} and left <= MAX_RESIDUAL_GAP * _squares(old, where)
+            (where := flagged(old)) - {key} and left <= MAX_RESIDUAL_GAP * _squares(old, where)
             for old in (nominal, before)
         )
 

@@ -84,8 +84,8 @@ def recordings_of(
         exposures = np.nan_to_num(np.array(table["exptime_s"], float))
         times = np.array(table["time_s"], float)
         kind = name.split("/")[0]
-        own = [np.arange(len(times))] if name in listed else groups(table)
-        for n, numbers in enumerate(own):
+        series = [np.arange(len(times))] if name in listed else groups(table)
+        for n, numbers in enumerate(series):
             exposure = float(exposures[numbers[0]])
             period = float(np.median(np.diff(times[numbers]))) if len(numbers) > 1 else exposure
             electrons = 1.0 if name in listed else 0.0
@@ -123,16 +123,16 @@ def _in_sequence(
 ) -> list[Recording]:
     """Each recording linked to the preceding one, if time stamps identify it."""
     stamps = [frame_days(tables[name])[numbers] for name, numbers in places]
-    found = []
-    for recording, own in zip(recordings, stamps, strict=True):
+    linked = []
+    for recording, days in zip(recordings, stamps, strict=True):
         earlier = [
-            (float(other[other < own[0]].max()), n)
+            (float(other[other < days[0]].max()), n)
             for n, other in enumerate(stamps)
-            if (other < own[0]).any()
+            if (other < days[0]).any()
         ]
         before = recordings[max(earlier)[1]] if earlier else None
-        found.append(replace(recording, before=before))
-    return found
+        linked.append(replace(recording, before=before))
+    return linked
 
 
 def _start(tables: Mapping[str, Table]) -> dict[str, float]:
@@ -141,11 +141,11 @@ def _start(tables: Mapping[str, Table]) -> dict[str, float]:
     if all(np.isfinite(s).all() for s in stamps.values()):
         first = min(float(s.min()) for s in stamps.values())
         return {name: float(s[0] - first) * DAY_S for name, s in stamps.items()}
-    found, clock = {}, 0.0
+    starts, clock = {}, 0.0
     for name, table in tables.items():
-        found[name] = clock
+        starts[name] = clock
         clock += float(np.ptp(np.array(table["time_s"], float)))
-    return found
+    return starts
 
 
 def _light(
@@ -167,14 +167,14 @@ def _light(
     good = np.all([one.good for one in evidence], axis=0)
     usual = [one.flat[good].mean() for one in evidence]
     for one, half, own_black, own_usual in zip(evidence, halves, black, usual, strict=True):
-        own = np.flatnonzero(np.isin(numbers, half[name]))
+        frames = np.flatnonzero(np.isin(numbers, half[name]))
         for stack in one.of_kind("flat"):
             known = np.isfinite(stack.exptime_s)
             same = np.isclose(stack.exptime_s, exposure) if known else exposure == 0
-            if same and stack.step == step and len(stack.adu) == len(own):
+            if same and stack.step == step and len(stack.adu) == len(frames):
                 above = light_of(one, stack) + one.gain * (own_black - np.mean(black))
                 relative = one.flat[one.good].mean() / own_usual
-                light[own] = above / (relative * np.mean(usual))
+                light[frames] = above / (relative * np.mean(usual))
     return light
 
 

@@ -79,14 +79,14 @@ def prepare_input(
     # The nominal bench has one gain, and pixels that are not full.
     ends = reduced["saturation_adu"]
     other = (n for key in ("full_frames", "frames_above_step") for n in ends.get(key, ()))
-    own = split(tables, pixels, sorted(other))
-    _enough(own.test)
-    runtime, few, room = _memory(own.test, pixels, runtime)
+    subsets = split(tables, pixels, sorted(other))
+    _enough(subsets.test)
+    runtime, few, room = _memory(subsets.test, pixels, runtime)
     windows: list[Window] = []
     left_out: list[dict[str, Any]] = []
     measured: list[Curves] = []
     for part in dict.fromkeys((first, *parts)):
-        raws = [take(ingested, frames, half, part) for half in (own.learn, own.test)]
+        raws = [take(ingested, frames, half, part) for half in (subsets.learn, subsets.test)]
         seed = windows[0].seed if windows else raws[0].checksum
         try:
             number = len(windows) + len(left_out) + 1
@@ -104,14 +104,14 @@ def prepare_input(
         halves = [replace(half, full=full) for half in halves]
         if not windows:
             effects = effects.estimated(halves[0], halves[1], few)
-        bench = nominal_bench(frames, halves, (own.learn, own.test), shape)
-        windows.append(Window(part, bench, own.learn, own.test, shape, seed, full))
+        bench = nominal_bench(frames, halves, (subsets.learn, subsets.test), shape)
+        windows.append(Window(part, bench, subsets.learn, subsets.test, shape, seed, full))
         if part in parts:
             measured.append(measured_curves(halves[1], effects.signatures))
     tried = tuple(w for w in windows if w.part in parts)
-    facts = _frames_used(frames, own, windows[0], tried, left_out)
+    facts = _frames_used(frames, subsets, windows[0], tried, left_out)
     effects.note_missing(facts)
-    learn = partial(take, ingested, frames, own.learn, first)
+    learn = partial(take, ingested, frames, subsets.learn, first)
     return DiagnosisInput(
         windows[0], tried, tuple(measured), facts, runtime, few, room, effects, learn
     )
@@ -144,7 +144,7 @@ def _run_frames(run_dir: Path, ingested: Ingested, reduced: Mapping[str, Any]) -
 
 def _frames_used(
     frames: RunFrames,
-    own: Split,
+    subsets: Split,
     first: Window,
     tried: Sequence[Window],
     left_out: Sequence[dict[str, Any]],
@@ -152,10 +152,10 @@ def _frames_used(
     steps = [s.step for s in first.bench.measured.sets]
     return FramesUsed(
         first.whole,
-        {"window": first.part, "frames": frames_of(own.learn)},
-        {"windows": tuple(w.part for w in tried), "frames": frames_of(own.test)},
+        {"window": first.part, "frames": frames_of(subsets.learn)},
+        {"windows": tuple(w.part for w in tried), "frames": frames_of(subsets.test)},
         tuple(left_out),
-        own.shared,
+        subsets.shared,
         tuple(kind for kind in ("bias", "dark", "flat") if kind in frames.tables),
         {s.name: s.baseline_mm for s in frames.acquisition.frames.fringes},
         missing_frames(frames.acquisition, frames.tables, steps),

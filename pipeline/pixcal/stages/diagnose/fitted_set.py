@@ -31,11 +31,11 @@ TURNS = 5  # iterations of the fits of pixels and frames: each gains a factor of
 def levels_before(levels: F64, effects: Sequence[Effect]) -> F64:
     """Levels (e-) of uniform frames after the effects on samples are undone."""
     frames = np.broadcast_to(levels[:, None, None], (len(levels), ACROSS, ACROSS))
-    found = start = np.asarray(frames, np.float32)
+    samples = start = np.asarray(frames, np.float32)
     for effect in sorted(effects, key=lambda e: e.sort_key, reverse=True):
-        corrected = effect.undo_samples(found)
-        found = found if corrected is None else corrected
-    return levels if found is start else np.asarray(found[:, ACROSS // 2, ACROSS // 2], float)
+        corrected = effect.undo_samples(samples)
+        samples = samples if corrected is None else corrected
+    return levels if samples is start else np.asarray(samples[:, ACROSS // 2, ACROSS // 2], float)
 
 
 def corrected_on_samples(

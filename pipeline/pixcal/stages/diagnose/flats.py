@@ -63,21 +63,21 @@ class FlatLight:
     @classmethod
     def of(cls, evidence: Sequence[Evidence], light: Mapping[int, F64]) -> "FlatLight":
         """From parts of the frames; ``light`` of frames (t,) by recording, NaN if not measured."""
-        found = [ladder(one) for one in evidence]
+        ladders = [ladder(one) for one in evidence]
         frames, firsts = {}, {}
-        for number, own in light.items():
-            if np.isfinite(own).sum() >= SERIES:
-                frames[number] = own / np.nanmean(own)
+        for number, values in light.items():
+            if np.isfinite(values).sum() >= SERIES:
+                frames[number] = values / np.nanmean(values)
                 frames[number][0] = np.nan
                 firsts[number] = _first(frames[number])
         flickers, freedoms = zip(*map(flicker, evidence), strict=True)
         return cls(
             float(np.mean(flickers)),
-            float(np.mean([LAMP if one is None else one.wander for one in found])),
+            float(np.mean([LAMP if one is None else one.wander for one in ladders])),
             # From all frames of a level: a part may have only two.
             rise_of(list(light.values())),
-            all(one is not None for one in found),
-            frozenset(float(t) for one in found if one is not None for t in one.off),
+            all(one is not None for one in ladders),
+            frozenset(float(t) for one in ladders if one is not None for t in one.off),
             min(freedoms),
             frames,
             firsts,
@@ -123,9 +123,9 @@ class FlatLight:
         levels = levels_before(np.array([r.electrons for r in flats]), effects)
         if self.one_lamp:
             below = levels < (d.top_adu - d.bias_adu) * d.gain_e_per_adu
-            own = np.isin(times, list(self.off), invert=True)
-            below = below & own if (below & own).any() else own
-            levels = np.where(own, straight_line(times[below], levels[below], times), levels)
+            steady = np.isin(times, list(self.off), invert=True)
+            below = below & steady if (below & steady).any() else steady
+            levels = np.where(steady, straight_line(times[below], levels[below], times), levels)
         return {r.number: float(level) for r, level in zip(flats, levels, strict=True)}
 
 
@@ -195,13 +195,13 @@ def photon_transfer_change(
     for camera in cameras:
         some = [_pairs(camera, r, range(min(FRAMES, r.count)), 0.0, neighbours) for r in dark]
         offsets.append(some[0].mean(axis=1) if some else np.zeros(2))
-    found: list[list[F64]] = [[], []]
+    by_camera: list[list[F64]] = [[], []]
     for first in range(0, flat.count - 1, FRAMES):
         frames = range(first, min(first + FRAMES, flat.count))
-        for camera, (offset, noise), ratios in zip(cameras, offsets, found, strict=True):
+        for camera, (offset, noise), ratios in zip(cameras, offsets, by_camera, strict=True):
             means, variances = _pairs(camera, flat, frames, offset, neighbours)
             ratios.append((variances - noise) / means)
-        before, after = (np.concatenate(ratios) for ratios in found)
+        before, after = (np.concatenate(ratios) for ratios in by_camera)
         if min(before.mean(), after.mean()) <= 0:
             return 1.0
         error = (after - before).std(ddof=1) / np.sqrt(len(before)) if len(before) > 1 else 0.0
@@ -223,7 +223,7 @@ def _pairs(
     detector = recording.bench.detector
     gain, lags = detector.gain_e_per_adu, [tuple(lag) for lag in LAGS.tolist()]
     shared = [3 + lags.index(lag) for lag in neighbours]
-    found = []
+    pairs = []
     for n in range(0, len(samples) - 1, 2):
         pair = samples[n : n + 2]
         levels = np.nanmean(pair, axis=(1, 2), keepdims=True)
@@ -235,5 +235,5 @@ def _pairs(
             quantum=1.0,
         )
         dof, noise = blocks[:, 0], blocks[:, 2] + 2 * blocks[:, shared].sum(axis=1)
-        found.append((level, dof @ noise / max(dof.sum(), 1.0)))
-    return np.array(found).T
+        pairs.append((level, dof @ noise / max(dof.sum(), 1.0)))
+    return np.array(pairs).T

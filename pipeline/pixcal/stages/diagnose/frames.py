@@ -59,18 +59,18 @@ def in_series(tables: Mapping[str, Table]) -> dict[str, Table]:
     dark = {name: table for name, table in tables.items() if name in ("bias", "dark")}
     every = [frame_days(table) for name, table in tables.items() if name not in dark]
     light = np.sort(np.concatenate([*every, []]))
-    found = dict(tables)
+    series = dict(tables)
     if light.size and np.isfinite(light).all():
-        found |= {name: _numbered(table, light) for name, table in dark.items()}
-    kinds = {name: found[name] for name in ("bias", "dark", "flat") if name in found}
-    return found | {name: _with_ends(table) for name, table in kinds.items()}
+        series |= {name: _numbered(table, light) for name, table in dark.items()}
+    kinds = {name: series[name] for name in ("bias", "dark", "flat") if name in series}
+    return series | {name: _with_ends(table) for name, table in kinds.items()}
 
 
 def _with_ends(table: Table) -> Table:
     """Table of calibration frames with the number of the last frame of each one's series."""
     last = np.zeros(len(table["time_s"]), int)
-    for own in groups(table):
-        last[own] = own[-1]
+    for group in groups(table):
+        last[group] = group[-1]
     return {**table, "last": last.tolist()}
 
 
@@ -83,13 +83,13 @@ def _numbered(table: Table, light: F64) -> Table:
     since = days - np.append(-np.inf, light)[before]
     soon = since * DAY_S < SOON_S
     step, after = np.zeros(len(days), int), np.zeros(len(days), np.bool_)
-    for own in groups(table):
-        begins = own[np.flatnonzero(np.diff(before[own], prepend=-1))]
-        begins = begins[(begins == own[0]) | soon[begins]]
-        series = np.searchsorted(begins, own, side="right") - 1
+    for group in groups(table):
+        begins = group[np.flatnonzero(np.diff(before[group], prepend=-1))]
+        begins = begins[(begins == group[0]) | soon[begins]]
+        series = np.searchsorted(begins, group, side="right") - 1
         if np.bincount(series).min() < FEWEST:
             series, begins = np.zeros_like(series), begins[:1]
-        step[own], after[own] = series, soon[begins][series]
+        step[group], after[group] = series, soon[begins][series]
     return {**table, "step": step.tolist(), "after_light": after.tolist()}
 
 
@@ -114,15 +114,15 @@ def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = 
     if fringes:
         most = min(most, MOST_FRAMES)
     else:
-        most = _equal_share([len(own) for of_name in every.values() for own in of_name], most)
+        most = _equal_share([len(group) for of_name in every.values() for group in of_name], most)
     after_light = {n: table["after_light"] for n, table in tables.items() if "after_light" in table}
     for name, of_name in every.items():
         fitted, held_out = [], []
-        for own in of_name:
-            one, other = _halves(own, most)
+        for group in of_name:
+            one, other = _halves(group, most)
             fitted.append(one)
-            lags = name == "flat" or (name in after_light and after_light[name][own[0]])
-            held_out.append(np.union1d(other, own[:1]) if lags and not fringes else other)
+            lags = name == "flat" or (name in after_light and after_light[name][group[0]])
+            held_out.append(np.union1d(other, group[:1]) if lags and not fringes else other)
         learn[name] = np.sort(np.concatenate(fitted))
         test[name] = np.sort(np.concatenate(held_out))
     short = (name for name, of_name in every.items() if min(map(len, of_name)) < FEWEST)
@@ -134,7 +134,7 @@ def _groups(name: str, table: Table, full_flats: Sequence[int]) -> list[Indices]
     if "/" in name:
         return [np.arange(len(table["exptime_s"]))]
     every = groups(table)
-    kept = [own for own in every if name != "flat" or not np.isin(own, full_flats).any()]
+    kept = [group for group in every if name != "flat" or not np.isin(group, full_flats).any()]
     return kept or every
 
 
@@ -145,10 +145,10 @@ def _of_half(count: int) -> int:
 def frames_of_half(tables: Mapping[str, Table]) -> int:
     """Calibration frames in each half."""
     return sum(
-        _of_half(len(own))
+        _of_half(len(group))
         for name, table in tables.items()
         if "/" not in name
-        for own in groups(table)
+        for group in groups(table)
     )
 
 
@@ -251,19 +251,19 @@ def recommend_closer_look(missing: Mapping[str, str], domain: str) -> list[str]:
 
 def _axes(baselines: Iterable[Sequence[float]]) -> list[tuple[str, set[float]]]:
     """Axes of the fringe sets, and the different lengths (mm) of their baselines."""
-    found: list[tuple[tuple[float, float], set[float]]] = []
+    axes: list[tuple[tuple[float, float], set[float]]] = []
     for bx, by in baselines:
         size = math.hypot(bx, by)
         if size == 0:
             continue
         one = bx / size, by / size
-        for axis, lengths in found:
+        for axis, lengths in axes:
             if abs(axis[0] * one[0] + axis[1] * one[1]) > SAME_AXIS:
                 lengths.add(round(size, 1))
                 break
         else:
-            found.append((one, {round(size, 1)}))
-    return [(_axis_name(axis), lengths) for axis, lengths in found]
+            axes.append((one, {round(size, 1)}))
+    return [(_axis_name(axis), lengths) for axis, lengths in axes]
 
 
 def _axis_name(axis: tuple[float, float]) -> str:

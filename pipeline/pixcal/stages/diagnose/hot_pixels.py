@@ -22,8 +22,8 @@ def uncoupled(dark: Dark, rng: np.random.Generator) -> Dark:
     spread = robust_sigma(rest)
     brightest = maximum_filter(rest, size=2 * HOT_REACH + 1, mode="nearest")
     beside = (brightest > HOT * spread) & (rest < SHARED * brightest)
-    found = dark.copy()
+    redrawn = dark.copy()
     usual = dark[~beside & (rest <= HOT * spread)]
     if usual.size:
-        found[beside] = rng.choice(usual, np.count_nonzero(beside))
-    return found
+        redrawn[beside] = rng.choice(usual, np.count_nonzero(beside))
+    return redrawn

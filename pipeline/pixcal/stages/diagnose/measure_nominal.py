@@ -128,10 +128,10 @@ def _response_of_fringes(evidence: Sequence[Evidence]) -> F32:
     # Noise is removed from its scatter, because the simulation adds its own.
     parts = []
     for one in evidence:
-        for found in one.fringes.values():
-            light = np.where(found.good, found.theta[0], np.nan)
-            contrast = contrast_surface(found.theta, found.good)
-            parts.append(light / light_surface(light, contrast, found.good))
+        for fringes in one.fringes.values():
+            light = np.where(fringes.good, fringes.theta[0], np.nan)
+            contrast = contrast_surface(fringes.theta, fringes.good)
+            parts.append(light / light_surface(light, contrast, fringes.good))
     if len(parts) < 2:
         return np.ones(evidence[0].good.shape, np.float32)
     mean, seen = np.mean(parts, axis=0) - 1, float(np.nanvar(np.mean(parts, axis=0)))
@@ -141,18 +141,18 @@ def _response_of_fringes(evidence: Sequence[Evidence]) -> F32:
 
 
 def _fitted(evidence: Sequence[Evidence], name: str, flat: F64 | None) -> FittedSet:
-    found = [e.fringes[name] for e in evidence]
-    one, read_noise_e = found[0], evidence[0].amplifier_noise
-    good = np.all([f.good for f in found], axis=0)
+    parts = [e.fringes[name] for e in evidence]
+    one, read_noise_e = parts[0], evidence[0].amplifier_noise
+    good = np.all([f.good for f in parts], axis=0)
     k = float(np.hypot(*one.k))
     # The scan starts at an arbitrary phase: rotate the others to the first before averaging.
-    phasors = [f.theta[2] + 1j * f.theta[1] for f in found]
+    phasors = [f.theta[2] + 1j * f.theta[1] for f in parts]
     turns = [np.angle(np.vdot(phasors[0][good], z[good])) for z in phasors]
     z = np.mean([z * np.exp(-1j * a) for z, a in zip(phasors, turns, strict=True)], axis=0)
-    theta = np.stack([np.mean([f.theta[0] for f in found], axis=0), z.imag, z.real])
-    delta = np.mean([f.delta for f in found], axis=0)
-    sigma = np.sqrt(np.sum([f.sigma**2 for f in found], axis=0)) / len(found) / k
-    sigma *= excess_scatter(found, good)
+    theta = np.stack([np.mean([f.theta[0] for f in parts], axis=0), z.imag, z.real])
+    delta = np.mean([f.delta for f in parts], axis=0)
+    sigma = np.sqrt(np.sum([f.sigma**2 for f in parts], axis=0)) / len(parts) / k
+    sigma *= excess_scatter(parts, good)
     bad = ~good
     return FittedSet(
         np.where(bad, np.nan, theta),
@@ -162,32 +162,32 @@ def _fitted(evidence: Sequence[Evidence], name: str, flat: F64 | None) -> Fitted
         evidence[0].origin,
         flat,
         one.name,
-        frames=_frames(found, turns, read_noise_e, evidence[0].origin[0]),
+        frames=_frames(parts, turns, read_noise_e, evidence[0].origin[0]),
     )
 
 
 def _frames(
-    found: Sequence[FringeEvidence], turns: Sequence[float], read_noise_e: float, first_row: int
+    parts: Sequence[FringeEvidence], turns: Sequence[float], read_noise_e: float, first_row: int
 ) -> FittedFrames:
     """All frames, with their phases rotated like the maps."""
     wave = np.concatenate(
-        [(f.g[:, 1] + 1j * f.g[:, 2]) * np.exp(1j * a) for f, a in zip(found, turns, strict=True)]
+        [(f.g[:, 1] + 1j * f.g[:, 2]) * np.exp(1j * a) for f, a in zip(parts, turns, strict=True)]
     )
-    g = np.stack([np.concatenate([f.g[:, 0] for f in found]), wave.real, wave.imag], axis=1)
-    g = g[np.argsort(np.concatenate([f.frame for f in found]))]
-    one = found[0]
+    g = np.stack([np.concatenate([f.g[:, 0] for f in parts]), wave.real, wave.imag], axis=1)
+    g = g[np.argsort(np.concatenate([f.frame for f in parts]))]
+    one = parts[0]
     period = float(np.median(np.diff(one.time_s))) if len(one.time_s) > 1 else 0.0
     rows = first_row, one.good.shape[0]
-    free = any(bool(np.any(f.dk)) for f in found)
+    free = any(bool(np.any(f.dk)) for f in parts)
     return FittedFrames(g, rows, read_noise_e, one.exptime_s, period, free)
 
 
-def excess_scatter(found: Sequence[FringeEvidence], good: Mask) -> float:
+def excess_scatter(parts: Sequence[FringeEvidence], good: Mask) -> float:
     """Scatter of offsets between independent frames over their errors, at least 1."""
     # A simulation must not contain frame-to-frame changes twice, as offsets and by the effect.
-    k = float(np.hypot(*found[0].k))
+    k = float(np.hypot(*parts[0].k))
     most = 1.0
-    for one, other in itertools.pairwise(found):
+    for one, other in itertools.pairwise(parts):
         apart = flattened(np.where(good, one.delta - other.delta, np.nan))
         error = np.hypot(one.sigma, other.sigma)[good] / k
         most = max(most, median_and_sigma(apart[good] / error)[1])
@@ -199,8 +199,8 @@ def _dark_rate(evidence: Sequence[Evidence], halves: Sequence[FrameSubset]) -> F
     # The shot noise of what the camera subtracts stays; the simulation subtracts it again.
     rate = _mean([uncoupled(e.dark_rate, np.random.default_rng(0)) for e in evidence])
     rate += np.float32(evidence[0].subtracted_dark)
-    own = parted("bias", halves) and parted("dark", halves)
-    noise = _rate_variance(evidence[0]) / (len(evidence) if own else 1)
+    separate = parted("bias", halves) and parted("dark", halves)
+    noise = _rate_variance(evidence[0]) / (len(evidence) if separate else 1)
     rest = rate - np.median(rate)
     spread = robust_sigma(rest)
     core = np.abs(rest) <= CORE * spread
@@ -219,14 +219,14 @@ def _rate_variance(evidence: Evidence) -> float:
     return float((evidence.read_noise**2 + charge) / (len(times) * times.var()))
 
 
-def _set_truth(found: Sequence[FringeEvidence], frames: Sequence[Indices], count: int) -> SetTruth:
+def _set_truth(parts: Sequence[FringeEvidence], frames: Sequence[Indices], count: int) -> SetTruth:
     """Straight, steady fringes of a set, as fitted."""
-    one = found[0]
-    good = np.all([f.good for f in found], axis=0)
-    iota = np.mean([f.theta[0] * np.mean(f.g[:, 0]) for f in found], axis=0)
-    contrast = np.mean([contrast_surface(f.theta, good) for f in found], axis=0)
+    one = parts[0]
+    good = np.all([f.good for f in parts], axis=0)
+    iota = np.mean([f.theta[0] * np.mean(f.g[:, 0]) for f in parts], axis=0)
+    contrast = np.mean([contrast_surface(f.theta, good) for f in parts], axis=0)
     surface = light_surface(iota, contrast, good)
-    contrast *= np.mean([np.median(np.hypot(*f.g.T[1:]) / f.g[:, 0]) for f in found])
+    contrast *= np.mean([np.median(np.hypot(*f.g.T[1:]) / f.g[:, 0]) for f in parts])
     ny, nx = good.shape
     y, x = np.arange(ny)[:, None] - (ny - 1) / 2, np.arange(nx)[None, :] - (nx - 1) / 2
     plane = one.k[0] * x + one.k[1] * y
@@ -238,16 +238,16 @@ def _set_truth(found: Sequence[FringeEvidence], frames: Sequence[Indices], count
         psi=psi,
         k=one.k,
         step=ramp_step(one.phi),
-        phi=_phases(found, frames, count),
+        phi=_phases(parts, frames, count),
     )
 
 
-def _phases(found: Sequence[FringeEvidence], frames: Sequence[Indices], count: int) -> F64:
+def _phases(parts: Sequence[FringeEvidence], frames: Sequence[Indices], count: int) -> F64:
     """Phase (t,) of every frame of a set, counted from the first part's maps; NaN where unknown."""
     phi = np.full(count, np.nan)
-    first = found[0].theta[2] + 1j * found[0].theta[1]
-    for one, numbers in zip(found, frames, strict=True):
-        both = found[0].good & one.good
+    first = parts[0].theta[2] + 1j * parts[0].theta[1]
+    for one, numbers in zip(parts, frames, strict=True):
+        both = parts[0].good & one.good
         z = one.theta[2] + 1j * one.theta[1]
         phi[numbers] = one.phi + np.angle(np.vdot(first[both], z[both]))
     return phi
@@ -260,12 +260,12 @@ def _gain(evidence: Sequence[Evidence], flat: F64, good: Mask, with_flats: bool)
     noise = [FringeSetData(one, e).moments[0] for e in evidence for one in e.fringes.values()]
     if with_flats and noise:
         amplifiers = relative_gain(flat, np.mean(noise, axis=0), good)
-    found = [(one.gain, *one.photon_transfer) for one in evidence]
+    gains = [(one.gain, *one.photon_transfer) for one in evidence]
     return MeasuredGain(
         amplifiers,
         tuple(
             (value / used, error / used)
-            for used, value, error, chi2 in found
+            for used, value, error, chi2 in gains
             if np.isfinite(value) and error > 0 and chi2 < MAX_GAIN_CHI2
         ),
         tuple(sorted({lag for e in evidence for lag in e.neighbours})),

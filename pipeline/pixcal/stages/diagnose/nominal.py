@@ -64,10 +64,10 @@ class Measured(OfAcquisition):
         """As in `Effect.light`."""
         if recording.kind != "fringes":
             return light
-        own, cut = self.sets[recording.number], slice(*rows)
-        psi = own.phase(self.maps.delta_x, self.maps.delta_y)[cut]
-        iota = own.light[cut].astype(float)
-        return Light.of_fringes(iota, own.contrast[cut] * iota * np.exp(1j * psi))
+        truth, cut = self.sets[recording.number], slice(*rows)
+        psi = truth.phase(self.maps.delta_x, self.maps.delta_y)[cut]
+        iota = truth.light[cut].astype(float)
+        return Light.of_fringes(iota, truth.contrast[cut] * iota * np.exp(1j * psi))
 
     def photons(self, mean: F32, shot: Shot) -> F32:
         """As in `Effect.photons`."""
@@ -77,9 +77,9 @@ class Measured(OfAcquisition):
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         """As in `Effect.states`."""
-        own, count = self.sets[recording.number], recording.count
+        truth, count = self.sets[recording.number], recording.count
         drawn = 2 * np.pi * recording.rng(self.name).random(count)
-        phi = np.where(np.isnan(own.phi), drawn, own.phi)
+        phi = np.where(np.isnan(truth.phi), drawn, truth.phi)
         still = np.zeros(count)
         return FrameStates(phi, np.ones(count), np.ones(count), still, still)
 
@@ -115,10 +115,10 @@ class NominalBench:
             name: np.empty((len(frames), *bench.detector.shape), self.frames.dtypes[name])
             for name, frames in half.items()
         }
-        for own, name, wanted, at in self._of_half(half, taken):
-            for (_, samples), place in zip(camera.expose(own, wanted), at, strict=True):
+        for recording, name, wanted, at in self._of_half(half, taken):
+            for (_, samples), place in zip(camera.expose(recording, wanted), at, strict=True):
                 arrays[name][place] = self._as_recorded(
-                    samples, own.exptime_s, bench.detector.top_adu, name
+                    samples, recording.exptime_s, bench.detector.top_adu, name
                 )
         return self.frames.raw(arrays, half)
 
@@ -131,15 +131,15 @@ class NominalBench:
         )
         arrays = {name: samples.copy() for name, samples in raw.arrays.items()}
         top, step = self.bench.detector.top_adu, self.bench.detector.step_adu
-        for own, name, wanted, at in self._of_half(half, taken):
+        for recording, name, wanted, at in self._of_half(half, taken):
             kind = arrays[name].dtype
-            each = with_effects.analogue(own, wanted), free.analogue(own, wanted), at
+            each = with_effects.analogue(recording, wanted), free.analogue(recording, wanted), at
             for one, other, place in zip(*each, strict=True):
                 before = arrays[name][place]
-                found = before - (one - other)
+                clean = before - (one - other)
                 if kind.kind != "f":
-                    found = np.clip(step * np.rint(found / step), np.iinfo(kind).min, top)
-                arrays[name][place] = np.where(before < top, found, before)
+                    clean = np.clip(step * np.rint(clean / step), np.iinfo(kind).min, top)
+                arrays[name][place] = np.where(before < top, clean, before)
         return replace(raw, arrays=arrays)
 
     @property
@@ -191,17 +191,17 @@ class NominalBench:
         self, samples: NDArray[np.uint16], exptime_s: float, top_adu: float, name: str
     ) -> F32:
         """Samples without the pedestal, and without dark signal that the camera subtracts."""
-        found = samples - np.float32(self.pedestal)
+        recorded = samples - np.float32(self.pedestal)
         black = self.frames.black
         if black is None or not black.subtracted:
-            return found
+            return recorded
         # In whole steps of the converter; saturated samples stay so.
         step = self.bench.detector.step_adu
         lost = step * round(black.subtracted * exptime_s / step)
         full = samples >= top_adu
         dtype = self.frames.dtypes[name]
         lowest = -np.inf if dtype.kind == "f" else float(np.iinfo(dtype).min)
-        return np.where(full, found, np.maximum(found - lost, np.float32(lowest)))
+        return np.where(full, recorded, np.maximum(recorded - lost, np.float32(lowest)))
 
     def _of_measured_k(
         self, measured: Measured, bench: Bench, effects: Sequence[Effect]
@@ -217,17 +217,17 @@ class NominalBench:
         sets = list(measured.sets)
         for recording in self.recordings:
             if recording.kind == "fringes":
-                own = replace(recording, bench=bench)
-                turn = after.light(own).phasor * before.light(own).phasor.conj()
+                scan = replace(recording, bench=bench)
+                turn = after.light(scan).phasor * before.light(scan).phasor.conj()
                 y, x = grid(turn.shape)
                 dky = np.angle(np.sum(turn[1:] * turn[:-1].conj()))
                 dkx = np.angle(np.sum(turn[:, 1:] * turn[:, :-1].conj()))
                 n = recording.number
-                found, (kx, ky) = sets[n], sets[n].k
+                truth, (kx, ky) = sets[n], sets[n].k
                 tilt = dkx * x + dky * y
                 tilt = tilt + np.angle(np.sum(turn * np.exp(-1j * tilt)))
                 # Offsets are included, because effects use them as positions.
-                sets[n] = replace(found, psi=found.psi - tilt, k=(kx - dkx, ky - dky))
+                sets[n] = replace(truth, psi=truth.psi - tilt, k=(kx - dkx, ky - dky))
         return replace(measured, sets=tuple(sets))
 
     def _electronics(
@@ -240,10 +240,10 @@ class NominalBench:
         m = replace(m, bias=m.bias + np.float32(self.pedestal))
         noise = m.read_noise
         if self.noise is not None:
-            own = self.noise.drawn(np.random.default_rng([own_seed, _NOISE]))
+            factor = self.noise.drawn(np.random.default_rng([own_seed, _NOISE]))
             for effect in effects:
-                own[effect.noisy_pixels(self.bench.detector)] = 1
-            noise = noise * own
+                factor[effect.noisy_pixels(self.bench.detector)] = 1
+            noise = noise * factor
         square = noise**2
         # Part of the measured variance that effects add.
         added = sum(effect.read_variance(self.bench.detector) for effect in effects)
@@ -275,11 +275,11 @@ class NominalBench:
         # Light and contrast before the effects, which reduce them again in the simulation.
         sets = tuple(
             replace(
-                own,
-                light=own.light * fit.light,
-                contrast=np.minimum(own.contrast * fit.contrast, np.float32(1)),
+                truth,
+                light=truth.light * fit.light,
+                contrast=np.minimum(truth.contrast * fit.contrast, np.float32(1)),
             )
-            for own, fit in zip(self.measured.sets, fits, strict=True)
+            for truth, fit in zip(self.measured.sets, fits, strict=True)
         )
         return replace(self.measured, maps=maps, sets=sets)
 

@@ -54,10 +54,10 @@ class RawFrames:
     @property
     def checksum(self) -> int:
         """Checksum of all samples, independent of how they are stored."""
-        found = 0
+        crc = 0
         for name in sorted(self.arrays):
-            found = crc32(np.ascontiguousarray(self.arrays[name]).data, found)
-        return found
+            crc = crc32(np.ascontiguousarray(self.arrays[name]).data, crc)
+        return crc
 
 
 @dataclass(frozen=True)
@@ -87,15 +87,15 @@ def take(ingested: Ingested, frames: RunFrames, half: FrameSubset, part: Part) -
 
 def select(tables: Mapping[str, Table], half: FrameSubset) -> dict[str, Table]:
     """Rows of the tables that belong to a half, with the numbers of the frames."""
-    found: dict[str, Table] = {}
+    chosen: dict[str, Table] = {}
     for name, frames in half.items():
-        own = {key: [column[n] for n in frames] for key, column in tables[name].items()}
+        rows = {key: [column[n] for n in frames] for key, column in tables[name].items()}
         # In a cube, only the first plane may have a time stamp.
-        if len(frames) and all(mjd is None for mjd in own["mjd"]):
-            begin = begin_mjd(tables[name]) + own["time_s"][0] / DAY_S
-            own["mjd"][0] = float(begin) if np.isfinite(begin) else None
-        found[name] = own | {"frame": frames.tolist()}
-    return found
+        if len(frames) and all(mjd is None for mjd in rows["mjd"]):
+            begin = begin_mjd(tables[name]) + rows["time_s"][0] / DAY_S
+            rows["mjd"][0] = float(begin) if np.isfinite(begin) else None
+        chosen[name] = rows | {"frame": frames.tolist()}
+    return chosen
 
 
 def evidence_of(raw: RawFrames, part: Part, window: tuple[int, int]) -> Evidence:
@@ -113,8 +113,8 @@ def run_in_memory(raw: RawFrames, sweep: Sweep = NO_BATCHES) -> MemoryPath:
     write_json(run / "ingest" / "acquisition.json", to_plain(acquisition))
     write_json(run / "ingest" / "frames.json", raw.tables)
     ingested = Ingested(run / "ingest", raw.black)
-    found = reduce_frames(MemoryBuild(run / "reduce"), ingested, raw.reduction, SERIAL_RUNTIME)
-    write_json(run / "reduce" / "reduce.json", found.noise(raw.reduction))
+    reduction = reduce_frames(MemoryBuild(run / "reduce"), ingested, raw.reduction, SERIAL_RUNTIME)
+    write_json(run / "reduce" / "reduce.json", reduction.noise(raw.reduction))
     if acquisition.frames.fringes:
         cubes = run / "reduce" / "reduced.zarr"
         facts = sweep_sets(MemoryBuild(run / "sweep"), cubes, acquisition, sweep, SERIAL_RUNTIME)

@@ -72,11 +72,11 @@ class Pruning:
         """A cause made redundant by another of the same step and domains; the bench without it."""
         candidates = self._candidates
         for name in sorted(effects, key=lambda n: candidates[n].significance):
-            own = effects[name]
+            old = effects[name]
             replays = {
                 n: replay
                 for n, e in effects.items()
-                if n != name and e.acts_at == own.acts_at and set(e.domains) >= set(own.domains)
+                if n != name and e.acts_at == old.acts_at and set(e.domains) >= set(old.domains)
                 if (replay := candidates[n].replay) is not None and replay != e
             }
             if not replays or self._benches.left < CONFIRM_SIMULATIONS:

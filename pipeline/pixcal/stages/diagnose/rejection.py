@@ -230,13 +230,13 @@ def exchanges(
     causes: Mapping[str, Effect], candidates: Mapping[str, Candidate]
 ) -> tuple[Exchange, ...]:
     """Replace each cause by every pair of the strongest other candidates, as measured."""
-    found = []
+    swaps = []
     for out in causes:
         rest = {name: effect for name, effect in causes.items() if name != out}
         for new in combinations(_other(causes, candidates)[:STRONGEST], 2):
             effects = rest | {name: _as_measured(candidates[name]) for name in new}
-            found.append(Exchange(out, effects, new))
-    return tuple(found)
+            swaps.append(Exchange(out, effects, new))
+    return tuple(swaps)
 
 
 def entangled(
@@ -250,8 +250,8 @@ def entangled(
 
     pairs = []
     for out in filter(steady, causes):
-        own = set(candidates[out].domains)
-        others = (n for n in _other(causes, candidates) if own & set(candidates[n].domains))
+        domains = set(candidates[out].domains)
+        others = (n for n in _other(causes, candidates) if domains & set(candidates[n].domains))
         pairs += [(out, n) for n in others if steady(n)][:1]
     return pairs
 

@@ -48,14 +48,14 @@ def by_domain(
     before: Mapping[Key, Difference], after: Mapping[Key, Difference]
 ) -> dict[str, list[float]]:
     """Largest deviation (sigma, at least 0) in each domain, before and after."""
-    found = {}
+    largest = {}
     for domain in DOMAINS:
         keys = [k for k in before if statistic_named(k[0]).domain == domain]
-        found[domain] = [
+        largest[domain] = [
             rounded(sigmas_among(min(one[k].log_chance for k in keys), len(keys))) if keys else 0.0
             for one in (before, after)
         ]
-    return found
+    return largest
 
 
 def not_compared(measured: Mapping[Key, Curve], data: Mapping[Key, F64]) -> list[str]:
@@ -73,7 +73,7 @@ def not_compared(measured: Mapping[Key, Curve], data: Mapping[Key, F64]) -> list
 class Description:
     """What a search found, as `diagnosis.json` and its curves say it."""
 
-    found: SearchResult
+    search: SearchResult
     data: Mapping[Key, F64]  # held-out curves on the reference's scales
     measured: Mapping[Key, Curve]  # the same in their own units
     reference: Reference
@@ -82,27 +82,27 @@ class Description:
     @cached_property
     def where(self) -> set[Key]:
         """Curves that make up the gap."""
-        return differing(self.found.nominal, self.found.final, self.data)
+        return differing(self.search.nominal, self.search.final, self.data)
 
     @cached_property
     def final(self) -> Shrinkage:
         """How much of the gap all causes close."""
-        return self._with(self.found.final)
+        return self._with(self.search.final)
 
     def _with(self, trial: Trial) -> Shrinkage:
-        return shrinkage(self.data, self.found.nominal, trial, self.where)
+        return shrinkage(self.data, self.search.nominal, trial, self.where)
 
     def diagnosis(self, places: Sequence[Mapping[str, Any]]) -> Json:
         """Contents of ``diagnosis.json``; ``places``: deviations of the windows, `by_domain`."""
-        found, final, verdict = self.found, self.final, self._verdict()
-        causes = [self._cause(name) for name in found.accepted]
+        search, final, verdict = self.search, self.final, self._verdict()
+        causes = [self._cause(name) for name in search.accepted]
         # Statistics that differ, the largest effect first; then those only with effects.
         before, after, size = final.before, final.after, final.sizes.size
         keys = sorted(self.where, key=lambda k: (-abs(size[k]), k))
         keys += sorted(flagged(after) - self.where, key=lambda k: after[k].log_chance)
         where = [self._entry(key, before[key], after[key]) for key in keys]
         not_tested: Json = {}  # effects that these frames cannot show, by the frames that could
-        for candidate in found.candidates.values():
+        for candidate in search.candidates.values():
             if candidate.needs and candidate.needs != (FRINGES,):
                 not_tested.setdefault(" or ".join(candidate.needs), []).append(candidate.name)
         return {
@@ -113,13 +113,13 @@ class Description:
             "gap": {
                 "total": 1.0 if self.where else 0.0,
                 "after": rounded(final.gap.total),
-                "interval": [rounded(v) for v in gap_interval(self.data, final, found.final)],
+                "interval": [rounded(v) for v in gap_interval(self.data, final, search.final)],
                 "domains": {d: [rounded(v) for v in final.gap.of_domain(d)] for d in DOMAINS},
                 "where": where,
                 "absolute": self._absolute(),
                 "places": list(places),
             },
-            "candidates": [self._candidate(c) for c in found.candidates.values()],
+            "candidates": [self._candidate(c) for c in search.candidates.values()],
             "not_tested": not_tested,
             "not_compared": not_compared(self.measured, self.data),
             "more_would_tell": self._more_would_tell(where, verdict),
@@ -130,7 +130,7 @@ class Description:
     def _verdict(self) -> str:
         if not self.where:
             return "no gap"
-        if not self.found.accepted:
+        if not self.search.accepted:
             return "unexplained"
         closed = self.final.significant.total <= EXPLAINED
         return "explained" if closed and not self.staying else "partly explained"
@@ -147,26 +147,26 @@ class Description:
         }
 
     def _cause(self, name: str) -> Json:
-        found, candidate = self.found, self.found.candidates[name]
+        search, candidate = self.search, self.search.candidates[name]
         estimate = candidate.estimate
         assert estimate is not None
-        effect = next(e for e in found.final.effects if e.name == name)
-        by_itself = candidate.alone or found.final
-        alone, without = self._with(by_itself), self._with(found.without[name])
-        gain = found.final.log_likelihood - found.without[name].log_likelihood
-        by_law = self._with(found.by_law[name]) if name in found.by_law else alone
-        alike = found.alike.get(name, ())
-        kinds = [type(e.effect) for n in (name, *alike) if (e := found.candidates[n].estimate)]
+        effect = next(e for e in search.final.effects if e.name == name)
+        by_itself = candidate.alone or search.final
+        alone, without = self._with(by_itself), self._with(search.without[name])
+        gain = search.final.log_likelihood - search.without[name].log_likelihood
+        by_law = self._with(search.by_law[name]) if name in search.by_law else alone
+        alike = search.alike.get(name, ())
+        kinds = [type(e.effect) for n in (name, *alike) if (e := search.candidates[n].estimate)]
         # Fisher's method combines two independent parts of the frames. A likelihood ratio of e^gain
         # has a chance of at most e^-gain (Markov's inequality).
-        own = estimate.significance * candidate.share
-        log_both = max(float(log_ndtr(-own)) - max(gain, 0.0), -600.0)
+        unique = estimate.significance * candidate.share
+        log_both = max(float(log_ndtr(-unique)) - max(gain, 0.0), -600.0)
         chance = np.exp(log_both) * (1 - log_both)
         same_samples = self.facts.shared and not self.facts.sets and self.facts.on_the_same_pixels
         if same_samples or candidate.in_maps_alone:
             # Both parts hold the same samples, or the same offsets: the second adds no information.
-            chance = float(ndtr(-own))
-        chance *= len(found.candidates) * candidate.variants_tried
+            chance = float(ndtr(-unique))
+        chance *= len(search.candidates) * candidate.variants_tried
         return {
             "effect": name,
             "title": effect.title,
@@ -188,7 +188,7 @@ class Description:
             "sigmas": rounded(estimate.significance),
             "why": estimate.why,
             "remedy": effect.remedy or "find and fix it on the bench",
-            "given_away_by": self._strongest_evidence(found.without[name]),
+            "given_away_by": self._strongest_evidence(search.without[name]),
             "not_told_apart_from": list(alike),
             "would_decide": recommend_frames(self.facts.missing_frames, kinds) if alike else [],
         }
@@ -204,7 +204,7 @@ class Description:
 
     def _strongest_evidence(self, without: Trial) -> list[dict[str, str]]:
         """Statistics whose likelihood an effect raises most, best first."""
-        gains = likelier(self.data, without.expected, self.found.final.expected)
+        gains = likelier(self.data, without.expected, self.search.final.expected)
         best = sorted(gains, key=lambda k: -gains[k])[:SHOWN]
         return [{"statistic": k[0], "set": k[1]} for k in best if gains[k] > 1]
 
@@ -234,8 +234,8 @@ class Description:
                 **{name: getattr(one, name) for name in FACTS},
                 "x": self.measured[key].x.tolist(),
                 "measured": _natural(self.data[key], self.reference.usual[key]).tolist(),
-                "nominal": self._band(self.found.nominal, key),
-                "with_effects": self._band(self.found.final, key),
+                "nominal": self._band(self.search.nominal, key),
+                "with_effects": self._band(self.search.final, key),
                 "z": before.sigmas.tolist(),
                 "z_after": after.sigmas.tolist(),
                 "in_gap": key in self.where,
@@ -277,8 +277,8 @@ class Description:
 
     def _absolute(self) -> list[Json]:
         """Differences in bench units, with all causes and with each alone; 1-sigma intervals."""
-        candidates = self.found.candidates
-        only = {n: t for n in self.found.accepted if (t := candidates[n].alone) is not None}
+        candidates = self.search.candidates
+        only = {n: t for n in self.search.accepted if (t := candidates[n].alone) is not None}
         rows = []
         for key, curve in self.curves.items():
             listed = key in self.where or key[0] in ALWAYS

@@ -218,7 +218,7 @@ class Search:
 
     def _measured_apart(self) -> tuple[rejection.Exchange, ...]:
         """Each cause with a candidate of its domains, both measured on frames without the other."""
-        found = []
+        exchanges = []
         for out, other in rejection.entangled(self._effects, self._candidates):
             rest = {name: effect for name, effect in self._effects.items() if name != out}
             estimates: dict[str, Estimate] = {}
@@ -232,8 +232,8 @@ class Search:
             if len(estimates) < 2:
                 continue
             effects = rest | {name: one.effect for name, one in estimates.items()}
-            found.append(rejection.Exchange(out, effects, (out, other), estimates))
-        return tuple(found)
+            exchanges.append(rejection.Exchange(out, effects, (out, other), estimates))
+        return tuple(exchanges)
 
     def _favoured(
         self, laws: Additions, replays: Additions
@@ -381,8 +381,8 @@ class Search:
             if candidates[name].in_maps_alone:
                 # Chance acts equally on all statistics of a pattern: together they are no less
                 # likely than one of them.
-                own = signature_key(effect.name, effect.domains[0])
-                gain = min(gain, self.comparison.gain_where_differing(start, trial, own))
+                key = signature_key(effect.name, effect.domains[0])
+                gain = min(gain, self.comparison.gain_where_differing(start, trial, key))
             made.append(Addition(name, effect, trial, gain))
         for name in refused.keys() - {one.name for one in made}:
             candidates[name].reason = refused[name]

@@ -45,10 +45,10 @@ def run_search(inputs: DiagnosisInput, scratch: Path) -> tuple[Description, list
     effects = inputs.effects
     quick = tuple(s for s in effects.signatures if effects.kinds[s.name].quick)
 
-    def simulated(own: tuple[Signature, ...]) -> tuple[Trials, Reference, dict[Key, F64]]:
+    def simulated(signatures: tuple[Signature, ...]) -> tuple[Trials, Reference, dict[Key, F64]]:
         """Null distribution from the nominal bench, and the curves of the data on its scales."""
         known, exact = effects.estimates, SCREEN_SIMULATIONS
-        trials = Trials(inputs.windows, scratch, inputs.runtime, own, known, exact)
+        trials = Trials(inputs.windows, scratch, inputs.runtime, signatures, known, exact)
         (nominal,) = trials.curves([effects.base], REFERENCES, "nominal bench")
         if isinstance(nominal, str):
             raise InputError(nominal)
@@ -60,9 +60,9 @@ def run_search(inputs: DiagnosisInput, scratch: Path) -> tuple[Description, list
         trials, reference, data = simulated(effects.signatures)
     services, most = _SearchServices(inputs, trials), affordable(trials.samples)
     search = Search(reference, data, services.simulate, services.again, most, services.measure)
-    found = search.run(effects.candidates)
-    described = Description(found, data, inputs.measured, reference, inputs.facts)
-    return described, _places(inputs, trials, found)
+    result = search.run(effects.candidates)
+    described = Description(result, data, inputs.measured, reference, inputs.facts)
+    return described, _places(inputs, trials, result)
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,8 @@ class _SearchServices:
         except InputError:
             return None
         asked = partial(estimate, evidence)
-        found = each_of({name: kind}, asked, self.inputs.few, "estimate again")[name]
-        return found if isinstance(found, Estimate) and not found.refused else None
+        answer = each_of({name: kind}, asked, self.inputs.few, "estimate again")[name]
+        return answer if isinstance(answer, Estimate) and not answer.refused else None
 
     def _estimated(self, on: Effects, names: Sequence[str], few: Runtime) -> dict[str, float]:
         window, effects = self.inputs.first, self.inputs.effects
@@ -114,25 +114,25 @@ class _SearchServices:
         except InputError:
             return {}  # These frames cannot show how the effects appear.
         asked = {n: known[n].again or effects.kinds[n] for n in names}
-        found = each_of(asked, partial(detect, evidence), few, "estimate again")
-        return {name: size for name, size in found.items() if size is not None}
+        sizes = each_of(asked, partial(detect, evidence), few, "estimate again")
+        return {name: size for name, size in sizes.items() if size is not None}
 
 
-def _places(inputs: DiagnosisInput, trials: Trials, found: SearchResult) -> list[dict[str, Any]]:
+def _places(inputs: DiagnosisInput, trials: Trials, result: SearchResult) -> list[dict[str, Any]]:
     """Deviations of each window alone; empty if one window covers the detector."""
     base = inputs.effects.base
     if len(inputs.windows) == 1 and inputs.windows[0].part == whole_of(inputs.windows[0].whole):
         return []
     places = []
     for number, window in enumerate(inputs.windows):
-        own = Reference.of(trials.of_window(number, base, REFERENCES))
-        data = own.on_scale(inputs.each[number])
-        nominal = compare(data, expect_nominal(own))
+        reference = Reference.of(trials.of_window(number, base, REFERENCES))
+        data = reference.on_scale(inputs.each[number])
+        nominal = compare(data, expect_nominal(reference))
         final = nominal
-        if found.accepted:
-            bench = (*base, *found.final.effects)
+        if result.accepted:
+            bench = (*base, *result.final.effects)
             final = compare(
-                data, expect_with(own, trials.of_window(number, bench, CONFIRM_SIMULATIONS))
+                data, expect_with(reference, trials.of_window(number, bench, CONFIRM_SIMULATIONS))
             )
         places.append({"window": to_plain(window.part), "domains": by_domain(nominal, final)})
     return places

@@ -62,7 +62,7 @@ def _diagnose(
     with naming("--nominal" if base else f"{run_dir}: the nominal simulation failed"):
         described, places = run_search(inputs, made.scratch)
     diagnosis = described.diagnosis(places)
-    named = {effect.name: effect for effect in described.found.final.effects}
+    named = {effect.name: effect for effect in described.search.final.effects}
     fits = [fit for window in inputs.windows for fit in window.bench.fits]
     shapes = fitted_shapes(run_dir)
     for cause in diagnosis["causes"]:

@@ -56,8 +56,8 @@ class Window:
         self, half: FrameSubset, effects: Effects, seed: int, *, number: int = 0
     ) -> Evidence:
         """Evidence of a simulated half of the frames with effects (`NominalBench.simulate`)."""
-        own = self.seed + seed
-        raw = self.bench.simulate(half, effects, own, window=number)
+        of_window = self.seed + seed
+        raw = self.bench.simulate(half, effects, of_window, window=number)
         return replace(evidence_of(raw, self.part, self.whole), full=self.full)
 
 
@@ -103,17 +103,17 @@ class Trials:
         if items:
             results = self._simulated(items, label, beside)
             for number, one in enumerate(missing):
-                own = results[number * len(places) : (number + 1) * len(places)]
-                wrong = [r for r in own if isinstance(r, str)]
-                kept = [r for r in own if not isinstance(r, str)]
+                of_windows = results[number * len(places) : (number + 1) * len(places)]
+                wrong = [r for r in of_windows if isinstance(r, str)]
+                kept = [r for r in of_windows if not isinstance(r, str)]
                 self._made[one] = wrong[0] if wrong else kept
-        found: list[list[Curves] | str] = []
+        curves: list[list[Curves] | str] = []
         for bench in benches:
             made = [self._made[frozenset(bench), seed] for seed in range(seeds)]
             wrong = [r for r in made if isinstance(r, str)]
             right = [averaged(r) for r in made if not isinstance(r, str)]
-            found.append(wrong[0] if wrong else right)
-        return found
+            curves.append(wrong[0] if wrong else right)
+        return curves
 
     def _simulated(
         self,
@@ -203,9 +203,9 @@ def measured_curves(evidence: Evidence, signatures: Sequence[Signature]) -> Curv
     """The test statistics, and the detection significance of given effects."""
     curves = measure(evidence)
     for kind in signatures:
-        found = detect(evidence, kind)
-        if found is not None:
-            curves[signature_key(kind.name, kind.domains[0])] = signature_curve(found)
+        significance = detect(evidence, kind)
+        if significance is not None:
+            curves[signature_key(kind.name, kind.domains[0])] = signature_curve(significance)
     return curves
 
 
@@ -214,30 +214,30 @@ def averaged(curves: Sequence[Curves]) -> Curves:
     first, *others = curves
     if not others:
         return first
-    found = {}
+    means = {}
     for key, curve in first.items():
-        own = [curve, *(c[key] for c in others if key in c)]
-        if len(own) == len(curves) and len({len(c.value) for c in own}) == 1:
-            found[key] = Curve(curve.x, np.mean([c.value for c in own], axis=0))
-    return found
+        alike = [curve, *(c[key] for c in others if key in c)]
+        if len(alike) == len(curves) and len({len(c.value) for c in alike}) == 1:
+            means[key] = Curve(curve.x, np.mean([c.value for c in alike], axis=0))
+    return means
 
 
 def estimate(
     evidence: Evidence, kind: type[Effect], bound: Bound = OF_ESTIMATE
 ) -> Estimate | str | None:
     """Parameters of an effect; None without evidence, a sentence where the estimate failed."""
-    found = _kept_within(bound, kind.estimate, evidence)
-    if isinstance(found, Estimate) and not np.isfinite(found.significance):
+    answer = _kept_within(bound, kind.estimate, evidence)
+    if isinstance(answer, Estimate) and not np.isfinite(answer.significance):
         return "cannot be estimated here: no finite significance"
-    return found
+    return answer
 
 
 def detect(evidence: Evidence, kind: Signature, bound: Bound = OF_ESTIMATE) -> float | None:
     """Significance of an effect; None if it cannot be determined."""
     # Slow detections run one at a time: the memory plan of simulations allows for one only.
     with nullcontext() if kind.quick else _SLOW:
-        found = _kept_within(bound, kind.detect, evidence)
-    return found if isinstance(found, float) and np.isfinite(found) else None
+        significance = _kept_within(bound, kind.detect, evidence)
+    return significance if isinstance(significance, float) and np.isfinite(significance) else None
 
 
 def each_of(

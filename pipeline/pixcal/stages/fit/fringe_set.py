@@ -158,13 +158,13 @@ def _fit_shape(
         free = np.linalg.lstsq(normal, right[:, 0], rcond=1e-12)[0]
         spread = background * max(1.0, float(square - free @ right[:, 0]) / pixels)
         c = basis.solve(normal, right, spread)
-        own = c[:size, 0]
+        step = c[:size, 0]
         moved = np.sqrt(
-            abs(own @ normal[:size, :size] @ own) / max(np.trace(normal[:1, :1]), 1e-300)
+            abs(step @ normal[:size, :size] @ step) / max(np.trace(normal[:1, :1]), 1e-300)
         )
         if shape.linear or moved < STEP_RAD or steps == MAX_STEPS:
             break
-        shape = shape.moved(own)
+        shape = shape.moved(step)
     rest = float(square - 2 * c[:, 0] @ right[:, 0] + c[:, 0] @ normal @ c[:, 0])
     return SetFit(basis, c, basis.covariance(normal, spread), rest, spread, steps)
 
@@ -176,14 +176,14 @@ def describe(fitted: FittedSet, masked: int, sigma_px: float) -> dict[str, Any]:
     kx, ky = fitted.vector
     k = float(np.hypot(kx, ky))
     ratio = np.median([p.ratio for p in fitted.planes if np.isfinite(p.sigma)])
-    own = len(shape.names)
+    count = len(shape.names)
     origin = float(shape.phase(np.zeros(1), np.zeros(1))[0])
     return {
         "frames": source.n_frames,
         "pixels": ny * nx,
         "pixels_masked": masked,
         "interfringe_px": 2 * np.pi / k,
-        "geometry": shape.facts(fit.covariance[:own, :own]),
+        "geometry": shape.facts(fit.covariance[:count, :count]),
         "kx": kx,
         "ky": ky,
         "nominal_kx": facts["nominal_k"][0],

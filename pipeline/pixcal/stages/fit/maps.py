@@ -137,14 +137,14 @@ def _maps_of_tile(
     """Fill the maps of a tile; return its share of the totals."""
     at, removed = job
     y, x = fitted[0].source.ranges(at)
-    found = [
+    maps = [
         _maps_of_set(f, swept, at, removed[f.name], made)
         for f, swept in zip(fitted, readers, strict=True)
     ]
     delta, sigma = (
-        np.stack([getattr(m, name) for m in found]).astype(float) for name in ("delta", "sigma")
+        np.stack([getattr(m, name) for m in maps]).astype(float) for name in ("delta", "sigma")
     )
-    masks = np.stack([m.flags for m in found])
+    masks = np.stack([m.flags for m in maps])
     # The direction of hyperbolic fringes varies over the window: each tile has its own axes.
     axes = [f.shape.axis((y[0] + y[1] - 1) / 2, (x[0] + x[1] - 1) / 2) for f in fitted]
     value, error, chi2 = (combine_sets if both else combine_parallel)(axes, delta, sigma)
@@ -197,22 +197,22 @@ def _maps_of_set(
 ) -> SetOffsets:
     """Fill a set's own maps of a tile."""
     y, x = fitted.source.ranges(at)
-    found = offsets(fitted, swept, at, removed)
-    made[fitted.name, "delta"][...], made[fitted.name, "sigma"][...] = found.delta, found.sigma
+    tile = offsets(fitted, swept, at, removed)
+    made[fitted.name, "delta"][...], made[fitted.name, "sigma"][...] = tile.delta, tile.sigma
     for name, array in (
         (("batch_delta", "batch_phase"), ("batch_sigma", "batch_sigma")) if fitted.n_batches else ()
     ):
         maps = swept[array].read((0, fitted.n_batches), y, x, out=made[fitted.name, name])
         if name == "batch_delta":
-            surfaces = removed[:, 1:].T.astype(np.float32) @ found.modes.astype(np.float32)
+            surfaces = removed[:, 1:].T.astype(np.float32) @ tile.modes.astype(np.float32)
             maps -= surfaces.reshape(maps.shape)
-            maps *= np.float32(1 / found.k)
-            maps += found.delta
+            maps *= np.float32(1 / tile.k)
+            maps += tile.delta
         else:
-            maps *= found.scale
-        maps[:, found.flags != 0] = np.nan
+            maps *= tile.scale
+        maps[:, tile.flags != 0] = np.nan
         rounded(maps, DIGITS[name])
-    return found
+    return tile
 
 
 def _create_set(folder: Path, fitted: FittedSet) -> Writers:

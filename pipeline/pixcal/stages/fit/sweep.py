@@ -236,10 +236,10 @@ def _sweep_tile(job: _Job, at: tuple[int, int]) -> dict[str, NDArray[Any]]:
     number = job.common.bound_pixels
     facts[0, 0, 1 + number : 1 + number + len(chi2)] = chi2
     sums = _sums(job, tile, maps, flags == 0)[None, None]
-    found = {name: getattr(maps, name) for name in MAPS}
+    arrays = {name: getattr(maps, name) for name in MAPS}
     # In place, once the sums have been taken.
-    found |= {name: rounded(getattr(maps, name), DIGITS[name]) for name in BATCH_MAPS}
-    return found | {"mask": flags, "tiles": facts, "sums": sums}
+    arrays |= {name: rounded(getattr(maps, name), DIGITS[name]) for name in BATCH_MAPS}
+    return arrays | {"mask": flags, "tiles": facts, "sums": sums}
 
 
 def rounded(values: F32, digits: int) -> F32:

@@ -154,7 +154,7 @@ def _described(
     planes = Counter(table["file"])
     first = {table["file"][n]: n for n, plane in enumerate(table["plane"]) if plane == 0}
     rows = {} if places is None else {name: n for n, name in enumerate(places["file"])}
-    found = []
+    files = []
     for source in sources:
         n = first[source.name]
         frame = (planes[source.name], shape[1], shape[2])
@@ -162,8 +162,8 @@ def _described(
         if places is not None:
             file = described(places, rows[source.name], source.path.parent, frame[1:])
         headers = {name: table[name][n] for name in ("mjd", "exptime_s", "temperature_c")}
-        found.append(replace(file, source=source, **headers))
-    return found
+        files.append(replace(file, source=source, **headers))
+    return files
 
 
 def _order(files: Sequence[FrameFile]) -> list[tuple[str, int]]:
@@ -184,8 +184,8 @@ def take_over(made: Build, kept: Sequence[Kept], runtime: Runtime) -> dict[str, 
         for k in kept
     ]
     tasks = list(zip(kept, writers, strict=True))
-    found = run_tasks(_take_over, tasks, runtime, label="reused frames")
-    return {k.array: facts for k, facts in zip(kept, found, strict=True) if facts is not None}
+    results = run_tasks(_take_over, tasks, runtime, label="reused frames")
+    return {k.array: facts for k, facts in zip(kept, results, strict=True) if facts is not None}
 
 
 def _take_over(task: tuple[Kept, Writers]) -> dict[str, Any] | None:

@@ -58,18 +58,18 @@ def cut_warning(
     array: str, frames: Sequence[Frame], first: Sequence[int | None], facts: Mapping[str, F64]
 ) -> list[str]:
     """Warnings on the frames of an array, given the arguments and result of `cut_from`."""
-    found = [
+    cut = [
         f"{frame.name} (all samples {value:g} from row {row} on)"
         for frame, row, value in zip(frames, first, facts["last"][:, -1], strict=True)
         if row is not None
     ]
-    return left_out(f"{array}: incomplete frames", found, len(frames), "cut_from_row")
+    return left_out(f"{array}: incomplete frames", cut, len(frames), "cut_from_row")
 
 
-def left_out(what: str, found: Sequence[str], count: int, key: str) -> list[str]:
+def left_out(what: str, frames: Sequence[str], count: int, key: str) -> list[str]:
     """Warning on frames that are not used, if there are any; ``key``: in ``frames.json``."""
-    several = f"({len(found)} of {count}): {first_few(found)}; frames.json lists them ({key})"
-    return [f"{what} are left out {several}"] if found else []
+    several = f"({len(frames)} of {count}): {first_few(frames)}; frames.json lists them ({key})"
+    return [f"{what} are left out {several}"] if frames else []
 
 
 def repeats_of(facts: Mapping[str, F64]) -> list[int | None]:
@@ -82,18 +82,18 @@ def repeats_of(facts: Mapping[str, F64]) -> list[int | None]:
     """
     first: dict[bytes, int] = {}
     content = np.stack([facts[name] for name in ("crc", "largest", "last", "share")], axis=1)
-    found = [first.setdefault(own.tobytes(), n) for n, own in enumerate(content)]
-    if 2 * len(first) < len(found):
-        return [None] * len(found)
+    earliest = [first.setdefault(frame.tobytes(), n) for n, frame in enumerate(content)]
+    if 2 * len(first) < len(earliest):
+        return [None] * len(earliest)
     noisy = facts["share"][:, -1] < _ONE_VALUE
-    return [one if one != n and noisy[n] else None for n, one in enumerate(found)]
+    return [one if one != n and noisy[n] else None for n, one in enumerate(earliest)]
 
 
 def repeat_warning(array: str, frames: Sequence[Frame], repeats: Sequence[int | None]) -> list[str]:
     """Warnings on the frames of an array, given the result of `repeats_of`."""
-    found = [
+    same = [
         f"{frames[n].name} (same as {frames[first].name})"
         for n, first in enumerate(repeats)
         if first is not None
     ]
-    return left_out(f"{array}: frames identical to an earlier one", found, len(frames), "repeat_of")
+    return left_out(f"{array}: frames identical to an earlier one", same, len(frames), "repeat_of")

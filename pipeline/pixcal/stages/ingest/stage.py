@@ -301,7 +301,7 @@ def _write_piece(piece: _Piece) -> None:
         strips = [(y, min(y + piece.rows, ny)) for y in range(0, ny, piece.rows)]
         count = min(CHUNK[0], len(piece.frames))
         buffer = np.empty((count, min(piece.rows, ny), nx), samples.dtype)
-    found = np.empty((len(piece.frames), *piece.writers.catalogue.shape[1:]))
+    facts = np.empty((len(piece.frames), *piece.writers.catalogue.shape[1:]))
     with TemporaryDirectory(dir=piece.scratch) as scratch:
         unpacked: dict[str, FrameFile] = {}
         for t in range(0, len(piece.frames), CHUNK[0]):
@@ -310,10 +310,10 @@ def _write_piece(piece: _Piece) -> None:
             for y0, y1 in strips:
                 out = None if samples is None else buffer[: len(block), : y1 - y0]
                 bands = slice(y0 // BAND, -(-y1 // BAND))
-                found[t : t + len(block), bands] = _read_block(block, unpacked, (y0, y1), out)
+                facts[t : t + len(block), bands] = _read_block(block, unpacked, (y0, y1), out)
                 if samples is not None and out is not None:
                     samples.write((piece.start + t, y0, 0), out)
-    piece.writers.catalogue.write((piece.start, 0, 0), found)
+    piece.writers.catalogue.write((piece.start, 0, 0), facts)
 
 
 def _unpack_block(
@@ -336,15 +336,15 @@ def _read_block(
     rows: tuple[int, int],
     out: NDArray[Any] | None,
 ) -> F64:
-    found, at = [], 0
+    facts, at = [], 0
     for file, group in groupby(block, key=lambda frame: frame.file):
         planes = [frame.plane for frame in group]
         target = None if out is None else out[at : at + len(planes)]
-        found.append(
+        facts.append(
             frame_decoding.read_rows(unpacked.get(file.source.name, file), planes, rows, target)
         )
         at += len(planes)
-    return np.concatenate(found)
+    return np.concatenate(facts)
 
 
 # The end
@@ -378,11 +378,11 @@ def _close(
     write_json(made.folder / "acquisition.json", to_plain(described))
     listed, places, warnings = {}, {}, []
     for array, frames in tables.items():
-        found = frame_decoding.by_fact(ArrayReader(made.folder / "catalogue.zarr" / array).read())
-        largest = np.fmax.reduce(found["largest"], axis=1)
-        cut = cut_from(array, found, frames[0].file.shape[1])
-        repeats = repeats_of(found)
-        warnings += cut_warning(array, frames, cut, found)
+        bands = frame_decoding.by_fact(ArrayReader(made.folder / "catalogue.zarr" / array).read())
+        largest = np.fmax.reduce(bands["largest"], axis=1)
+        cut = cut_from(array, bands, frames[0].file.shape[1])
+        repeats = repeats_of(bands)
+        warnings += cut_warning(array, frames, cut, bands)
         warnings += repeat_warning(array, frames, repeats)
         listed[array] = columns(frames) | {
             "largest_adu": [float(v) if np.isfinite(v) else None for v in largest],

@@ -106,41 +106,41 @@ class _Counts(NamedTuple):
         return not bool((down[:-2] & up[1:-1] & down[2:]).any())
 
 
-def _pile(found: _Counts, most: float, step: float) -> int:
+def _pile(counts: _Counts, most: float, step: float) -> int:
     """Code up to ``most`` at which samples pile up, with hardly any below; 0 if there is none."""
-    low = found.many() & (found.code < most)
-    piled = low & (found.below < _BELOW * found.number)
+    low = counts.many() & (counts.code < most)
+    piled = low & (counts.below < _BELOW * counts.number)
     if not piled.any():
-        return _spread_pile(found, low, step)
+        return _spread_pile(counts, low, step)
     at = int(np.flatnonzero(piled)[-1])
     # Rounding after the cut may spread the pile over two codes. Noise alone is log-concave.
-    after = found.number[at + 1 : at + 4].astype(float)
-    if len(after) == 3 and after[0] - after[1] ** 2 / after[2] > _SECOND * found.number[at]:
+    after = counts.number[at + 1 : at + 4].astype(float)
+    if len(after) == 3 and after[0] - after[1] ** 2 / after[2] > _SECOND * counts.number[at]:
         at += 1
-    return int(found.code[at])
+    return int(counts.code[at])
 
 
-def _spread_pile(found: _Counts, low: Mask, step: float) -> int:
+def _spread_pile(counts: _Counts, low: Mask, step: float) -> int:
     """Second code of a pile whose first code has few of its samples; 0 if there is none."""
     at = int(np.argmax(low))
-    near = found.number[at : at + 3].astype(float)
-    if at == 0 or len(near) < 3 or found.below[at - 1] > _BELOW * near[0]:
+    near = counts.number[at : at + 3].astype(float)
+    if at == 0 or len(near) < 3 or counts.below[at - 1] > _BELOW * near[0]:
         return 0
-    if found.code[at + 2] - found.code[at] != 2 * step:
+    if counts.code[at + 2] - counts.code[at] != 2 * step:
         return 0
     # Noise alone is log-concave.
     most = near[1] ** 2 / near[2]
     error = math.sqrt(near[0] + most**2 * (4 / near[1] + 1 / near[2]))
     beyond = near[0] - most > max(_SPREAD * near[0], _SURE * error)
-    return int(found.code[at]) if beyond else 0
+    return int(counts.code[at]) if beyond else 0
 
 
-def _edge(found: _Counts, step: float) -> int:
+def _edge(counts: _Counts, step: float) -> int:
     """Lowest code of noise of about a step, if many lower samples are lacking; else 0."""
     # The logarithms of the counts of normal noise lie on a parabola, which the codes above
     # continue.
-    code, number, total = found.code, found.number, found.number.sum()
-    first = int(np.argmax(found.many() & (found.below < _SHARE * total)))
+    code, number, total = counts.code, counts.number, counts.number.sum()
+    first = int(np.argmax(counts.many() & (counts.below < _SHARE * total)))
     # Rounding, or dark signal added, after the cut may spread the pile over two codes.
     for at in (first, first + 1):
         near = number[at : at + 4].astype(float)
@@ -152,7 +152,7 @@ def _edge(found: _Counts, step: float) -> int:
         lacking = math.exp(above @ ((6, -8, 3) if at == first else (10, -15, 6)))
         if at > first:
             lacking += math.exp(above @ (6, -8, 3)) - float(number[first])
-        lost = lacking > max(_LACKING * total, found.below[first] / _BELOW)
+        lost = lacking > max(_LACKING * total, counts.below[first] / _BELOW)
         if lost and near[0] > _EDGE * math.exp(above @ (3, -3, 1)):
             return int(code[at])
     return 0
@@ -168,22 +168,22 @@ def _changing(samples: NDArray[Any], code: int) -> float:
 
 def cut_offs(arrays: Mapping[str, Reader], step: float) -> dict[str, CutOff]:
     """Cut-offs of the bias and dark frames, by array."""
-    found = {name: CutOff.of(arrays[name], step) for name in ("bias", "dark") if name in arrays}
-    dark = found.get("dark")
+    by_array = {name: CutOff.of(arrays[name], step) for name in ("bias", "dark") if name in arrays}
+    dark = by_array.get("dark")
     if dark is not None and "bias" in arrays:
         # Codes below the end, in frames of less charge: dark signal of skewed pixels has an edge.
         samples = middle_rows(arrays["bias"], 0, _FRAMES)
         changing = samples.min(axis=0) != samples.max(axis=0)
         if np.sum(samples[:, changing] < dark.code) > _BELOW * dark.share * samples.size:
-            found["dark"] = None
-    return {name: one for name, one in found.items() if one is not None}
+            by_array["dark"] = None
+    return {name: one for name, one in by_array.items() if one is not None}
 
 
-def cut_off_warnings(found: Mapping[str, CutOff]) -> Sequence[str]:
+def cut_off_warnings(by_array: Mapping[str, CutOff]) -> Sequence[str]:
     """Sentences about cut-offs."""
     return [
         f"{name} frames are cut off at code {one.code:.0f}, where {100 * one.share:.3g} % of their "
         "samples lie: level and noise are estimated from a normal distribution cut off there; "
         "raise the black level (offset) of the camera"
-        for name, one in found.items()
+        for name, one in by_array.items()
     ]

@@ -142,23 +142,23 @@ def finish(job: Finishing, strip: Strip) -> F64:
 
 def _maps(job: Finishing, index: Index, block: F32) -> dict[str, NDArray[Any]]:
     """Calibration maps (y, x) of a column, from what `measure` wrote."""
-    found = dict(zip(STATISTICS, block.astype(float), strict=True))
-    flat = np.ones_like(found["bias"])
+    stats = dict(zip(STATISTICS, block.astype(float), strict=True))
+    flat = np.ones_like(stats["bias"])
     error = np.zeros_like(flat)
     if job.measured.flat:
         light = job.light[index] / job.usual.response
-        flat, error = (light * found[name] for name in ("response", "response_error"))
-    mask = _flags(job, found, flat, error)
+        flat, error = (light * stats[name] for name in ("response", "response_error"))
+    mask = _flags(job, stats, flat, error)
     read = np.full_like(flat, job.read_noise)
     series = job.measured.read_series
     if series is not None and len(series.frames) >= _MIN_READ_FRAMES:
-        own, dof = job.gain**2 * np.maximum(found["read_variance"], 0), len(series.frames) - 1
-        shared = dof * own + _PRIOR_DOF * job.read_noise**2
+        variance, dof = job.gain**2 * np.maximum(stats["read_variance"], 0), len(series.frames) - 1
+        shared = dof * variance + _PRIOR_DOF * job.read_noise**2
         of_pixel = np.sqrt(shared / (dof + _PRIOR_DOF))
         read = np.where(np.isfinite(of_pixel), np.maximum(of_pixel, job.floor), read)
     return {
-        "bias": np.nan_to_num(found["bias"]),
-        "dark_rate": job.gain * np.nan_to_num(found["dark_rate"]),
+        "bias": np.nan_to_num(stats["bias"]),
+        "dark_rate": job.gain * np.nan_to_num(stats["dark_rate"]),
         "flat": np.where(np.isfinite(flat), np.maximum(flat, FLAT_FLOOR), 1.0),
         "read_noise": read,
         "mask": mask,
@@ -174,15 +174,15 @@ def _ends(maps: Mapping[str, NDArray[Any]]) -> tuple[float, float, float, float]
     return float(flat.min()), float(flat.max()), float(bias.max()), float(rate.max())
 
 
-def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> U8:
-    mask = found["flags"].astype(np.uint8)
+def _flags(job: Finishing, stats: Mapping[str, F64], flat: F64, error: F64) -> U8:
+    mask = stats["flags"].astype(np.uint8)
     limits, medians = job.measured.options, job.usual
     # A level at the boundary of two codes gives either one, however low the noise.
     least = 3 * (job.floor / job.gain) ** 2
     warm = np.zeros(mask.shape, np.bool_)
     if len({group.exptime for group in job.measured.dark}) > 1:
         warm = hot(
-            found["dark_rate"], found["dark_rate_error"], medians.dark_rate_sigma, limits.hot_sigma
+            stats["dark_rate"], stats["dark_rate_error"], medians.dark_rate_sigma, limits.hot_sigma
         )
         mask[warm] |= np.uint8(PixelFlag.HOT)
     if job.measured.flat:
@@ -192,13 +192,13 @@ def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> U
         # The response of a hot pixel that its dark signal fills is not known.
         mask[where & ~(warm & (flat > FLAT_FLOOR))] |= np.uint8(PixelFlag.DEAD)
     if np.isfinite(medians.dark_variance):
-        variance, dof = found["dark_variance"], found["dark_dof"]
+        variance, dof = stats["dark_variance"], stats["dark_dof"]
         where = noisy(
             variance,
             dof,
             variance_nearby(variance, dof, max(medians.dark_variance, least)),
-            found["kurtosis"],
-            found["outliers"],
+            stats["kurtosis"],
+            stats["outliers"],
             medians.noisy,
         )
         mask[where] |= np.uint8(PixelFlag.NOISY)

@@ -136,11 +136,11 @@ class DarkLevels:
         flats = source.exposures.flat if _follows_light(source) else []
         groups, levels = [], []
         for group in (*source.exposures.dark, *flats) if pixels.any() else ():
-            own = _frame_levels(partial(_samples, source, group, window, pixels))
-            kept = tuple(n for n, one in zip(group.frames, own, strict=True) if np.isfinite(one))
+            means = _frame_levels(partial(_samples, source, group, window, pixels))
+            kept = tuple(n for n, one in zip(group.frames, means, strict=True) if np.isfinite(one))
             if kept:
                 groups.append(replace(group, frames=kept))
-                levels.append(own[np.isfinite(own)])
+                levels.append(means[np.isfinite(means)])
         return cls(tuple(groups), tuple(levels), int(pixels.sum()))
 
     @property
@@ -153,7 +153,7 @@ class DarkLevels:
     def means(self) -> F64:
         """Mean of each frame without light, ADU."""
         pairs = zip(self.groups, self.levels, strict=True)
-        return np.concatenate([*(own for g, own in pairs if g.array != "flat"), []])
+        return np.concatenate([*(level for g, level in pairs if g.array != "flat"), []])
 
 
 def _frame_levels(read: Callable[[], Iterable[NDArray[Any]]]) -> F64:
@@ -226,18 +226,18 @@ def late_rate(
         return None
     unlit = levels.means[levels.times == levels.times.min()].mean()
     series = []
-    for group, own in zip(levels.groups, levels.levels, strict=True):
+    for group, level in zip(levels.groups, levels.levels, strict=True):
         frames, start = np.array(group.frames), starts_of(source.tables)[group.array]
         time = np.array(source.tables[group.array]["time_s"], float)[frames]
         stack = Stack(group.array, group.exptime, frames, time, _NO_SAMPLES, start)
-        series.append((stack, gain * (own - unlit)))
+        series.append((stack, gain * (level - unlit)))
     least = read_noise**2 / levels.pixels
-    found = released_late(series, least)
-    if found is None:
+    fit = released_late(series, least)
+    if fit is None:
         return None
-    lag, late = found
+    lag, late = fit
     pairs = zip(levels.groups, late, strict=True)
-    dark = np.concatenate([own for g, own in pairs if g.array != "flat"])
+    dark = np.concatenate([charge for g, charge in pairs if g.array != "flat"])
     slope = emva.dark_slope(levels.times, gain * levels.means - dark)
     of_late = emva.dark_slope(levels.times, dark)
     if slope is None or of_late is None:

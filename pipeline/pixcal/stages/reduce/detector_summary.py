@@ -93,8 +93,8 @@ class Summary:
         """A noise (ADU) and its error in e-, by the measured gain, else by the used gain."""
         if noise is None:
             return None
-        own, error = (gain, 0.0) if self.gain is None else self.gain.of_electrons
-        return own * noise[0], math.hypot(own * noise[1], error * noise[0])
+        factor, error = (gain, 0.0) if self.gain is None else self.gain.of_electrons
+        return factor * noise[0], math.hypot(factor * noise[1], error * noise[0])
 
     def noise_before_rounding_e(self, gain: float) -> float:
         """Read noise (e-) of the amplifier: measured, else declared."""
@@ -138,14 +138,14 @@ def summarise(job: Measuring, folder: Place, source: Ingested) -> Summary:
     for _ in range(2 if charge else 1):
         shot = charge / (job.gain if gain is None else gain.gain)
         error = _GUESS_ERROR if gain is None else gain.error / gain.gain
-        noise, own, spread = read_noise.read_noise(dark, lost, (shot, error * shot), job)
-        gain = _gain(sums, own, lost[0], wander, top, job)
+        noise, unrounded, spread = read_noise.read_noise(dark, lost, (shot, error * shot), job)
+        gain = _gain(sums, unrounded, lost[0], wander, top, job)
     if spread is not None:
         medians = replace(medians, noisy=noisy_beyond(medians.noisy, spread))
     if gain is not None and (read_noise.is_cut_off(job) or _tells_noise(gain)):
-        noise, own = read_noise.of_variance(gain.read_variance, job.quantum)
+        noise, unrounded = read_noise.of_variance(gain.read_variance, job.quantum)
     elif gain is not None and gain.without_dark:
-        noise, own = (n and (n[0], max(n[1], _OFF_CURVE * n[0])) for n in (noise, own))
+        noise, unrounded = (n and (n[0], max(n[1], _OFF_CURVE * n[0])) for n in (noise, unrounded))
     known = math.nan if gain is None else gain.read_variance[0]
     straight = straightness(_steps_of(source, levels, usable, rate), points, known)
     return Summary(
@@ -154,7 +154,7 @@ def summarise(job: Measuring, folder: Place, source: Ingested) -> Summary:
         medians,
         light,
         noise,
-        own,
+        unrounded,
         gain,
         levels,
         usable,
@@ -285,10 +285,10 @@ def _light(tables: F64, levels: F64, usable: Mask, job: Measuring) -> F64:
     lost = tables[..., 2].sum(axis=(0, 1))
     taken = usable if usable.any() else lost == lost.min()
     frames = np.array([len(group.frames) for group in job.flat])
-    own = tables[..., 0]
-    weight = np.where(np.isfinite(own) & taken, frames, 0.0)
+    means = tables[..., 0]
+    weight = np.where(np.isfinite(means) & taken, frames, 0.0)
     whole = (weight * levels).sum(axis=-1)
-    charge = (weight * np.nan_to_num(own)).sum(axis=-1)
+    charge = (weight * np.nan_to_num(means)).sum(axis=-1)
     share: F64 = np.divide(charge, whole, out=np.full_like(whole, np.nan), where=whole != 0)
     return share
 
@@ -317,15 +317,15 @@ def linearity_report(summary: Summary, job: Measuring, gain: float) -> dict[str,
     """Entry of ``reduce.json`` on the exposure-time steps of flats; None without them."""
     if summary.linearity is None:
         return None
-    found, line = summary.linearity, summary.linearity.line
+    linearity, line = summary.linearity, summary.linearity.line
     rows = zip(job.flat, summary.levels, line.deviation, strict=True)
     return {
-        "max_deviation_percent": 100 * found.largest,
-        "error_percent": None if found.error is None else 100 * found.error,
+        "max_deviation_percent": 100 * linearity.largest,
+        "error_percent": None if linearity.error is None else 100 * linearity.error,
         "intercept_adu": line.intercept,
         "exposure_offset_s": line.late[0],
-        "exposure_step_s": found.rounded or None,
-        "lamp_drift_percent": 100 * found.drift,
+        "exposure_step_s": linearity.rounded or None,
+        "lamp_drift_percent": 100 * linearity.drift,
         "levels": [
             {
                 "exptime_s": group.exptime,

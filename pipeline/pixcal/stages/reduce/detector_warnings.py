@@ -134,7 +134,7 @@ def _gain_warnings(fit: GainFit, summary: Summary, used: float, filtered: bool) 
 
 def lamp_warnings(series: Sequence[tuple[float, F64]]) -> list[str]:
     """That the light of flats (t,) of an exposure time (s) drifts or scatters within the series."""
-    found = {"drifts": (0.0, 0.0), "scatters": (0.0, 0.0)}
+    worst = {"drifts": (0.0, 0.0), "scatters": (0.0, 0.0)}
     for seconds, levels in series:
         if len(levels) < _FEWEST or levels.mean() <= 0:
             continue
@@ -143,60 +143,60 @@ def lamp_warnings(series: Sequence[tuple[float, F64]]) -> list[str]:
         line = np.polyfit(time, light, 1)
         drift, scatter = abs(line[0]) * (len(time) - 1), float(np.std(np.diff(light)) / np.sqrt(2))
         if drift > _DRIFT and drift > _SURE * scatter:
-            found["drifts"] = max(found["drifts"], (drift, seconds))
+            worst["drifts"] = max(worst["drifts"], (drift, seconds))
         elif scatter > _SCATTER:
-            found["scatters"] = max(found["scatters"], (scatter, seconds))
+            worst["scatters"] = max(worst["scatters"], (scatter, seconds))
     how = {"drifts": "over their series", "scatters": "rms from frame to frame"}
     return [
         f"the light of the flats {what} by up to {100 * size:.2g} % {how[what]} (exposures of "
         f"{seconds:g} s): gain and noise allow for it; for linearity, let the lamp warm up and "
         "keep it steady"
-        for what, (size, seconds) in found.items()
+        for what, (size, seconds) in worst.items()
         if size
     ]
 
 
 def _linearity_warnings(summary: Summary) -> list[str]:
     """Why the levels of the flats deviate from a straight line over exposure time."""
-    found = summary.linearity
-    if found is None:
+    flats = summary.linearity
+    if flats is None:
         return []
-    off, said = f"{100 * found.line.max_deviation:.2g} %", []
+    off, said = f"{100 * flats.line.max_deviation:.2g} %", []
     unflagged = "; it does not flag pixels as NONLINEAR"
-    if found.drift > _LATE:
+    if flats.drift > _LATE:
         said.append(
-            f"the light of the flats changes by up to {100 * found.drift:.2g} %, as the frames of "
+            f"the light of the flats changes by up to {100 * flats.drift:.2g} %, as the frames of "
             "each exposure time show: the linearity error allows for it"
         )
-    if found.rounded:
+    if flats.rounded:
         said.append(
-            f"the exposure times of the flats seem rounded to {found.rounded:g} s: deviations of "
+            f"the exposure times of the flats seem rounded to {flats.rounded:g} s: deviations of "
             f"the levels from a straight line, of up to {off}, are within half a step "
-            f"({found.rounded / 2:g} s) of the exposure times, and their noise shows no nonlinear "
+            f"({flats.rounded / 2:g} s) of the exposure times, and their noise shows no nonlinear "
             "response; the linearity error allows for it. Write the true times into "
             "the headers, or expose "
             "for whole multiples of the step" + unflagged
         )
-    elif found.scatter:
+    elif flats.scatter:
         said.append(
-            f"the levels of the flats scatter by {100 * found.scatter:.2g} % about a smooth curve "
+            f"the levels of the flats scatter by {100 * flats.scatter:.2g} % about a smooth curve "
             "over exposure time, while their noise shows no nonlinear response; possible causes: "
             "rounded exposure times, a lamp reset for each level, or a step in the response; the "
             "linearity error allows for it" + unflagged
         )
-    elif found.lamp:
+    elif flats.lamp:
         said.append(
             f"the levels of the flats deviate by up to {off} from a straight line over exposure "
             "time: the response may be nonlinear, or the lamp may drift; to separate the two, "
             "repeat the first level at the end, with several flats of each level" + unflagged
         )
-    elif found.line.max_deviation > _LINEARITY:
+    elif flats.line.max_deviation > _LINEARITY:
         said.append(
             f"the levels of the flats deviate by up to {off} from a straight line over exposure "
             "time: the response of all pixels is nonlinear, the lamp is unsteady, or exposure "
             "times are wrong" + unflagged
         )
-    return said + _exposure_warnings(summary, found.line)
+    return said + _exposure_warnings(summary, flats.line)
 
 
 def _exposure_warnings(summary: Summary, straight: Linearity) -> list[str]:
@@ -259,8 +259,8 @@ def trail_warnings(calibration: Place, source: Ingested, gain: float) -> list[st
         for name in ("dark_rate", "bias")
     )
     usable = bias + rate * seconds / gain < _HOT_FULL * source.saturation(longest.array)
-    found = hot_pixels_of(rate * seconds, usable, LINKS)
-    trails = None if found is None else trails_of(found, rate.shape, (y0, x0))
+    hot = hot_pixels_of(rate * seconds, usable, LINKS)
+    trails = None if hot is None else trails_of(hot, rate.shape, (y0, x0))
     middle = (y0 + y1) / 2, (x0 + x1) / 2
     said = [
         f"along {lines} that are read out towards the {'first' if one.output <= first else 'last'} "

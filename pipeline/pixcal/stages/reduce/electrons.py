@@ -47,10 +47,10 @@ class FringeSet:
         """Calibration maps of each column of chunks."""
         ranges = tiles.span(self.raw.shape[1:], strip)
         names = ("bias", "dark_rate", "flat", "read_noise", "mask")
-        found = [
+        maps = [
             tiles.by_column(ArrayReader(self.calibration / name).read(*ranges)) for name in names
         ]
-        return [dict(zip(names, of_column, strict=True)) for of_column in zip(*found, strict=True)]
+        return [dict(zip(names, of_column, strict=True)) for of_column in zip(*maps, strict=True)]
 
 
 def signal_range(fringes: FringeSet, strip: Strip) -> tuple[float, float]:
@@ -61,8 +61,8 @@ def signal_range(fringes: FringeSet, strip: Strip) -> tuple[float, float]:
     for _, samples in blocks(fringes.raw, strip):
         for n, (low, high) in enumerate(zip(lowest, highest, strict=True)):
             extremes(samples, fringes.saturation, low, high, n * CHUNK[2])
-    found = [_range_e(fringes, *of) for of in zip(every, lowest, highest, strict=True)]
-    return min(low for low, _ in found), max(high for _, high in found)
+    ranges = [_range_e(fringes, *of) for of in zip(every, lowest, highest, strict=True)]
+    return min(low for low, _ in ranges), max(high for _, high in ranges)
 
 
 def _range_e(
@@ -190,20 +190,20 @@ def convert(
     The counts are: saturated samples; other samples without weight; samples with weight; the sum of
     their codes; the largest sample of the strip (ADU; zero for real numbers).
     """
-    found: dict[Index, dict[str, NDArray[Any]]] = {}
+    results: dict[Index, dict[str, NDArray[Any]]] = {}
     for strip in parts:
-        own = zip(strip, fringes.maps(strip), strict=True)
-        columns = [_Column(fringes, scale, index, maps) for index, maps in own]
+        with_maps = zip(strip, fringes.maps(strip), strict=True)
+        columns = [_Column(fringes, scale, index, maps) for index, maps in with_maps]
         for first, samples in blocks(fringes.raw, strip):
             largest = int(samples.max()) if samples.dtype.kind in "iu" else 0
             for n, column in enumerate(columns):
                 column.add(first, samples, n * CHUNK[2], writers["signal"])
                 column.largest = max(column.largest, largest)
-        found |= {column.index: column.result() for column in columns}
-    for strip in tiles.strips(list(found), STRIP):
+        results |= {column.index: column.result() for column in columns}
+    for strip in tiles.strips(list(results), STRIP):
         (y0, _), (x0, _) = tiles.extent(fringes.raw.shape[1:], strip[0])
-        for name in found[strip[0]]:
+        for name in results[strip[0]]:
             writer = writers[name]
-            data = np.concatenate([found[index][name] for index in strip], axis=1)
+            data = np.concatenate([results[index][name] for index in strip], axis=1)
             start = (*strip[0], 0) if name == "counts" else (y0, x0)
             writer.write(start, data.astype(writer.dtype))

@@ -61,38 +61,38 @@ def characterise(
     outputs = _outputs_of(made, summary, middle)
     if outputs is not None:
         note = _report_outputs(outputs, gain[0], facts, source.shape)
-    found: Json = {"conversion_gain": _figure("conversion gain", "e-/ADU", gain, note)}
-    noise = _read_noise(found, summary, gain[0], source.quantum)
+    figures: Json = {"conversion_gain": _figure("conversion gain", "e-/ADU", gain, note)}
+    noise = _read_noise(figures, summary, gain[0], source.quantum)
     excess = 1.0 if summary.gain is None else summary.gain.excess[0]
-    _line_noise(found, dark, gain[0], job.shape, nearby)
+    _line_noise(figures, dark, gain[0], job.shape, nearby)
     if top is not None:
-        _full_well(found, gain, excess, top, reached, noise)
+        _full_well(figures, gain, excess, top, reached, noise)
     if facts["linearity"] is not None:
         departure = (facts["linearity"][key] for key in ("max_deviation_percent", "error_percent"))
-        found["linearity_error"] = _figure("linearity error, largest", "%", (*departure,))
+        figures["linearity_error"] = _figure("linearity error, largest", "%", (*departure,))
     curves: Json = {"photon_transfer": _listed(summary.transfer.T, ("level", "variance", "error"))}
     of_noise = {"gain": gain[0] / excess, "read_variance": (noise or (0.0,))[0] ** 2}
     curves["photon_transfer"] |= of_noise
     if halves.dark is not None:
-        facts["warnings"] += _dsnu(found, curves, halves, summary, gain[0], source.quantum)
+        facts["warnings"] += _dsnu(figures, curves, halves, summary, gain[0], source.quantum)
         if source.exposures.read_series and source.exposures.read_series.array in source.cut_off:
-            said = found["dsnu"]["note"], "lower limit: dark pixels are cut off at the lowest code"
-            found["dsnu"]["note"] = "; ".join(filter(None, said))
+            why = figures["dsnu"]["note"], "lower limit: dark pixels are cut off at the lowest code"
+            figures["dsnu"]["note"] = "; ".join(filter(None, why))
     if halves.flat is not None:
         light = halves.flat if outputs is None else halves.flat * outputs.of_pixel
         percent = np.stack([100 * emva.without_trend(half, halves.good) for half in light])
-        facts["warnings"] += _spread(found, curves, "prnu", "%", percent, halves.good)
+        facts["warnings"] += _spread(figures, curves, "prnu", "%", percent, halves.good)
     rate = dark_current(made, source, job, gain, gain[0] / entry["used"], middle)
     if rate is not None:
-        found["dark_current"] = _figure("dark current", rate.unit, rate.measure, rate.note)
+        figures["dark_current"] = _figure("dark current", rate.unit, rate.measure, rate.note)
         facts["warnings"] += rate.warnings
-    for name, figure in found.items():
+    for name, figure in figures.items():
         by_gain = figure["unit"].startswith("e-") and name != "conversion_gain"
         if by_gain and figure["error"] is not None:
             of_gain = figure["value"] * (gain[1] or 0.0) / gain[0]
             figure["error"] = math.hypot(figure["error"], of_gain)
     write_json(made.folder / "figures_of_merit.json", curves)
-    return found
+    return figures
 
 
 def _figure(
@@ -102,27 +102,27 @@ def _figure(
     return {"title": title, "unit": unit, "value": value, "error": error, "note": note}
 
 
-def _read_noise(found: Json, summary: Summary, gain: float, step: float) -> Measure | None:
+def _read_noise(figures: Json, summary: Summary, gain: float, step: float) -> Measure | None:
     """Add read noise with and without rounding to steps, in e-; return it with rounding, in ADU."""
-    whole, own = summary.read_noise, summary.before_rounding
+    whole, unrounded = summary.read_noise, summary.before_rounding
     if whole is None:
         return None
     steps = "ADU" if step == 1 else f"steps of {step:g} ADU"
     note = f"rounding to {steps} adds {step * gain / math.sqrt(12):.3g} e-" if step else ""
-    if own is None and note:
+    if unrounded is None and note:
         note += "; too coarse to measure the noise without it"
     for name, title, noise, said in (
         ("read_noise_with_rounding", "read noise with rounding", whole, note),
-        ("read_noise", "read noise without rounding", own, ""),
+        ("read_noise", "read noise without rounding", unrounded, ""),
     ):
         if noise is not None:
             electrons = gain * noise[0], gain * noise[1]
-            found[name] = _figure(title, "e-", electrons, said)
+            figures[name] = _figure(title, "e-", electrons, said)
     return whole
 
 
 def _line_noise(
-    found: Json, dark: F64, gain: float, shape: tuple[int, int], nearby: Nearby | None
+    figures: Json, dark: F64, gain: float, shape: tuple[int, int], nearby: Nearby | None
 ) -> None:
     """Temporal noise common to the pixels of a row, or of a column."""
     lengths = {"row": shape[1], "column": shape[0]}
@@ -133,7 +133,7 @@ def _line_noise(
             error = math.hypot(error, shared * math.sqrt(2 * lengths[name] / dark[:, 0].sum()))
             noise = math.sqrt(shared)
             title, note = f"{name} noise", "part of the read noise"
-            found[f"{name}_noise"] = _figure(
+            figures[f"{name}_noise"] = _figure(
                 title, "e-", (gain * noise, gain * error / (2 * noise)), note
             )
 
@@ -152,7 +152,7 @@ def _top(summary: Summary, job: Measuring, clipped: bool) -> tuple[Measure | Non
 
 
 def _full_well(
-    found: Json,
+    figures: Json,
     gain: tuple[float, float | None],
     excess: float,
     top: Measure,
@@ -166,16 +166,16 @@ def _full_well(
         said = "; ".join(filter(None, (more, note)))
         return _figure(title, unit, (value, error if reached else None), said)
 
-    found["saturation"] = figure("saturation above bias", "ADU", top)
+    figures["saturation"] = figure("saturation above bias", "ADU", top)
     well = gain[0] * top[0], gain[0] * top[1]
-    found["full_well"] = figure("full well", "e-", well)
+    figures["full_well"] = figure("full well", "e-", well)
     peak = math.sqrt(well[0] / excess)
     error = math.hypot(top[1] / top[0], (gain[1] or 0.0) / gain[0]) * peak / 2
-    found["snr_max"] = figure("largest signal-to-noise ratio", "", (peak, error))
+    figures["snr_max"] = figure("largest signal-to-noise ratio", "", (peak, error))
     if noise is not None:
         electrons = noise[0] * gain[0], noise[1] * gain[0]
         ratio, error, decibels = emva.dynamic_range(well, electrons)
-        found["dynamic_range"] = figure("dynamic range", "", (ratio, error), f"{decibels:.1f} dB")
+        figures["dynamic_range"] = figure("dynamic range", "", (ratio, error), f"{decibels:.1f} dB")
 
 
 # Outputs of a detector whose conversion gains differ
@@ -193,15 +193,15 @@ def _outputs_of(made: Build, summary: Summary, middle: Part) -> Outputs | None:
 
 
 def _report_outputs(
-    found: Outputs, gain: float, facts: dict[str, Any], shape: tuple[int, ...]
+    outputs: Outputs, gain: float, facts: dict[str, Any], shape: tuple[int, ...]
 ) -> str:
     """Words on the gain of each output, which is also added to the contents of ``reduce.json``.
 
     ``gain``: of all outputs together (e-/ADU). ``shape``: of the detector.
     """
-    sides = found.of_pixel.shape
+    sides = outputs.of_pixel.shape
     looked_at = "" if sides == shape else " in the central {} × {} pixels".format(*sides)
-    each = zip(found.names, gain * found.gain, gain * found.gain * found.error, strict=True)
+    each = zip(outputs.names, gain * outputs.gain, gain * outputs.gain * outputs.error, strict=True)
     entries: list[dict[str, Any]] = []
     entries += [{"where": n, "gain": float(g), "error": float(e)} for n, g, e in each if g > 0]
     said = [f"{e['where']}: {with_error(e['gain'], e['error'])}" for e in entries]
@@ -227,25 +227,27 @@ _ALTERNATING_SHARE = 0.04  # least share of its square in the variance of the ma
 
 
 def _dsnu(
-    found: Json, curves: Json, halves: Halves, summary: Summary, gain: float, quantum: float
+    figures: Json, curves: Json, halves: Halves, summary: Summary, gain: float, quantum: float
 ) -> list[str]:
     """Add DSNU before rounding, or with an error of how far rounded means follow the level."""
     assert halves.dark is not None
     step = quantum or 1e-9
     sigma = summary.noise_before_rounding_e(gain) / gain / step
-    own = gain * step * level_before_rounding(halves.dark / step, sigma)
+    unrounded = gain * step * level_before_rounding(halves.dark / step, sigma)
     if summary.before_rounding is not None and sigma > UNDETERMINED_BELOW:
-        return _spread(found, curves, "dsnu", "e-", own, halves.good)
+        return _spread(figures, curves, "dsnu", "e-", unrounded, halves.good)
     other: Json = {}
-    _spread(other, {}, "dsnu", "e-", own, halves.good)
-    warnings = _spread(found, curves, "dsnu", "e-", gain * halves.dark, halves.good)
+    _spread(other, {}, "dsnu", "e-", unrounded, halves.good)
+    warnings = _spread(figures, curves, "dsnu", "e-", gain * halves.dark, halves.good)
     for name, figure in other.items():
-        left = figure["value"] - found[name]["value"]
-        found[name]["error"] = math.hypot(found[name]["error"], left)
+        left = figure["value"] - figures[name]["value"]
+        figures[name]["error"] = math.hypot(figures[name]["error"], left)
     return warnings
 
 
-def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: Mask) -> list[str]:
+def _spread(
+    figures: Json, curves: Json, name: str, unit: str, halves: F64, good: Mask
+) -> list[str]:
     """Add standard deviations, spectra and profiles of a pair of maps; return pattern warnings."""
     pair = emva.without_gaps(halves[0], good), emva.without_gaps(halves[1], good)
     spread: Nonuniformity = emva.nonuniformity(*pair, int((~good).sum()))
@@ -257,10 +259,10 @@ def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: 
             patterns.append((differ, size / 2))
     trend = ["quadratic trend of the lamp removed"] if name == "prnu" else []
     note = "; ".join([*trend, *(differ for differ, _ in patterns)])
-    found[name] = _figure(_TITLES[name], unit, spread.total, note)
+    figures[name] = _figure(_TITLES[name], unit, spread.total, note)
     for part in ("row", "column", "pixel"):
         title = f"{_TITLES[name]} of {part}s"
-        found[f"{name}_{part}"] = _figure(title, unit, getattr(spread, part))
+        figures[f"{name}_{part}"] = _figure(title, unit, getattr(spread, part))
     mean = np.where(good, halves.mean(axis=0), np.nan)
     curves[name] = {"unit": unit}
     for axis, along in ((1, "rows"), (0, "columns")):

@@ -57,8 +57,8 @@ class FlatSurvey:
         """Flats (t,) that hold light: all, if the level without light is unknown, or none does."""
         # A level within the noise of one sample is no flat: the shutter was closed, or the lamp
         # off.
-        found = np.abs(self.levels) > _LIT * self.noise
-        return found if found.any() else np.ones(len(found), np.bool_)
+        lit = np.abs(self.levels) > _LIT * self.noise
+        return lit if lit.any() else np.ones(len(lit), np.bool_)
 
     def brightest(self, share: float) -> tuple[int, float] | None:
         """Number of the brightest flat, and a ``share`` of its level (ADU above bias).
@@ -150,17 +150,17 @@ class FlatSurvey:
 
     def steps(self, exposures: Sequence[float | None]) -> list[int]:
         """Index from 0 of each frame's level among those of its exposure time."""
-        found = np.zeros(len(exposures), int)
+        steps = np.zeros(len(exposures), int)
         times = np.array([np.nan if t is None else t for t in exposures], float)
         for time in np.unique(times):
-            own = np.flatnonzero((times == time) | (np.isnan(times) & np.isnan(time)))
-            order = own[np.argsort(self.levels[own], kind="stable")]
+            frames = np.flatnonzero((times == time) | (np.isnan(times) & np.isnan(time)))
+            order = frames[np.argsort(self.levels[frames], kind="stable")]
             levels = self.levels[order]
             bounds = np.flatnonzero(np.diff(levels) > APART * np.maximum(levels[1:], 1.0)) + 1
             parts = (fine for part in np.split(order, bounds) for fine in self._parted(part))
             for step, part in enumerate(parts):
-                found[part] = step
-        return [int(step) for step in found]
+                steps[part] = step
+        return [int(step) for step in steps]
 
     def _parted(self, frames: I64) -> list[I64]:
         """Split frames of similar levels where a steady lamp was changed slightly."""
@@ -202,12 +202,12 @@ def rough_gain(arrays: Mapping[str, Reader], levels: F64, groups: Sequence[Seque
     """
     dark = next((arrays[name] for name in ("bias", "dark") if name in arrays), None)
     read = 0.0 if dark is None or dark.shape[0] < 2 else _noise_of_pair(dark, 0, 1)
-    found = [
+    pairs = [
         (_noise_of_pair(arrays["flat"], *group[:2]) - read, float(levels[list(group[:2])].mean()))
         for group in groups
         if len(group) > 1
     ]
-    photons, level = max(found, default=(0.0, 0.0))
+    photons, level = max(pairs, default=(0.0, 0.0))
     if not (photons > 0 and level > 0):
         raise InputError(
             "detector.gain_e_per_adu: missing, and not measurable, because no two flats at the "
@@ -275,12 +275,12 @@ def _pile(tops: Sequence[_Top], step: int) -> float | None:
     if not tops:
         return None
     highest = max(top.code for top in tops)
-    own = [top for top in tops if top.code == highest]
-    counts = np.sum([top.counts for top in own], axis=0)
+    at_top = [top for top in tops if top.code == highest]
+    counts = np.sum([top.counts for top in at_top], axis=0)
     piled = counts[0] >= MIN_SAMPLES and counts[0] > PILED * counts[1:].max()
-    if piled and max(top.share for top in own) >= MIN_SHARE:
+    if piled and max(top.share for top in at_top) >= MIN_SHARE:
         return float(highest)
     # Full wells are read as one of two codes. Flats that are not full vary more if brighter.
-    narrow = min(top.spread for top in own) <= 1 and max(top.spread for top in tops) >= WIDE
+    narrow = min(top.spread for top in at_top) <= 1 and max(top.spread for top in tops) >= WIDE
     double = counts[:2].min() >= MIN_SAMPLES and counts[:2].sum() > PILED * counts[2:].max()
     return float(highest - step) if narrow and double else None

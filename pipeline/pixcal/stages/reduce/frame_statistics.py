@@ -140,9 +140,9 @@ class _Column:
 
 def measure(job: Measuring, parts: Sequence[Strip]) -> None:
     """Combine the calibration frames of columns of chunks and write their statistics."""
-    found = {column.index: column for strip in parts for column in _measured(job, strip)}
-    for strip in tiles.strips(list(found), STRIP):
-        columns = [found[index] for index in strip]
+    by_index = {column.index: column for strip in parts for column in _measured(job, strip)}
+    for strip in tiles.strips(list(by_index), STRIP):
+        columns = [by_index[index] for index in strip]
         (i, j), ((y0, _), (x0, _)) = strip[0], tiles.span(job.shape, strip)
         maps = [np.stack([column.maps[name] for name in STATISTICS]) for column in columns]
         job.writers["maps"].write((0, y0, x0), np.concatenate(maps, axis=2).astype(np.float32))
@@ -154,8 +154,8 @@ def _measured(job: Measuring, strip: Strip) -> list[_Column]:
     """Statistics of columns that are read together."""
     columns = [_Column.begin(job, index) for index in strip]
     combined = [_combine_dark(job, group, columns) for group in job.dark]
-    for column, *found in zip(columns, *combined, strict=True) if combined else []:
-        _measure_dark(job, column, found)
+    for column, *darks in zip(columns, *combined, strict=True) if combined else []:
+        _measure_dark(job, column, darks)
     del combined
     for number, group in enumerate(job.flat):
         for column, combination in zip(columns, _combine(job, group, columns), strict=True):
@@ -176,7 +176,7 @@ def _combine_dark(job: Measuring, group: Group, columns: Sequence[_Column]) -> l
     if group == job.read_series:
         for column, (_, factor) in zip(columns, made, strict=True):
             column.pairs[0, :, 2:] *= factor
-    return [found for found, _ in made]
+    return [combined for combined, _ in made]
 
 
 def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined]) -> None:
@@ -205,14 +205,14 @@ def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined])
     weights = [n * (read / (read + shot)) ** 2 for n, shot in zip(dofs, shots, strict=True)]
     weight = np.sum(weights, axis=0)
     pooled = np.zeros_like(line.bias)
-    for group, found, n, w, shot in zip(job.dark, combined, dofs, weights, shots, strict=True):
-        variance, share = np.nan_to_num(found.variance), w / np.where(weight > 0, weight, 1)
+    for group, dark, n, w, shot in zip(job.dark, combined, dofs, weights, shots, strict=True):
+        variance, share = np.nan_to_num(dark.variance), w / np.where(weight > 0, weight, 1)
         pooled += n / np.maximum(dof, 1) * variance
         maps["dark_variance"] += share * (variance - shot)
-        maps["kurtosis"] += share * np.nan_to_num(found.excess_kurtosis)
-        maps["outliers"] += found.seen - found.kept
+        maps["kurtosis"] += share * np.nan_to_num(dark.excess_kurtosis)
+        maps["outliers"] += dark.seen - dark.kept
         if group == job.read_series:
-            maps["read_variance"] = found.variance - shot
+            maps["read_variance"] = dark.variance - shot
     maps["dark_dof"] = np.rint(weight)
     missing = ~np.isfinite(line.bias) | ~np.isfinite(line.rate)
     maps["flags"][missing] += int(PixelFlag.NO_DATA)
@@ -223,28 +223,28 @@ def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined])
     maps["dark_rate_error"] = np.sqrt(line.per_rate * column.noise)
 
 
-def _measure_level(job: Measuring, column: _Column, number: int, found: Combined) -> None:
+def _measure_level(job: Measuring, column: _Column, number: int, combined: Combined) -> None:
     """Measure a level of the flats, and count its samples without weight."""
     group, line = job.flat[number], column.line
     exptime = group.exptime if job.flats_timed else 0.0
     frames = len(group.frames)
-    signal = np.where(found.seen == frames, found.mean, np.nan)
-    column.levels[number, 1:3] = signal.size, (frames - found.seen).sum()
+    signal = np.where(combined.seen == frames, combined.mean, np.nan)
+    column.levels[number, 1:3] = signal.size, (frames - combined.seen).sum()
     # Few frames give a poor estimate of one pixel's noise, and most pixels are similar.
     seen = lit(signal)
     level = finite_median(signal[seen])
-    usual = calibration.usual_variance(found.variance[seen], frames - 1)
+    usual = calibration.usual_variance(combined.variance[seen], frames - 1)
     if usual < (_COARSE * job.quantum) ** 2:
-        usual = float(np.nanmean(found.variance[seen]))
+        usual = float(np.nanmean(combined.variance[seen]))
     usual = max(level, 0) / job.gain + job.read_noise**2 if np.isnan(usual) else usual
     # A brighter pixel has more photon noise, and the same read noise.
     photons = max(usual - float(np.median(column.noise)), 0.0)
     brighter = np.fmax(signal / level - 1, 0) if level > 0 else 0.0
-    variance = np.fmax(found.variance, usual + photons * brighter) / frames
+    variance = np.fmax(combined.variance, usual + photons * brighter) / frames
     if line is not None:
         variance = variance + column.noise * line.variance(exptime)
     column.steps.append(ExposureLevel(group.exptime, frames, signal, variance, usual))
-    column.variances.append(found.variance)
+    column.variances.append(combined.variance)
 
 
 def _measure_response(job: Measuring, column: _Column) -> None:
@@ -258,7 +258,7 @@ def _measure_response(job: Measuring, column: _Column) -> None:
         column.levels[number, 3] = ended.sum()
     maps["response"], maps["response_error"] = calibration.relative_response(steps, levels)
     maps["shot"] = calibration.shot_over_light(
-        [replace(step, variance=own) for step, own in zip(steps, column.variances, strict=True)],
+        [replace(step, variance=new) for step, new in zip(steps, column.variances, strict=True)],
         levels,
         maps["dark_variance"],
         maps["dark_rate"] if job.flats_timed else 0 * maps["dark_rate"],

@@ -130,35 +130,35 @@ def _describe_scale(
     }
 
 
-def share_at_mean(found: dict[str, Any], bounds: Bounds) -> float | None:
+def share_at_mean(facts: dict[str, Any], bounds: Bounds) -> float | None:
     """Share of the variance that rounding adds at the mean signal of a set."""
-    if found["mean_e"] is None:
+    if facts["mean_e"] is None:
         return None
-    variance = max(found["mean_e"], 0.0) + bounds.read_noise**2
-    return float(found["quantisation"]["step_e"] ** 2 / 12 / variance)
+    variance = max(facts["mean_e"], 0.0) + bounds.read_noise**2
+    return float(facts["quantisation"]["step_e"] ** 2 / 12 / variance)
 
 
 def set_warnings(
-    name: str, found: dict[str, Any], declared: float | None, share: float
+    name: str, facts: dict[str, Any], declared: float | None, share: float
 ) -> list[str]:
     """Warnings on a fringe set, given the result of `write_set`.
 
     ``declared``: saturation level, ADU; ``share``: as in `write_set`.
     """
     warnings = []
-    cost = found["quantisation"]["share_of_variance_dark"]
+    cost = facts["quantisation"]["share_of_variance_dark"]
     if cost > share:
         warnings.append(
-            f"{name}: steps of {found['quantisation']['step_e']:.3g} e-, which the range of the "
+            f"{name}: steps of {facts['quantisation']['step_e']:.3g} e-, which the range of the "
             f"signal needs, add {100 * cost:.2g} % to the variance of a sample without light"
         )
-    largest = found["largest_adu"]
+    largest = facts["largest_adu"]
     level = math.inf if declared is None else declared
     if largest < level and any(largest == 2**bits - 1 for bits in _CONVERTERS):
         warnings.append(
             f"{name}: the largest sample is {largest}, the largest code of a converter; if it "
             f"saturates there, declare detector.saturation_adu: {largest}"
         )
-    if found["mean_e"] is None:
+    if facts["mean_e"] is None:
         warnings.append(f"{name}: no usable samples: all are saturated or missing")
     return warnings

@@ -62,28 +62,28 @@ class Ingested:
     @cached_property
     def _whole(self) -> dict[str, list[int]]:
         """Numbers of the frames that were not cut off and repeat no other."""
-        found = {}
+        whole = {}
         for name, table in self._catalogue.items():
             count = len(table["time_s"])
             faults = [table.get(key, [None] * count) for key in ("cut_from_row", "repeat_of")]
-            found[name] = [n for n in range(count) if all(fault[n] is None for fault in faults)]
-        return found
+            whole[name] = [n for n in range(count) if all(fault[n] is None for fault in faults)]
+        return whole
 
     @cached_property
     def _all_flats(self) -> FlatSurvey | None:
         """Survey of the flats, unlit ones included; None without flats. InputError if they wrap."""
         if "flat" not in self._catalogue:
             return None
-        found = FlatSurvey.of(self._chosen(self._whole))
-        if found.wrapped is not None:
+        survey = FlatSurvey.of(self._chosen(self._whole))
+        if survey.wrapped is not None:
             raise InputError(
-                f"{self._catalogue['flat']['file'][self._whole['flat'][found.wrapped]]}: light "
+                f"{self._catalogue['flat']['file'][self._whole['flat'][survey.wrapped]]}: light "
                 "makes its samples negative: unsigned 16-bit samples that were written as signed "
                 "ones, so that levels above 32767 ADU wrap; write all frames again as unsigned "
                 "(astropy: fits.writeto(NEW, data.astype('uint16'), header), which adds "
                 "BZERO = 32768)"
             )
-        return found
+        return survey
 
     @cached_property
     def _left_out(self) -> dict[tuple[str, str], Mask]:
@@ -147,19 +147,19 @@ class Ingested:
     @cached_property
     def exposures(self) -> Exposures:
         """Groups of the calibration frames, and exposure times of the fringe frames."""
-        found = group_exposures(self.tables)
+        exposures = group_exposures(self.tables)
         if self._mixed_darks:
-            found.warnings.append(
+            exposures.warnings.append(
                 "dark frames have no EXPTIME and are of several levels: not used; write exposure "
                 "times into the headers (for TIFF and PNG into headers.csv)"
             )
-        found.warnings += [
+        exposures.warnings += [
             f"flat frames {reason[0]} are left out ({mask.sum()} of {len(mask)}): "
             f"{first_few(self._names_of_flats(mask))}; {reason[1]}"
             for reason, mask in self._left_out.items()
             if mask.any()
         ]
-        return found
+        return exposures
 
     def _names_of_flats(self, mask: Mask) -> list[str]:
         table = self._catalogue["flat"]
@@ -204,9 +204,9 @@ class Ingested:
         """The folder of the files: at its noted path, or at the same path relative to the run."""
         folder, run = Path(noted["folder"]), self.folder.parent
         assert isinstance(run, Path)
-        for found in (folder, run.absolute() / noted["from_run"]):
-            if (found / file).exists():
-                return found
+        for place in (folder, run.absolute() / noted["from_run"]):
+            if (place / file).exists():
+                return place
         raise InputError(
             f"{folder}: the frames of {self.folder} are gone; run 'pixcal ingest ACQ --out {run}' "
             "with their new place as ACQ (--copy keeps a copy in RUN)"

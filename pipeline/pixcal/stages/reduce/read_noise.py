@@ -35,11 +35,11 @@ _PAIRS, _SAMPLES = 16, 1 << 20  # pairs, and samples of each frame, that measure
 
 def lost_in_blocks(job: Measuring) -> Measure:
     """Variance (ADU²) that `pair_statistics` removes with the means of its blocks; its error."""
-    found = [shared_by_blocks(pair, job.quantum) for pair in _pairs(job)]
-    if not found:
+    lost = [shared_by_blocks(pair, job.quantum) for pair in _pairs(job)]
+    if not lost:
         return 0.0, 0.0
-    mean = max(float(np.mean(found)), 0.0)
-    return mean, float(np.std(found, ddof=1)) / math.sqrt(len(found)) if len(found) > 1 else mean
+    mean = max(float(np.mean(lost)), 0.0)
+    return mean, float(np.std(lost, ddof=1)) / math.sqrt(len(lost)) if len(lost) > 1 else mean
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,11 @@ class Nearby:
     @classmethod
     def of(cls, job: Measuring, variance: float) -> "Nearby | None":
         """Of the read-noise series, whose samples have a variance (ADU²)."""
-        found = np.array([along_lines(pair, job.quantum) for pair in _pairs(job)])
-        if len(found) < 2 or not variance > 0:
+        shared = np.array([along_lines(pair, job.quantum) for pair in _pairs(job)])
+        if len(shared) < 2 or not variance > 0:
             return None
-        near, far = np.moveaxis(found.mean(axis=0), 1, 0)
-        error = found[:, :, 1].std(axis=0, ddof=1) / math.sqrt(len(found))
+        near, far = np.moveaxis(shared.mean(axis=0), 1, 0)
+        error = shared[:, :, 1].std(axis=0, ddof=1) / math.sqrt(len(shared))
         return cls(
             dict(zip(LINES, ((near - far) / variance).tolist(), strict=True)),
             dict(zip(LINES, (far + _LINE_ERRORS * error).tolist(), strict=True)),
@@ -130,10 +130,10 @@ def is_cut_off(job: Measuring) -> bool:
 def of_variance(variance: Measure, step: float) -> tuple[Measure, Measure]:
     """Noise (ADU) with and without rounding from a variance (ADU²), at any level."""
     least = _LEAST * step
-    whole, own = (
+    whole, unrounded = (
         max(math.sqrt(max(v, 0.0)), least) for v in (variance[0], variance[0] - SHEPPARD * step**2)
     )
-    return (whole, variance[1] / (2 * whole)), (own, variance[1] / (2 * own))
+    return (whole, variance[1] / (2 * whole)), (unrounded, variance[1] / (2 * unrounded))
 
 
 def _before_rounding(
@@ -148,41 +148,41 @@ def _before_rounding(
     step, series = job.quantum, job.read_series
     in_steps = variance[0] / step**2, variance[1] / step**2
     reader, counts = job.frames[series.array], code_counts([series], job)
-    found, spread = None, None
+    measured, spread = None, None
     if len(missing_codes(counts)):
         # A few frames without light cannot show a pattern of missing codes.
         multiple = step_of(code_counts([series, *job.flat], job))[0]
         # With missing codes, means of darks are not linear in exposure time.
-        own = np.mean([middle_rows(reader, n, n + 1) for n in series.frames], axis=0)
-        found = noise_before_missing_codes(
-            *in_steps, own.ravel() / step, len(series.frames), counts, multiple
+        mean = np.mean([middle_rows(reader, n, n + 1) for n in series.frames], axis=0)
+        measured = noise_before_missing_codes(
+            *in_steps, mean.ravel() / step, len(series.frames), counts, multiple
         )
     elif in_steps[0] > BELOW**2 + SHEPPARD:
         noise = math.sqrt(in_steps[0] - SHEPPARD)
-        found = noise, in_steps[1] / (2 * noise)
+        measured = noise, in_steps[1] / (2 * noise)
     else:
         rows = max(_CODES // job.shape[1], 1)
         frames = [middle_rows(reader, n, n + 1, rows).ravel() for n in series.frames[:FRAMES]]
         samples = np.array(frames, float)
         samples = samples[:, np.isfinite(samples).all(axis=0)]
         codes = np.rint(samples / step).astype(np.int64)
-        found, spread = noise_of_codes(codes, shot / step**2)
-    return found and (step * found[0], step * found[1]), spread
+        measured, spread = noise_of_codes(codes, shot / step**2)
+    return measured and (step * measured[0], step * measured[1]), spread
 
 
 def code_counts(groups: Sequence[Group], job: Measuring) -> F64:
     """Counts of each code, in steps, in the middle rows of given series."""
-    found = np.zeros(0)
+    counts = np.zeros(0)
     for group in groups:
         reader = job.frames[group.array]
         for n in group.frames:
             rows = middle_rows(reader, n, n + 1)
             codes = np.maximum(rows[np.isfinite(rows)], 0) // job.quantum
             codes = codes[codes < _MOST_CODES].astype(np.int64)
-            own = np.bincount(codes, minlength=len(found)).astype(float)
-            own[: len(found)] += found
-            found = own
-    return found
+            more = np.bincount(codes, minlength=len(counts)).astype(float)
+            more[: len(counts)] += counts
+            counts = more
+    return counts
 
 
 def bias_wander(job: Measuring) -> float:

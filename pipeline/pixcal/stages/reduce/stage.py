@@ -69,8 +69,8 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
         def body(made: Build) -> None:
             source = Ingested(run_dir / "ingest")
-            found = reduce_frames(made, source, config, runtime)
-            _report(made, source, config, found, runtime)
+            reduction = reduce_frames(made, source, config, runtime)
+            _report(made, source, config, reduction, runtime)
 
         def keep(_ready: Manifest) -> bool:
             return config.cubes is None or base_of(run_dir / "reduce") == base
@@ -232,27 +232,27 @@ def _calibrate(
 
 
 def _report(
-    made: Build, source: Ingested, config: Config, found: Reduction, runtime: Runtime
+    made: Build, source: Ingested, config: Config, reduction: Reduction, runtime: Runtime
 ) -> None:
-    job, summary, sets = found.job, found.summary, found.sets
+    job, summary, sets = reduction.job, reduction.summary, reduction.sets
     piled = source.saturation_found if source.detector.saturation_adu is None else None
     warnings = [*source.exposures.warnings, *cut_off_warnings(source.cut_off)]
-    warnings += subtracted_warnings(job.subtracted, found.gain)
+    warnings += subtracted_warnings(job.subtracted, reduction.gain)
     nearby = summary.read_noise and Nearby.of(job, summary.read_noise[0] ** 2)
-    warnings += detector_warnings(summary, found.gain, piled, nearby)
+    warnings += detector_warnings(summary, reduction.gain, piled, nearby)
     if source.survey is not None and source.exposures.known:
         light = source.survey.levels
         warnings += lamp_warnings([(g.exptime, light[list(g.frames)]) for g in job.flat])
-    warnings += trail_warnings(made.folder / "calibration.zarr", source, found.gain)
+    warnings += trail_warnings(made.folder / "calibration.zarr", source, reduction.gain)
     warnings += _dark_lines(ArrayReader(made.folder / "calibration.zarr" / "mask"), source.shape)
     for name, facts in sets.items():
         warnings += set_warnings(name, facts, source.detector.saturation_adu, config.rounding_share)
-        facts["quantisation"]["share_at_mean"] = share_at_mean(facts, found.bounds)
+        facts["quantisation"]["share_at_mean"] = share_at_mean(facts, reduction.bounds)
         facts["flags"] = _count_flags(made.cubes / "reduced.zarr" / name / "mask", source.shape)
     report = {
         "schema": SCHEMA,
-        **found.noise(config),
-        "linearity": linearity_report(summary, job, found.gain),
+        **reduction.noise(config),
+        "linearity": linearity_report(summary, job, reduction.gain),
         "saturation_adu": {
             "declared": source.detector.saturation_adu,
             "found": source.saturation_found,
@@ -274,7 +274,7 @@ def _report(
 def _flats(source: Ingested, levels: Mask) -> list[int]:
     """Numbers of the flats of some levels (step,)."""
     chosen = zip(source.exposures.flat, levels, strict=True)
-    return sorted(frame for group, own in chosen if own for frame in group.frames)
+    return sorted(frame for group, wanted in chosen if wanted for frame in group.frames)
 
 
 def _dark_lines(mask: ArrayReader, shape: tuple[int, int]) -> list[str]:

@@ -48,11 +48,11 @@ def subtracted_rate(source: Ingested, gain: float) -> Measure:
     if len(noise) < 2:
         return 0.0, 0.0
     of_series, variance, error = np.array(noise).T
-    found = [
+    rates = [
         subtracted_dark((np.array(times), np.array(levels)), (of_series, variance, error), one)
         for one in (gain, *_of_flats(source))
     ]
-    return found[0] if found[0] and all(found) else (0.0, 0.0)
+    return rates[0] if rates[0] and all(rates) else (0.0, 0.0)
 
 
 def subtracted_dark(

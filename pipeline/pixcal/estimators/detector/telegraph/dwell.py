@@ -47,9 +47,9 @@ class PixelSeries:
 
     def of(self, pixels: Indices) -> "PixelSeries":
         """Of some pixels alone."""
-        own = np.isin(self.pixel, pixels)
-        arrays = self.charge[:, own], self.weight[:, own], self.frame, self.period_s
-        return PixelSeries(*arrays, self.pixel[own], self.fitted, self.chosen)
+        wanted = np.isin(self.pixel, pixels)
+        arrays = self.charge[:, wanted], self.weight[:, wanted], self.frame, self.period_s
+        return PixelSeries(*arrays, self.pixel[wanted], self.fitted, self.chosen)
 
 
 class Dwell(NamedTuple):
@@ -133,7 +133,7 @@ def _expected(series: Sequence[PixelSeries], seen: Moments, most: float, stays: 
     shown = (x**2).sum(axis=0) / (seen.frames - 1) - 1
     weight = np.where(shown > limit, np.minimum(most / np.maximum(shown, limit), 1), 0)
     scale = seen.sigma**2 * total / max(trust.sum(), 1.0) / max(float(weight @ shown), 1e-9)
-    found = []
+    products = []
     for one in series:
         count = len(one.frame)
         if one.chosen:
@@ -141,14 +141,14 @@ def _expected(series: Sequence[PixelSeries], seen: Moments, most: float, stays: 
             share = np.maximum(1 - LAGS / count, 1 / count)[:, None]
             # The mean of the quiet ones, with more noise than usual, was subtracted, too.
             taken = (more - quiet) / trust.sum() * seen.sigma**2 / count
-            found.append(scale * (pairs / share + 1 / count) @ weight - taken)
+            products.append(scale * (pairs / share + 1 / count) @ weight - taken)
             continue
         k = np.minimum(np.resize(stays.kept(one.period_s, PLACES), weight.shape), 1 - 1e-9)
         # Variance of the subtracted mean of ``count`` frames, over that of one.
         both = (1 + k) / (1 - k) / count - 2 * k * (1 - k**count) / (count * (1 - k)) ** 2
         powers = (k ** LAGS[:, None] - both) @ weight
-        found.append(4 * stays.upper * (1 - stays.upper) * scale * size * powers)
-    return found
+        products.append(4 * stays.upper * (1 - stays.upper) * scale * size * powers)
+    return products
 
 
 def _products(series: PixelSeries, trust: F64) -> tuple[Indices, F64, F64]:

@@ -82,16 +82,16 @@ def find_telegraph(
         found_dwell = find_stays([*dark, *bright], seen, upper)
         dwell = found_dwell or dwell._replace(stays=none, other=none)
     parts = moments.thinned(parts)
-    found = find_population(parts, dwell.stays)
+    jumps = find_population(parts, dwell.stays)
     if dwell.other != dwell.stays:
         # Pixels with long times jump in none of few frames.
-        change = find_population(parts, dwell.other).share - found.share
-        found = replace(found, share_error=float(np.hypot(found.share_error, change)))
+        change = find_population(parts, dwell.other).share - jumps.share
+        jumps = replace(jumps, share_error=float(np.hypot(jumps.share_error, change)))
     if own is not None:
         far = own.amplitude >= smallest_jump
         own = replace(own, pixel=own.pixel[far], amplitude=own.amplitude[far], upper=own.upper[far])
     return Telegraph(
-        **vars(found),
+        **vars(jumps),
         stays=dwell.stays,
         switching_error=dwell.error,
         signs=signs,
@@ -115,8 +115,8 @@ def _levels(
     dark, bright = _frames(series, seen, lit, pixels[::each])
     if not bright and abs(signs.one_sided) < SIGNIFICANT:
         return 0.5, None
-    own = own_levels([*dark, *bright], seen.sigma)
-    return own.common_upper, own if bright and each == 1 else None
+    levels = own_levels([*dark, *bright], seen.sigma)
+    return levels.common_upper, levels if bright and each == 1 else None
 
 
 def _frames(
@@ -188,13 +188,13 @@ def _common(likely: F64) -> float:
 
 def _two_levels(charge: F32, weight: F32, noise: float) -> F32:
     """Logarithms (share, amplitude, n) of the likelihoods of two levels relative to one."""
-    found = np.empty((len(SHARES), len(AMPLITUDES), charge.shape[1]), np.float32)
-    for of_share, upper in zip(found, SHARES.astype(np.float32), strict=True):
-        for own, a in zip(of_share, (noise * AMPLITUDES).astype(np.float32), strict=True):
+    ratios = np.empty((len(SHARES), len(AMPLITUDES), charge.shape[1]), np.float32)
+    for of_share, upper in zip(ratios, SHARES.astype(np.float32), strict=True):
+        for ratio, a in zip(of_share, (noise * AMPLITUDES).astype(np.float32), strict=True):
             # Of the lower level, and by how much the upper one is likelier.
             lower = -(upper * a * charge + (upper * a) ** 2 / 2) * weight
             more = (a * charge + (upper - np.float32(0.5)) * a**2) * weight
             low = np.minimum(more, _OVERFLOW)
             mixed = np.log(1 - upper + upper * np.exp(low))
-            own[:] = (lower + mixed + (more - low)).sum(axis=0)
-    return found
+            ratio[:] = (lower + mixed + (more - low)).sum(axis=0)
+    return ratios

@@ -57,9 +57,9 @@ class Moments:
 
     def of(self, pixels: Indices) -> "Moments":
         """Of some pixels (ascending) alone."""
-        own = np.isin(self.pixel, pixels)
+        wanted = np.isin(self.pixel, pixels)
         arrays = ((name, v) for name, v in vars(self).items() if isinstance(v, np.ndarray))
-        some: dict[str, Any] = {name: values[..., own] for name, values in arrays}
+        some: dict[str, Any] = {name: values[..., wanted] for name, values in arrays}
         return replace(self, **some)
 
     @property
@@ -129,8 +129,8 @@ def _particles(noise: F64) -> Mask:
     square = np.nan_to_num(noise**2)
     largest, n = square.max(axis=0), np.isfinite(noise).sum(axis=0)
     others = (square.sum(axis=0) - largest) / np.maximum(n - 2, 1)
-    found: Mask = square > _OUTLIER**2 * np.maximum(others, 1)
-    return np.asarray(found & (found.sum(axis=0) == 1))
+    particles: Mask = square > _OUTLIER**2 * np.maximum(others, 1)
+    return np.asarray(particles & (particles.sum(axis=0) == 1))
 
 
 def thinned(parts: Sequence[Moments]) -> list[Moments]:

@@ -63,8 +63,8 @@ def _states(keeps: tuple[float, ...], count: int, upper: float) -> F64:
     anew[0] = True
     # Each frame has the state that was last drawn anew.
     drawn = np.maximum.accumulate(np.where(anew, np.arange(count)[:, None], 0), axis=0)
-    found = np.where(np.take_along_axis(up, drawn, 0), 1.0, -1.0)
-    return np.asarray(found - found.mean(axis=0))
+    states = np.where(np.take_along_axis(up, drawn, 0), 1.0, -1.0)
+    return np.asarray(states - states.mean(axis=0))
 
 
 @dataclass(frozen=True)
@@ -165,11 +165,11 @@ def log_ratio_of_jumps(variance: F64, added: F64, dof: float) -> F64:
     """
     order = max(dof / 2 - 1, 0.5)
     s = np.sqrt(1 + variance[:, None] * (added * (dof / order) ** 2))
-    found = s - 1 - np.log((1 + s) / 2)
-    found *= order
-    found -= np.log(s) / 2
-    found -= dof / 2 * added
-    return np.asarray(found)
+    log_ratio = s - 1 - np.log((1 + s) / 2)
+    log_ratio *= order
+    log_ratio -= np.log(s) / 2
+    log_ratio -= dof / 2 * added
+    return np.asarray(log_ratio)
 
 
 @lru_cache(maxsize=16)

@@ -87,12 +87,12 @@ class FringeShape(ABC):
 
 def fringe_models() -> dict[str, type[FringeShape]]:
     """All shapes, by name."""
-    found = {}
+    shapes = {}
     for module in pkgutil.iter_modules(__path__):
         shape = getattr(importlib.import_module(f"{__name__}.{module.name}"), "SHAPE", None)
         if shape is not None:
-            found[module.name] = shape
-    return found
+            shapes[module.name] = shape
+    return shapes
 
 
 @dataclass(frozen=True)

@@ -79,13 +79,13 @@ class Hyperbolic(FringeShape):
 
         middle = int(np.argmin((y - ry) ** 2 + (x - rx) ** 2))
         offset = values[middle] - float(self._relative(self.geometry, y[middle], x[middle]))
-        found = least_squares(
+        solution = least_squares(
             residual, np.concatenate([[offset], base]), x_scale="jac", xtol=1e-14, ftol=1e-14
         ).x
         return replace(
             self,
-            phase0=float(found[0]),
-            geometry=self.geometry.with_vector(nominal + found[1:] * sigma),
+            phase0=float(solution[0]),
+            geometry=self.geometry.with_vector(nominal + solution[1:] * sigma),
         )
 
     def _relative(self, geometry: Geometry, y: F64, x: F64) -> F64:
