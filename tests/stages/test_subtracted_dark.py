@@ -86,7 +86,7 @@ def test_charge_of_light_is_taken_from_a_level_alone(
     current = found["figures_of_merit"]["dark_current"]
     less = 0.0 if clamped or not sure else late.rate
     assert current["value"] == pytest.approx(DARK - less, abs=4 * current["error"])
-    assert ("without 1e+02 e-/s" in current["note"]) == bool(less)
+    assert ("excludes 1e+02 e-/s" in current["note"]) == bool(less)
     assert (late.warning("e-/s") in found["warnings"]) == (not clamped)
 
 
