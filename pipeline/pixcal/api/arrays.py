@@ -86,7 +86,8 @@ def calibrate(
 
     Raises
     ------
-    InputError If arrays do not match, a value is out of range, ``out`` is not empty, or the frames
+    InputError
+        If arrays do not match, a value is out of range, ``out`` is not empty, or the frames
         hold no fringes that can be fitted.
     """
     stacks = _stacks(frames, bias, darks or {}, flats or {}, exptime_s)

@@ -33,13 +33,14 @@ def correct_centroids(
 
     Returns
     -------
-    x, y, error_x, error_y : (n,) float64 Corrected positions, and their errors from those of the
-        maps, px, 1 sigma; NaN off the detector, and where masked pixels carry more than 10 % of the
-        position information.
+    x, y, error_x, error_y : (n,) float64
+        Corrected positions, and their errors from those of the maps, px, 1 sigma; NaN off the
+        detector, and where masked pixels carry more than 10 % of the position information.
 
     Raises
     ------
-    InputError If the run has no maps, the width is out of range, or x and y have different lengths.
+    InputError
+        If the run has no maps, the width is out of range, or x and y have different lengths.
     """
     from pixcal.stages import centroids as stage  # here, as in `pixcal.api.commands`
 

@@ -22,7 +22,8 @@ def sample_acquisition() -> Path:
 
     Raises
     ------
-    InputError If this installation lacks it.
+    InputError
+        If this installation lacks it.
     """
     for place in PLACES:
         if (place / "demo" / "acquisition.yaml").is_file():
