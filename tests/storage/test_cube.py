@@ -12,7 +12,6 @@ import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from zarr.codecs import BloscCodec, Crc32cCodec
 
 from pixcal.model.errors import DamagedError
 from pixcal.storage.cube import (
@@ -53,34 +52,6 @@ def test_both_libraries_read_what_was_written(
     path = write(tmp_path / "a", data, chunks)
     np.testing.assert_array_equal(ArrayReader(path).read(), data)
     np.testing.assert_array_equal(zarr.open_array(store=path, mode="r")[:], data)
-
-
-@pytest.mark.parametrize(
-    ("dtype", "fill"), [("u1", 0), ("i2", 1), ("u2", 65535), ("i8", 0), ("f4", np.nan), ("f8", 0)]
-)
-def test_metadata_are_those_of_zarr(tmp_path: Path, dtype: str, fill: float) -> None:
-    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
-    attrs = {"units": "e²", "of": [1, 2.5, None]}
-    options = {"fill_value": fill, "chunks": CHUNKS}
-    create_group(ours, attrs)
-    create_array(ours / "a", SHAPE, dtype, attrs=attrs, **options)
-    zarr.create_group(store=theirs, attributes=attrs)
-    zarr.create_array(
-        store=theirs / "a",
-        shape=SHAPE,
-        dtype=dtype,
-        attributes=attrs,
-        dimension_names=("time", "y", "x"),
-        compressors=[
-            BloscCodec(
-                typesize=np.dtype(dtype).itemsize, cname="lz4", clevel=1, shuffle="bitshuffle"
-            ),
-            Crc32cCodec(),
-        ],
-        **options,
-    )
-    for name in ("zarr.json", "a/zarr.json"):
-        assert (ours / name).read_bytes() == (theirs / name).read_bytes()
 
 
 def test_what_zarr_writes_is_read(tmp_path: Path) -> None:

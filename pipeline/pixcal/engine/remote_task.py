@@ -26,7 +26,7 @@ from pixcal.model.errors import ClusterError, InputError
 PATIENCE_S = 1.0  # time within which a new file must be visible on other machines
 KEPT = 2  # unpacked functions cached per worker: one for each concurrent run
 # libraries that may affect the last bit of a result
-PACKAGES = ("numpy", "scipy", "numba", "numcodecs", "astropy")
+PACKAGES = ("numpy", "scipy", "numba", "numcodecs", "zarr", "astropy")
 CODE, MACHINE = "code of pixcal", "machine"
 
 

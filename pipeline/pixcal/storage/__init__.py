@@ -1,1 +1,1 @@
-"""Everything on disk: FITS, cubes, artefacts. Only importer of numcodecs, fsspec, astropy.io."""
+"""Everything on disk: FITS, Zarr cubes, artefacts. Only importer of zarr, fsspec, astropy.io."""

@@ -184,7 +184,7 @@ def settle_flush(run: Path) -> None:
 
 def _whole(folder: Path) -> bool:
     """Whether the local chunks of an interrupted build are unaltered."""
-    from pixcal.storage.cube import chunks_whole  # here: the command line does without numcodecs
+    from pixcal.storage.cube import chunks_whole  # here: the command line does without zarr
 
     places = {folder, cubes_of(folder)}
     return all(chunks_whole(place) for place in places if isinstance(place, Path))

@@ -1,9 +1,9 @@
 """Cubes (time, y, x) on disk: Zarr 3 arrays in whole, checksummed chunks, one writer per chunk.
 
-Metadata and chunks are those of zarr-python, which takes long to import, and does not scale with
-threads. Cubes are in local folders or at URLs. Every chunk contains a crc32c; an index beside the
-array holds its size and crc, and ends with a crc of itself and of the metadata. A missing, cut or
-exchanged chunk is refused.
+zarr-python makes the metadata. Chunks in the same format are read and written here, because the
+pipeline of zarr-python does not scale with threads. Cubes are in local folders or at URLs. Every
+chunk contains a crc32c; an index beside the array holds its size and crc, and ends with a crc of
+itself and of the metadata. A missing, cut or exchanged chunk is refused.
 """
 
 import errno
@@ -12,7 +12,7 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from io import BytesIO
 from itertools import product
 from pathlib import Path
@@ -20,8 +20,10 @@ from typing import Any
 
 import google_crc32c
 import numpy as np
+import zarr
 from numcodecs import Blosc, blosc
 from numpy.typing import NDArray
+from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec
 
 from pixcal.model.errors import DamagedError, reason_of
 from pixcal.storage.folder import INDEX, File, copy_files, link_files, open_folder, read_file
@@ -62,7 +64,8 @@ def create_array(
     if isinstance(path, MemoryPath):
         path.keep(MemoryArray(np.full(shape, fill_value, dtype), chunks, fill_value, attrs or {}))
         return ArrayWriter(path, shape, chunks, dtype, fill_value, b"")
-    metadata = _array_metadata(shape, chunks, dtype, fill_value, dims, attrs)
+    text = json.dumps(attrs or {})
+    metadata = _array_metadata(shape, chunks, dtype.str, fill_value, tuple(dims), text)
     _write_metadata(path, metadata)
     return ArrayWriter(path, shape, chunks, dtype, fill_value, metadata)
 
@@ -84,47 +87,45 @@ def create_map(
     )
 
 
+# Cached: many arrays have the same metadata, and zarr-python takes a millisecond for each.
+@lru_cache(maxsize=512)
 def _array_metadata(
-    shape: Ints,
-    chunks: Ints,
-    dtype: np.dtype[Any],
-    fill_value: Any,
-    dims: Sequence[str],
-    attrs: Any,
+    shape: Ints, chunks: Ints, dtype: str, fill_value: Any, dims: tuple[str, ...], attrs: str
 ) -> bytes:
-    """Metadata as zarr-python writes it for an array."""
-    fill = dtype.type(fill_value).item()
-    order = {"configuration": {"endian": "little"}} if dtype.itemsize > 1 else {}
-    lz4 = {"typesize": dtype.itemsize, "cname": "lz4", "clevel": 1, "shuffle": "bitshuffle"}
-    return _json(
+    """Metadata as zarr-python writes it for an array; attributes as JSON."""
+    made: dict[str, Any] = {}
+    size = np.dtype(dtype).itemsize
+    blosc_codec = BloscCodec(typesize=size, cname="lz4", clevel=1, shuffle="bitshuffle")
+    zarr.create_array(
+        store=made,
         shape=shape,
-        data_type=dtype.name,
-        chunk_grid={"name": "regular", "configuration": {"chunk_shape": chunks}},
-        chunk_key_encoding={"name": "default", "configuration": {"separator": "/"}},
-        fill_value="NaN" if fill != fill else fill,
-        codecs=[
-            {"name": "bytes"} | order,
-            {"name": "blosc", "configuration": lz4 | {"blocksize": 0}},
-            {"name": "crc32c"},
-        ],
-        attributes=attrs or {},
+        chunks=chunks,
+        dtype=np.dtype(dtype),
+        fill_value=fill_value,
+        serializer=BytesCodec(endian="little"),
+        compressors=[blosc_codec, Crc32cCodec()],
+        filters=None,
         dimension_names=dims,
-        zarr_format=3,
-        node_type="array",
-        storage_transformers=[],
+        attributes=json.loads(attrs),
     )
-
-
-def _json(**content: Any) -> bytes:
-    return json.dumps(content, indent=2).encode()
+    content: bytes = made["zarr.json"].to_bytes()
+    return content
 
 
 def create_group(path: Place, attrs: dict[str, Any] | None = None) -> None:
     """Create a Zarr group (a folder that xarray opens as a dataset) if it does not exist."""
     if isinstance(path, MemoryPath):
         return
-    # As zarr-python writes it.
-    _write_metadata(path, _json(attributes=attrs or {}, zarr_format=3, node_type="group"))
+    _write_metadata(path, _group_metadata(json.dumps(attrs or {})))
+
+
+@lru_cache(maxsize=512)
+def _group_metadata(attrs: str) -> bytes:
+    """Metadata as zarr-python writes it for a group; attributes as JSON."""
+    made: dict[str, Any] = {}
+    zarr.create_group(store=made, attributes=json.loads(attrs))
+    content: bytes = made["zarr.json"].to_bytes()
+    return content
 
 
 def _write_metadata(path: Place, content: bytes) -> None:
@@ -305,6 +306,8 @@ class ArrayReader:
             metadata = (path / "zarr.json").read_bytes()
             if _seal(metadata, body[:-4]) != body[-4:]:
                 raise ValueError(f"zarr.json or {INDEX} was altered")
+            # The seal guarantees zarr's metadata, so zarr's event loop is not needed, which is slow
+            # when many threads open many arrays.
             meta = json.loads(metadata)
             self.shape, self.chunks = _shapes(meta)
             self.dtype, self.attrs = np.dtype(meta["data_type"]), meta["attributes"]

@@ -71,7 +71,7 @@ def settle(artefact: Path, run: Path, base: Place | None) -> None:
 
 def remove_cubes(artefact: Path, run: Path) -> None:
     """Remove the cubes elsewhere that an artefact owns; warn if that fails."""
-    from pixcal.storage.cube import remove_arrays  # here: the command line does without numcodecs
+    from pixcal.storage.cube import remove_arrays  # here: the command line does without zarr
 
     try:
         pointer = _read(artefact)
