@@ -53,9 +53,8 @@ class GainFit:
     error: float
     chi2_reduced: float  # of the points about the curve
     levels: tuple[float, float]  # lowest and highest level used, ADU
-    read_variance: tuple[
-        float, float
-    ]  # at level zero, from the curve and the measurement together; error
+    # at level zero, from the curve and the measurement together; error
+    read_variance: tuple[float, float]
     # slope at the highest level (variance over level) relative to that at zero, less one; zero
     # where a straight line fits
     curved: float = 0.0
