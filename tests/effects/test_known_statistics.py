@@ -114,6 +114,16 @@ def test_harmonics_of_single_pixels_show_where_their_mean_is_zero(plain: Evidenc
     assert np.abs(shared).max() < 0.1 * size
 
 
+def test_harmonics_that_the_phases_do_not_separate_are_not_compared(plain: Evidence) -> None:
+    """Four phases to a turn: the third harmonic looks like the fringes, the fourth is constant."""
+    number = np.arange(len(plain.fringes["vertical"].g))
+    phi = np.pi / 2 * number + 1e-3 * np.sin(7.0 * number)
+    g = np.stack([np.ones(len(phi)), np.cos(phi), np.sin(phi)], axis=1)
+    found = measure(changed(plain, g=g))
+    assert found["pixel_harmonics", "vertical"].x == pytest.approx([2.0])
+    assert found["harmonics", "vertical"].x == pytest.approx([2.0, 2.25])
+
+
 def test_offsets_along_one_axis_are_compared(plain: Evidence) -> None:
     twin = dataclasses.replace(
         plain.fringes["vertical"],

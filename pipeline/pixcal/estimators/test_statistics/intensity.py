@@ -15,36 +15,49 @@ of_intensity_power = partial(statistic, "intensity", power=True)
 
 CLASSES = (4, 16, 64)
 ORDERS = (2, 3, 4)  # harmonics
+MIN_APART = 0.1  # least part of a harmonic that is not absorbed by the fit, for it to be compared
 
 
-def _harmonics(data: FringeSetData) -> C128:
-    """Two to four times the phase in the residuals (order, pixel), over the fringe amplitude."""
+def _harmonics(data: FringeSetData) -> tuple[F64, C128]:
+    """Harmonics (order, pixel) of the phase in the residuals, over the fringe amplitude.
+
+    Also their orders: those that the phases of the frames separate from the fringes. Four phases to
+    a turn, for instance, show no third or fourth harmonic: the fit absorbs them.
+    """
     fringes, good = data.fringes, data.good
     alpha = float(np.median(np.hypot(fringes.theta[1], fringes.theta[2])[good]))
-    turns = np.exp(-1j * np.outer(ORDERS, fringes.phi)).astype(np.complex64)
+    every = np.exp(-1j * np.outer(ORDERS, fringes.phi))
+    fitted = np.stack([np.ones(len(fringes.phi)), np.sin(fringes.phi), np.cos(fringes.phi)], axis=1)
+    axes = np.linalg.qr(fitted)[0]
+    apart = np.mean(np.abs(every - every @ axes @ axes.T) ** 2, axis=1) > MIN_APART
+    orders, turns = np.array(ORDERS, float)[apart], every[apart].astype(np.complex64)
     # The signal goes with sin(phi + psi).
     moments = (turns.real @ data.electrons + 1j * (turns.imag @ data.electrons))[:, good.ravel()]
-    return np.asarray(
-        2 * moments * np.exp(-1j * np.outer(ORDERS, data.psi[good])) / len(fringes.phi) / alpha
-    )
+    turned = moments * np.exp(-1j * np.outer(orders, data.psi[good]))
+    return orders, np.asarray(2 * turned / len(fringes.phi) / alpha)
 
 
 @of_intensity("harmonics of the fringes", "amplitude / α", x="harmonic (cosine, sine)")
-def harmonics(data: FringeSetData) -> Curve:
+def harmonics(data: FringeSetData) -> Curve | None:
     """Those that all pixels share."""
-    sizes = _harmonics(data).mean(axis=1)
-    places = np.add.outer(ORDERS, (0, 0.25))
+    orders, of_pixels = _harmonics(data)
+    if not len(orders):
+        return None
+    sizes = of_pixels.mean(axis=1)
+    places = np.add.outer(orders, (0, 0.25))
     return Curve(places.ravel(), np.stack([sizes.real, sizes.imag], axis=1).ravel())
 
 
 @of_intensity_power(
     "harmonics of the fringes that differ from pixel to pixel", "amplitude / α", x="harmonic"
 )
-def pixel_harmonics(data: FringeSetData) -> Curve:
+def pixel_harmonics(data: FringeSetData) -> Curve | None:
     """Median square: a few odd pixels do not count."""
-    sizes = _harmonics(data)
+    orders, sizes = _harmonics(data)
+    if not len(orders):
+        return None
     apart = np.abs(sizes - sizes.mean(axis=1, keepdims=True)) ** 2
-    return Curve(np.array(ORDERS, float), np.median(apart, axis=1))
+    return Curve(orders, np.median(apart, axis=1))
 
 
 @of_intensity("mean residual against signal", "mean residual", unit="e-", x="bin of level")
