@@ -89,13 +89,11 @@ class IntensityNoise(LevelChange):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """As by `Effect`, with the change of contrast by ambient light or separate powers."""
         estimate = super().estimate(evidence)
-        share, error = gain_share(evidence)
-        if estimate is not None and share > max(0.5, SIGNIFICANT * error):
-            return replace(
-                estimate, refused="the noise rises as with a gain that varies, not light"
-            )
         if estimate is None:
             return None
+        of_gain, of_gain_error = gain_share(evidence)
+        if of_gain > max(0.5, SIGNIFICANT * of_gain_error):
+            return replace(estimate, refused="its noise rises as that of a gain that varies")
         assert isinstance(estimate.effect, cls)
         effect = estimate.effect
         shares = ambient_shares(evidence)

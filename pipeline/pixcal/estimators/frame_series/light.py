@@ -114,6 +114,7 @@ def ambient_shares(evidence: Evidence) -> list[tuple[float, float]]:
     return list(shares.values())
 
 
+@cached_on_evidence
 def gain_share(evidence: Evidence) -> tuple[float, float]:
     """Part of the frames' changes that is of the gain, not of the light, and its error.
 
