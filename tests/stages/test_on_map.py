@@ -9,7 +9,7 @@ from pixcal.effects.lag import Lag
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.estimators.detector.lag_by_level import FittedLoss
 from pixcal.simulation.effect import FringeMaps
-from pixcal.stages.advice import NOTHING, limit, moved_by, size_of, unexplained
+from pixcal.stages.advice import NOTHING, _correction_clause, limit, moved_by, size_of, unexplained
 from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.stage import on_map
 
@@ -114,6 +114,15 @@ def test_what_nothing_is_known_of_is_not_said_to_do_nothing():
         assert moved_by(cause, sigma) == said
         limited = limit(sigma, {"causes": [cause], "verdict": "explained"}, NOTHING)
         assert ("glow may bias" in limited) == (said == "not known")
+
+
+@pytest.mark.parametrize("verdict", ["no gap", "explained", "partly explained", "unexplained"])
+def test_maps_with_an_unexplained_gap_are_not_said_to_need_no_correction(verdict):
+    diagnosis = {"causes": [], "verdict": verdict}
+    clause = _correction_clause(diagnosis, NOTHING, "They need")
+    biased = "may be biased" in limit({"vertical": 1e-3}, diagnosis, NOTHING)
+    assert clause.startswith(" as fitted")
+    assert ("no correction" in clause) == (not biased) == (verdict in ("no gap", "explained"))
 
 
 def test_a_parameter_that_the_frames_do_not_tell_has_an_error_as_large_as_itself():

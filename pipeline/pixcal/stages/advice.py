@@ -112,6 +112,8 @@ def _correction_clause(diagnosis: Json, correction: Json, it_needs: str) -> str:
         return " as fitted, NOT corrected for the effects below"
     if unknown := _unknown(diagnosis["causes"]):
         return f" as fitted. The effect of {' and '.join(unknown)} on the offsets is unknown"
+    if diagnosis["verdict"] in WITH_GAP:
+        return " as fitted"  # `limit` says why they may need a correction
     return f" as fitted. {it_needs} no correction"
 
 
