@@ -26,10 +26,12 @@ from pixcal.kernels.sample_sums import (
     pixel_moments,
     products_by_level,
 )
-from pixcal.model.arrays import F32, F64, Indices, Mask
+from pixcal.model.arrays import C128, F32, F64, Indices, Mask
 
 OUTLIER_SIGMA = 8.0  # standard deviations beyond which a residual counts only as an outlier
 OUTLIERS = (5.0, 7.0, 10.0)  # standard deviations beyond which residuals are counted
+HARMONICS = (2, 3, 4)  # orders that are looked for
+MIN_APART = 0.1  # least part of a harmonic that is not absorbed by the fit, for it to be compared
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,28 @@ class FringeSetData:
     def electrons(self) -> F32:
         """The same residuals, e-, as (t, pixel) of all pixels."""
         return self._calm[1].reshape(len(self.residual), -1)
+
+    @cached_property
+    def harmonics(self) -> tuple[Indices, C128]:
+        """Orders, and harmonics (order, pixel) of the residuals of good pixels over the amplitude.
+
+        Only those that the phases of the frames separate from the fringes. Four phases to a turn,
+        for instance, show no third or fourth harmonic: the fit absorbs them.
+        """
+        fringes, good = self.fringes, self.good
+        _, sine, cosine = (part[good] for part in fringes.theta)
+        amplitude = np.hypot(sine, cosine)
+        every = np.exp(-1j * np.outer(HARMONICS, fringes.phi))
+        fitted = [np.ones(len(fringes.phi)), np.sin(fringes.phi), np.cos(fringes.phi)]
+        axes = np.linalg.qr(np.stack(fitted, axis=1))[0]
+        apart = np.mean(np.abs(every - every @ axes @ axes.T) ** 2, axis=1) > MIN_APART
+        orders, turns = np.array(HARMONICS)[apart], every[apart].astype(np.complex64)
+        moments = turns.real @ self.electrons + 1j * (turns.imag @ self.electrons)
+        # The signal goes with sin(phi + psi).
+        unit = (cosine - 1j * sine) / np.maximum(amplitude, 1e-300)
+        turned = moments[:, good.ravel()] * np.cumprod([unit] * max(HARMONICS), axis=0)[orders - 1]
+        alpha = float(np.median(amplitude))
+        return orders, np.asarray(2 * turned / len(fringes.phi) / alpha)
 
     @property
     def variance(self) -> F64:

@@ -8,39 +8,18 @@ from pixcal.estimators.detector.flat_ladder import MIN_STEPS, ladder, straight_l
 from pixcal.estimators.diagnosis.evidence import Evidence, cached_on_evidence
 from pixcal.estimators.test_statistics import Curve, statistic
 from pixcal.estimators.test_statistics.fringe_set_data import CODES, FringeSetData
-from pixcal.model.arrays import C128, F64
+from pixcal.model.arrays import F64
 
 of_intensity = partial(statistic, "intensity")
 of_intensity_power = partial(statistic, "intensity", power=True)
 
 CLASSES = (4, 16, 64)
-ORDERS = (2, 3, 4)  # harmonics
-MIN_APART = 0.1  # least part of a harmonic that is not absorbed by the fit, for it to be compared
-
-
-def _harmonics(data: FringeSetData) -> tuple[F64, C128]:
-    """Harmonics (order, pixel) of the phase in the residuals, over the fringe amplitude.
-
-    Also their orders: those that the phases of the frames separate from the fringes. Four phases to
-    a turn, for instance, show no third or fourth harmonic: the fit absorbs them.
-    """
-    fringes, good = data.fringes, data.good
-    alpha = float(np.median(np.hypot(fringes.theta[1], fringes.theta[2])[good]))
-    every = np.exp(-1j * np.outer(ORDERS, fringes.phi))
-    fitted = np.stack([np.ones(len(fringes.phi)), np.sin(fringes.phi), np.cos(fringes.phi)], axis=1)
-    axes = np.linalg.qr(fitted)[0]
-    apart = np.mean(np.abs(every - every @ axes @ axes.T) ** 2, axis=1) > MIN_APART
-    orders, turns = np.array(ORDERS, float)[apart], every[apart].astype(np.complex64)
-    # The signal goes with sin(phi + psi).
-    moments = (turns.real @ data.electrons + 1j * (turns.imag @ data.electrons))[:, good.ravel()]
-    turned = moments * np.exp(-1j * np.outer(orders, data.psi[good]))
-    return orders, np.asarray(2 * turned / len(fringes.phi) / alpha)
 
 
 @of_intensity("harmonics of the fringes", "amplitude / α", x="harmonic (cosine, sine)")
 def harmonics(data: FringeSetData) -> Curve | None:
     """Those that all pixels share."""
-    orders, of_pixels = _harmonics(data)
+    orders, of_pixels = data.harmonics
     if not len(orders):
         return None
     sizes = of_pixels.mean(axis=1)
@@ -53,11 +32,11 @@ def harmonics(data: FringeSetData) -> Curve | None:
 )
 def pixel_harmonics(data: FringeSetData) -> Curve | None:
     """Median square: a few odd pixels do not count."""
-    orders, sizes = _harmonics(data)
+    orders, sizes = data.harmonics
     if not len(orders):
         return None
     apart = np.abs(sizes - sizes.mean(axis=1, keepdims=True)) ** 2
-    return Curve(orders, np.median(apart, axis=1))
+    return Curve(orders.astype(float), np.median(apart, axis=1))
 
 
 @of_intensity("mean residual against signal", "mean residual", unit="e-", x="bin of level")
