@@ -133,7 +133,8 @@ EFFECTS = {file.stem for file in (PACKAGES["pixcal"] / "effects").glob("[!_]*.py
 NAMED = {
     "blind_examination.strengths": EFFECTS,  # What the examination asks of each.
     # Terms of a budget, as the next ones.
-    "pixcal.stages.budget.stage": {"quantisation", "flat_error"},
+    "pixcal.stages.budget.stage": {"quantisation"},
+    "pixcal.stages.budget.calibration": {"flat_error"},
     "pixcal_cli.budget": {"flat_error"},
     "pixcal.stages.reduce.fringe_sets": {"quantisation"},
     "pixcal.stages.reduce.stage": {"quantisation"},

@@ -13,7 +13,7 @@ from pixcal.report.drawing import WIDE, finish, new_figure, png, span_scale, sym
 from pixcal.report.text import number
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import recordings
-from pixcal.stages.budget.expected import phase_information
+from pixcal.stages.budget.information import phase_information
 from reproduction.draw import THOUSANDTHS, image
 from reproduction.lab import Lab, Scene, read_set
 from reproduction.maps import Whiteness, plane, without

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
 from pixcal.estimators.fringe_fit.sweep import phase_bound
 from pixcal.estimators.fringe_fit.tile_fit import Tile
-from pixcal.stages.budget.expected import (
+from pixcal.stages.budget.calibration import WeightErrors
+from pixcal.stages.budget.information import (
     FrameSpread,
-    WeightErrors,
     phase_information,
     sampling_loss,
     unweighted_variance,

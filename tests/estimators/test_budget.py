@@ -8,23 +8,25 @@ import pytest
 
 from pixcal.kernels.scene import electrons_per_unit, fibre_light
 from pixcal.model.bench import Bench, load_bench
+from pixcal.stages.budget.calibration import (
+    WeightErrors,
+    bias_frames_needed,
+    flat_error,
+    flats_needed,
+)
 from pixcal.stages.budget.expected import (
     JoinedBound,
     SetBound,
-    WeightErrors,
-    bias_frames_needed,
     brightest_allowed,
-    flat_error,
-    flats_needed,
     frames_needed,
     grid,
     joined,
-    phase_information,
     pixel_contrast,
     planned_split,
     sample_variance,
 )
-from pixcal.stages.budget.stage import levers
+from pixcal.stages.budget.information import phase_information
+from pixcal.stages.budget.levers import levers
 
 ROOT = Path(__file__).parents[2]
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import InputError, PlanError
+from pixcal.stages.ingest import reading
 from pixcal.stages.ingest import stage as ingest
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage import frame_decoding, frames
@@ -147,7 +148,7 @@ def test_workers_and_bands_do_not_matter(
     folder = describe(tmp_path / "acq")
     save_frames(folder / "v", noise((5, 700, 1000)))
     ingest.run(folder, tmp_path / "one", ingest.Config(copy=copy), SYNC)
-    monkeypatch.setattr(ingest, "_BAND_ROWS", (256,))
+    monkeypatch.setattr(reading, "_BAND_ROWS", (256,))
     two = Runtime(cluster=cluster, workers=2)
     ingest.run(folder, tmp_path / "two", ingest.Config(copy=copy), two)
     assert tree(tmp_path / "one/ingest") == tree(tmp_path / "two/ingest")
@@ -678,7 +679,7 @@ def nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: Any) -> None:
         raise AssertionError("data were read")
 
-    monkeypatch.setattr(ingest, "_write_piece", refuse)
+    monkeypatch.setattr(reading, "_write_piece", refuse)
 
 
 def refused(acquisition: Path, out: Path) -> str:

@@ -21,9 +21,8 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError, PlanError
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import recordings
-from pixcal.stages import simulate
-from pixcal.stages import simulate as simulated_truth
-from pixcal.stages.simulate import Config, run
+from pixcal.stages.simulate import Config, run, stage
+from pixcal.stages.simulate import truth as simulated_truth
 from pixcal.storage.artefact import artefact_key
 from pixcal.storage.manifest import read_manifest
 
@@ -201,8 +200,8 @@ def test_the_bits_do_not_depend_on_how_the_work_is_cut(
     def odd_rows(bench: Any) -> list[tuple[int, int]]:
         return [(0, 5), (5, 70), (70, 131)]
 
-    monkeypatch.setattr(simulate, "FRAMES_PER_TASK", 5)
-    monkeypatch.setattr(simulate, "row_blocks", odd_rows)
+    monkeypatch.setattr(stage, "FRAMES_PER_TASK", 5)
+    monkeypatch.setattr(stage, "row_blocks", odd_rows)
     monkeypatch.setattr(simulated_truth, "row_blocks", odd_rows)
     assert contents(simulated(tmp_path)) == contents(acq)
 
@@ -424,7 +423,7 @@ def test_cut_short_it_leaves_nothing_that_looks_whole(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(simulate, "call", killed)
+        patch.setattr(stage, "call", killed)
         with pytest.raises(KeyboardInterrupt):
             simulated(tmp_path)
     assert {p.name for p in tmp_path.iterdir()} == {"bench.yaml"}

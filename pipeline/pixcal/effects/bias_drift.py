@@ -258,7 +258,8 @@ def _settling(every: Sequence[OffsetSeries], plain: Components) -> tuple[Profile
         return estimate_components(offset_modes(every, shapes), start=start, steps=steps)
 
     trials = np.geomspace(3 * step, max(length, 6 * step), SETTLINGS)
-    best = best_shape(fit, trials, True, plain)
+    # Between the trial values the gain rises by far less than twofold.
+    best = best_shape(fit, trials, True, plain, least=SIGNIFICANT**2 / 4)
     # Neighbouring time constants are correlated: half their number counts as trials.
     chance = log_chance_of_any([log_chance(_rise(best.components, plain))] * (SETTLINGS // 2))
     return best if sigmas(chance) > SIGNIFICANT else None, chance

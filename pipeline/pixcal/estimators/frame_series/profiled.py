@@ -35,11 +35,16 @@ class Profiled:
 
 
 def best_shape(
-    fit: ProfiledFit, trials: F64, steady: bool, start: Components | None = None
+    fit: ProfiledFit,
+    trials: F64,
+    steady: bool,
+    start: Components | None = None,
+    least: float = -np.inf,
 ) -> Profiled:
     """The best of values (n,), in equal steps of the logarithm, and between them.
 
-    Likelihoods of a ``steady`` one, of known shapes, are compared without restriction.
+    Likelihoods of a ``steady`` one, of known shapes, are compared without restriction. A best value
+    that raises the log-likelihood of ``start`` by less than ``least`` is not refined.
     """
 
     def high(components: Components) -> float:
@@ -52,6 +57,8 @@ def best_shape(
     log_value = float(np.log(trials[best]))
     peak = fit(float(trials[best]), fits[best])
     width = float(np.log(trials[1] / trials[0]))
+    if start and high(peak) - high(start) < least:
+        return Profiled(float(trials[best]), np.inf, peak, ())
     for _ in range(HALVINGS):
         # A parabola through the three, ever closer; its curvature is the information.
         sides = tuple(fit(float(np.exp(log_value + w)), peak) for w in (-width, width))

@@ -10,7 +10,6 @@ from functools import cached_property
 from math import ceil
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 
 from pixcal.effects import effects, parse_effects
@@ -23,9 +22,8 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import states_of
 from pixcal.simulation.recording import Recording
+from pixcal.stages.budget.information import FrameSpread, phase_information, sampling_loss
 
-NODES = 9  # nodes of the quadrature over frame-to-frame changes
-TURN = 720  # steps per cycle for means over the phase without a closed form
 Shares = Sequence[float] | F64
 
 SAMPLES = 96  # pixels along each side of the grid: light changes little between them
@@ -33,97 +31,6 @@ SAMPLES = 96  # pixels along each side of the grid: light changes little between
 MAX_PHASES = 2000
 FRAMES_DRAWN = 20_000  # to measure frame-to-frame changes of light and contrast
 DARKNESS = 1e-12  # least information of one frame, 1/rad²
-NEGLIGIBLE = 1e-3  # relative increase in frames allowed for the noise of calibration frames
-
-
-@dataclass(frozen=True)
-class FrameSpread:
-    """Frame-to-frame changes of light and contrast, as nodes and weights of a quadrature."""
-
-    level: F64  # level, amplitude: (n,) B and A, mean about 1
-    amplitude: F64
-    weight: F64  # (n,) sum 1
-
-    @classmethod
-    def normal(cls, level_rms: float, contrast_rms: float, visibility: float) -> "FrameSpread":
-        """Normal changes of light and contrast, relative, clipped as `scene` does at contrast 1."""
-        x, u = np.polynomial.hermite_e.hermegauss(NODES if level_rms else 1)
-        y, v = np.polynomial.hermite_e.hermegauss(NODES if contrast_rms else 1)
-        level = np.repeat(np.maximum(1 + level_rms * x, 0), len(y))
-        contrast = np.tile(np.clip(1 + contrast_rms * y, 0, 1 / visibility), len(x))
-        weight = np.outer(u, v).ravel()
-        return cls(level, level * contrast, weight / weight.sum())
-
-
-STEADY = FrameSpread(np.ones(1), np.ones(1), np.ones(1))
-
-
-def phase_information(
-    iota: ArrayLike, alpha: ArrayLike, variance: float, spread: FrameSpread = STEADY
-) -> F64:
-    """Information of one frame on a pixel's phase, 1/rad², averaged over phases and spread.
-
-    ``iota``, ``alpha``: e-, at B = A = 1. ``variance``: e-², of a sample without light.
-    """
-    total = np.asarray(iota, float)[..., None] * spread.level + variance
-    swing = np.asarray(alpha, float)[..., None] * spread.amplitude
-    # At low contrast, a difference of two nearly equal numbers: written as a quotient.
-    root = np.sqrt(np.maximum(total**2 - swing**2, 0.0))
-    return np.asarray(swing**2 / (total + root) @ spread.weight)
-
-
-def unweighted_variance(
-    iota: ArrayLike, alpha: ArrayLike, variance: float, spread: FrameSpread = STEADY
-) -> F64:
-    """Variance (rad²) of one frame with equal weights: twice the bound at full contrast."""
-    square = spread.amplitude**2
-    noise = np.asarray(iota, float)[..., None] * spread.level + variance
-    power = np.asarray(alpha, float) ** 2 * (square @ spread.weight) ** 2
-    return np.asarray(2 * (square * noise @ spread.weight) / power)
-
-
-def sampling_loss(iota: float, alpha: float, variance: float, phases: F64) -> tuple[float, float]:
-    """Ratio of frames needed with phases (t,) to uniform phases, at the median and worst phase."""
-    # Few phases favour some pixels and mix iota, alpha and phase; infinite if these are degenerate.
-    psi = 2 * np.pi * np.arange(TURN) / TURN
-    information = np.zeros((TURN, 3, 3))
-    for phi in phases:
-        sine, cosine = np.sin(psi + phi), np.cos(psi + phi)
-        slopes = np.stack([np.ones(TURN), sine, cosine], axis=-1)
-        noise = np.maximum(iota + alpha * sine + variance, 1e-9)
-        information += slopes[:, :, None] * slopes[:, None, :] / noise[:, None, None]
-    information /= len(phases)
-    if np.max(np.linalg.cond(information)) > 1e12:
-        return np.inf, np.inf
-    achieved = np.linalg.inv(information)[:, 2, 2] / alpha**2
-    loss = achieved * float(phase_information(iota, alpha, variance))
-    return float(np.median(loss)), float(loss.max())
-
-
-@dataclass(frozen=True)
-class WeightErrors:
-    """Cost of wrong weights: relative increase of the frames needed, per squared relative error.
-
-    Weights ``(1 + e(u)) / variance`` add the variance of e over the phases, by their information.
-    """
-
-    # per e-² of a constant error of a sample's variance, from a wrong bias or read noise
-    offset: float
-    scale: float  # per squared relative error of the light, from a wrong flat
-
-    @classmethod
-    def of(cls, iota: float, alpha: float, variance: float) -> "WeightErrors":
-        """For a pixel; parameters as `phase_information`."""
-        u = 2 * np.pi * (np.arange(TURN * 8) + 0.5) / (TURN * 8)
-        light = iota + alpha * np.sin(u)
-        noise = light + variance
-        weight = np.cos(u) ** 2 / noise
-        weight /= weight.sum()
-
-        def scatter(values: F64) -> float:
-            return float(weight @ values**2 - (weight @ values) ** 2)
-
-        return cls(scatter(1 / noise), scatter(light / noise))
 
 
 def sample_variance(bench: Bench) -> float:
@@ -342,30 +249,3 @@ def brightest_allowed(bench: Bench) -> float | None:
     d = bench.detector
     converter = (d.top_adu - d.bias_adu) * d.gain_e_per_adu
     return converter if d.full_well_e is None else min(d.full_well_e, converter)
-
-
-def bias_frames_needed(errors: WeightErrors, variance: float) -> int:
-    """Bias frames needed for a cost below `NEGLIGIBLE` of the fringe frames."""
-    # A pixel's iota absorbs its bias. The remaining cost is from weights with a wrong level and, if
-    # each pixel's read noise is measured from the same frames, a wrong read noise.
-    n = 2
-    while errors.offset * (variance / n + 2 * variance**2 / (n - 1)) > NEGLIGIBLE:
-        n += 1
-    return n
-
-
-def flat_error(bench: Bench) -> float | None:
-    """Relative error of a pixel's flat from the planned flats of the bench; None without any."""
-    f = bench.frames
-    if not f.flats or f.flat_rate_e_s is None:
-        return None
-    variance = sample_variance(bench)
-    levels = [(step.count, f.flat_rate_e_s * step.exptime_s) for step in f.flats]
-    weight = sum(count * level**2 / (level + variance) for count, level in levels if level > 0)
-    return float(weight**-0.5) if weight > 0 else None
-
-
-def flats_needed(errors: WeightErrors, level: float, variance: float) -> int:
-    """Flats at a level (e-) that add less than `NEGLIGIBLE` to the fringe frames."""
-    # An error of the flat does not change the phase; it only affects weights from neighbours.
-    return max(1, ceil(errors.scale * (level + variance) / level**2 / NEGLIGIBLE))

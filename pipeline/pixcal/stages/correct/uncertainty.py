@@ -15,7 +15,7 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.simulation.forward import numbers, with_numbers
 from pixcal.stages.correct.sweep_to_correct import Swept, corrected, maps_of
-from pixcal.stages.fit.sweep import scout_tiles
+from pixcal.stages.fit.scouting import scout_tiles
 
 # peak memory of a tile's task per pixel, surroundings included (measured),
 PIXEL_BYTES = 500

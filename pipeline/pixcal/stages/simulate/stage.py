@@ -2,17 +2,11 @@
 
 The work is divided into tasks of a range of frames and rows, which `pixcal.simulation.exposure`
 computes from the bench and its effects only.
-
-The truth is a separate directory: ``delta_x``, ``delta_y`` (px), ``response``, ``bias`` (ADU),
-``dark_rate`` (e-/s) and ``mask`` (`PixelFlag`) as FITS images; ``truth.json`` with the geometry of
-each set (``centre_px`` from the window's first pixel, ``kx`` and ``ky`` at its centre in rad/px)
-and its frames (``B``, ``A``, ``phi``, ``dkx``, ``dky``); and the bench file.
 """
 
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import fields
 from datetime import datetime, timedelta
 from functools import partial
 from itertools import product
@@ -23,8 +17,8 @@ from typing import Any
 from pixcal.effects import known_effects, parse_effects
 from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.kernels import optics, synthesis
-from pixcal.kernels.scene import DetectorMaps, Rows, geometry
+from pixcal.kernels import synthesis
+from pixcal.kernels.scene import Rows
 from pixcal.model import acquisition as described
 from pixcal.model.bench import Bench, load_bench
 from pixcal.model.config import to_plain
@@ -32,20 +26,14 @@ from pixcal.model.errors import InputError, naming
 from pixcal.model.options import Simulate as Config
 from pixcal.model.yaml_file import to_yaml
 from pixcal.simulation.effect import Effect
-from pixcal.simulation.exposure import Camera, states_of
+from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import Recording, recordings
-from pixcal.stages.tiles import spans
+from pixcal.stages.simulate.target import Target
+from pixcal.stages.simulate.truth import row_blocks, write_truth
 from pixcal.storage.artefact import artefact_key
-from pixcal.storage.formats import STAGES, ArtefactKind
+from pixcal.storage.formats import STAGES
 from pixcal.storage.lock import lock
-from pixcal.storage.manifest import (
-    MANIFEST,
-    Manifest,
-    file_digest,
-    read_manifest,
-    write_json,
-    write_manifest,
-)
+from pixcal.storage.manifest import Manifest, file_digest
 from pixcal.storage.products import COMPRESSED, FrameWriter, ascii_text
 
 STAGE, TRUTH = STAGES["simulate"], STAGES["simulate-truth"]
@@ -62,9 +50,6 @@ _BYTES_PER_COMPRESSED_SAMPLE = 10
 
 _MJD_EPOCH = datetime(1858, 11, 17)
 Effects = tuple[Effect, ...]
-
-# maps in the truth; read noise and gain of a simulated detector are equal in all pixels
-TRUTH_MAPS = tuple(f for f in fields(DetectorMaps) if f.name not in ("read_noise", "adu_per_e"))
 
 
 # a range of frames of a recording, and their files by number
@@ -223,137 +208,3 @@ def _write_description(bench: Bench, folder: Path) -> None:
         ),
     )
     (folder / "acquisition.yaml").write_text(to_yaml(contents), encoding="utf-8")
-
-
-# The truth: maps as FITS, geometry and frames of each set as JSON
-
-
-def row_blocks(bench: Bench) -> list[Rows]:
-    """The window's rows, in blocks that are simulated separately."""
-    return list(spans(bench.detector.shape[0], synthesis.BLOCK_ROWS))
-
-
-def write_truth(
-    bench: Bench, effects: Effects, recorded: list[Recording], folder: Path, runtime: Runtime
-) -> None:
-    """Maps as FITS; geometry and frames as JSON."""
-    units = {"delta_x": "pix", "delta_y": "pix", "bias": "adu", "dark_rate": "electron/s"}
-    maps = [
-        FrameWriter.create(
-            folder / f"{field.name}.fits",
-            bench.detector.shape,
-            "uint8" if field.name == "mask" else "float32",
-            {"BUNIT": units[field.name]} if field.name in units else None,
-        )
-        for field in TRUTH_MAPS
-    ]
-    run_tasks(partial(_write_maps, bench, effects, maps), row_blocks(bench), runtime, label="truth")
-    for writer in maps:
-        writer.finish()
-    sets = {s.folder: _set_truth(bench, effects, s) for s in recorded if s.kind == "fringes"}
-    write_json(folder / "truth.json", {"schema": "pixcal/truth/1", "sets": sets})
-
-
-def _write_maps(bench: Bench, effects: Effects, writers: list[FrameWriter], rows: Rows) -> None:
-    camera = Camera(bench, rows, effects)
-    skip = rows[0] - camera.rows[0]
-    keep = slice(skip, skip + rows[1] - rows[0])
-    for field, writer in zip(TRUTH_MAPS, writers, strict=True):
-        writer.write_rows(rows[0], getattr(camera.maps, field.name)[keep])
-
-
-def _set_truth(bench: Bench, effects: Effects, recording: Recording) -> dict[str, Any]:
-    g, states = geometry(bench, recording.number), states_of(recording, effects)
-    ny, nx = bench.detector.shape
-    kx, ky = optics.fringe_vector((nx - 1) / 2, (ny - 1) / 2, g)
-    return {
-        "centre_px": [g.centre_x / g.pitch, g.centre_y / g.pitch],
-        "baseline_mm": [g.baseline_x, g.baseline_y, g.baseline_z],
-        "distance_mm": g.distance,
-        "wavelength_nm": bench.optics.wavelength_nm,
-        "interfringe_px": optics.interfringe((float(kx), float(ky))),
-        "kx": float(kx),
-        "ky": float(ky),
-        "electrons": recording.electrons,
-        **{"B": states.level.tolist(), "A": states.amplitude.tolist()},
-        **{name: getattr(states, name).tolist() for name in ("phi", "dkx", "dky")},
-    }
-
-
-# Output directories, built at a temporary place and then moved
-
-
-@dataclass(frozen=True)
-class Target:
-    """A directory to write, the option that names it, and the kind of its contents."""
-
-    final: Path
-    option: str
-    stage: ArtefactKind
-
-    @classmethod
-    def of(cls, folder: Path, option: str, stage: ArtefactKind) -> "Target":
-        """Target at a given directory, which may not exist yet."""
-        try:
-            folder = folder.resolve()
-            folder.parent.mkdir(parents=True, exist_ok=True)
-        except (OSError, RuntimeError) as error:  # the latter for circular links
-            raise InputError(
-                f"{option} {folder}: cannot be created ({error}); choose another"
-            ) from error
-        return cls(folder, option, stage)
-
-    @property
-    def aside(self) -> Path:
-        """Temporary place where the directory is built."""
-        return self.final.with_name(f".{self.final.name}.partial")
-
-    def up_to_date(self, key: str) -> Manifest | None:
-        """Manifest of the present directory, if it has this key and is complete."""
-        folder, place = self.final, f"{self.option} {self.final}"
-        if not folder.exists():
-            return None
-        if not folder.is_dir():
-            raise InputError(f"{place}: is a file; choose another directory")
-        there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if not p.is_dir()}
-        if not there:
-            return None
-        manifest = read_manifest(folder)
-        if manifest is None or manifest.stage != self.stage.name:
-            raise InputError(
-                f"{place}: not empty, and not made by 'pixcal simulate'; choose another"
-            )
-        foreign = sorted(there - set(manifest.summary.get("files", {})) - {MANIFEST})
-        if foreign:
-            raise InputError(f"{folder / foreign[0]}: not made by 'pixcal simulate'; move it away")
-        whole = manifest.key == key and _sizes(folder) == manifest.summary.get("files")
-        return manifest if whole else None
-
-    @contextmanager
-    def building(self) -> Iterator[Path]:
-        """An empty temporary directory for the contents, removed at the end."""
-        made = self.aside / "made"
-        try:
-            shutil.rmtree(made, ignore_errors=True)
-            made.mkdir(parents=True)
-            yield made
-        finally:
-            shutil.rmtree(self.aside, ignore_errors=True)
-
-    def put_in_place(self, key: str, config: dict[str, Any]) -> Manifest:
-        """Write the manifest and replace the present directory by the new one."""
-        made, stage = self.aside / "made", self.stage
-        summary = {"files": _sizes(made)}
-        manifest = Manifest(stage.name, stage.format, key, config, {}, summary=summary)
-        write_manifest(made, manifest)
-        if self.final.exists():
-            old = self.aside / "replaced"
-            shutil.rmtree(old, ignore_errors=True)
-            self.final.rename(old)
-        made.rename(self.final)
-        return manifest
-
-
-def _sizes(folder: Path) -> dict[str, int]:
-    files = (p for p in sorted(folder.rglob("*")) if p.is_file() and p != folder / MANIFEST)
-    return {p.relative_to(folder).as_posix(): p.stat().st_size for p in files}
