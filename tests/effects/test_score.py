@@ -17,9 +17,10 @@ from pixcal.engine.run import Runtime
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
-from pixcal.simulation.deviations import common_precision, pair_sums, pair_variance
 from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.map_deviation import common_precision
 from pixcal.simulation.own_effect import effect_of_file
+from pixcal.simulation.pairs import pair_sums, pair_variance
 from pixcal.simulation.replica import Replica
 from pixcal.simulation.score import score
 from pixcal.stages import diagnose, fit, ingest, reduce, simulate

@@ -14,16 +14,9 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.arrays import F32, F64, Mask
-from pixcal.simulation.deviations import (
-    LINEAR,
-    Change,
-    Deviation,
-    SetDeviations,
-    StackDeviations,
-    common_precision,
-    is_smooth,
-)
+from pixcal.simulation.deviations import LINEAR, Change, SetDeviations, StackDeviations
 from pixcal.simulation.forward import ForwardModel, Stage
+from pixcal.simulation.map_deviation import Deviation, common_precision, is_smooth
 from pixcal.simulation.replica import Replica
 
 Key = tuple[str | int, str]  # fringe set or number of a stack, and name of its deviation

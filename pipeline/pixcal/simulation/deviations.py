@@ -7,29 +7,22 @@ the first three linearly, less the part that the fit absorbs.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct
-from scipy.ndimage import median_filter
 
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
-from pixcal.estimators.maps.structure import flattened, without_outliers
-from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData, neighbour_sums
-from pixcal.kernels.robust import SIGMA_OF_MAD, robust_sigma
+from pixcal.estimators.maps.structure import without_outliers
+from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData
+from pixcal.kernels.robust import SIGMA_OF_MAD
 from pixcal.model.arrays import F32, F64, Mask
+from pixcal.simulation.map_deviation import MAPS, Deviation, change_of_maps, weighed
+from pixcal.simulation.pairs import pair_sums, pair_variance, taken_by_fit
 
-# degree of the smooth surfaces that maps of the nominal bench may contain
-DEGREES = {"offset": 3, "contrast": 2, "light": 3}
-MAPS = tuple(DEGREES)
-WILD_STEP = 5.0  # robust deviations above which a step between neighbours is an outlier
-AROUND = 5  # side (pixels) of a pixel's surroundings
-# share of the pixels' changes by which they may differ from those of their surroundings
-ALONE = 0.5
 OUTLIER_SIGMA = 8.0  # standard deviations above which a residual is an outlier
 HARMONICS = 2  # harmonics of the phase on which fitted frame parameters may depend
 TINY = 1e-30  # weight that counts as none
@@ -37,61 +30,6 @@ KNOWN = 0.02  # relative error of the modelled variance of a frame's parameters
 
 LINEAR = ("residual", "frames", "maps")
 Change = dict[str, NDArray[Any]]
-# offsets (rows, columns) to neighbours in other rows and columns
-DIAGONAL = ((1, 1), (1, -1), (1, 2), (1, -2), (2, 1), (2, -1))
-FRAMES_APART = (1, 2, 3, 4)
-
-
-@dataclass(frozen=True)
-class Deviation:
-    """Differences from nominal values, and inverse variances."""
-
-    value: NDArray[Any]
-    weight: NDArray[Any]
-
-
-def weighed(maps: F64) -> Deviation:
-    """Maps less smooth surfaces, with weights from differences of neighbours; NaN: weight 0."""
-    flat, weight = without_smooth(maps), np.zeros(maps.shape)
-    for values, out in zip(maps, weight, strict=True):
-        steps = np.diff(values, axis=1)
-        if np.isfinite(steps).any():
-            spread = robust_sigma(steps) / np.sqrt(2)
-            out[np.isfinite(values)] = 1 / max(spread**2, 1e-30)
-    return Deviation(flat, weight)
-
-
-def common_precision(maps: F64) -> F64:
-    """Inverse covariance (m, m) of the noise of maps (m, y, x) of the same pixels."""
-    # From steps between neighbours along both axes, without outliers (`WILD_STEP`).
-    steps = np.concatenate([np.diff(maps, axis=a).reshape(len(maps), -1) for a in (1, 2)], axis=1)
-    steps = steps[:, np.isfinite(steps).all(axis=0)]
-    usual = SIGMA_OF_MAD * np.median(np.abs(steps), axis=1, keepdims=True)
-    scaled = steps / np.maximum(usual, 1e-30)
-    scaled = scaled[:, (np.abs(scaled) < WILD_STEP).all(axis=0)]
-    size = np.sqrt(2) / np.maximum(usual[:, 0], 1e-30)
-    correlation = np.atleast_2d(np.corrcoef(scaled))
-    return np.asarray(np.linalg.pinv(correlation, hermitian=True) * np.outer(size, size))
-
-
-def is_smooth(maps: F64, weight: F64) -> bool:
-    """Whether maps (m, y, x) change less from pixel to pixel than at large scales."""
-    around = np.stack([median_filter(own, AROUND, mode="reflect") for own in maps])
-    rough, whole = (float((weight * v**2).sum()) for v in (maps - around, maps))
-    return rough <= ALONE**2 * whole
-
-
-def change_of_maps(maps: F64, measured: Deviation) -> F64:
-    """Change of maps less smooth surfaces, on the measured pixels."""
-    return without_smooth(np.where(measured.weight > 0, maps, np.nan))
-
-
-def without_smooth(maps: F64) -> F64:
-    """Maps less their smooth surfaces; zero where maps are undefined."""
-    degrees = [DEGREES[name] for name in MAPS] if len(maps) == len(MAPS) else [DEGREES["light"]]
-    return np.nan_to_num(
-        np.stack([flattened(own, degree) for own, degree in zip(maps, degrees, strict=True)])
-    )
 
 
 class _Deviations:
@@ -347,76 +285,3 @@ def band_power(series: F64, *, squares: bool = True) -> F64:
 
 def _inverse(variance: F64) -> F64:
     return np.where(variance > 0, 1 / np.where(variance > 0, variance, 1), 0)
-
-
-# Products of pairs of residuals
-
-
-def pair_sums(values: F32, good: Mask) -> F64:
-    """Sums (n,) over frames of products of two residuals (t, y, x) over their noise.
-
-    Pairs of columns within rows, of rows within columns, of column sums and of row sums (of
-    different rows and columns), neighbours of `DIAGONAL`, samples of `FRAMES_APART`. Values
-    without weight are zero.
-    """
-    count, ny, nx = values.shape
-    rows = values.reshape(-1, nx)
-    columns = np.ascontiguousarray(values.transpose(0, 2, 1)).reshape(-1, ny)
-    within_rows = (rows.T @ rows).astype(float)
-    within_columns = (columns.T @ columns).astype(float)
-    of_columns, of_rows = values.sum(axis=1, dtype=float), values.sum(axis=2, dtype=float)
-    near, _ = neighbour_sums(values, good, DIAGONAL)
-    flat = values.reshape(count, -1)
-    apart = [
-        float(np.einsum("tn,tn->t", flat[n:], flat[:-n]).sum(dtype=float)) if n < count else 0.0
-        for n in FRAMES_APART
-    ]
-    columns_apart = of_columns.T @ of_columns - within_rows
-    rows_apart = of_rows.T @ of_rows - within_columns
-    return _each_once((within_rows, within_columns), (columns_apart, rows_apart), near, apart)
-
-
-def pair_variance(frames: int, good: Mask) -> F64:
-    """Variance (n,) of `pair_sums` of independent samples of unit variance."""
-    there = good.astype(float)
-    in_rows, in_columns = there.T @ there, there @ there.T
-    columns, rows = there.sum(axis=0), there.sum(axis=1)
-    # A pair of two rows of one column is counted twice.
-    of_columns = np.outer(columns, columns) - in_rows
-    of_rows = np.outer(rows, rows) - in_columns
-    of_columns[np.diag_indices(len(columns))] *= 2
-    of_rows[np.diag_indices(len(rows))] *= 2
-    _, near = neighbour_sums(np.zeros((1, *good.shape), np.float32), good, DIAGONAL)
-    apart = [max(frames - n, 0) / frames * there.sum() for n in FRAMES_APART]
-    return frames * _each_once((in_rows, in_columns), (of_columns, of_rows), near, apart)
-
-
-def taken_by_fit(place: F32, covariance: F64, of_time: F32, good: Mask) -> F64:
-    """Expected `pair_sums` of independent samples after the fit of frames and pixels.
-
-    place : (j, n) functions of place fitted to each frame, over the noise of good pixels
-    covariance : (j, j) of their coefficients in a frame: mean over the frames
-    of_time : (k, t) orthonormal functions of time fitted to each pixel
-    """
-    count, shape = of_time.shape[1], good.shape
-    size, axes = np.linalg.eigh(covariance)
-    total: F64 | float = 0.0
-    for value, axis in zip(size, axes.T, strict=True):
-        if value > 0:
-            one = np.zeros((1, *shape), np.float32)
-            one[0][good] = np.sqrt(value * count) * (axis @ place)
-            total = total - pair_sums(one, good)
-    taken = np.zeros_like(pair_variance(1, good)) + total
-    taken[-len(FRAMES_APART) :] = [
-        -float(np.einsum("kt,kt->", of_time[:, n:], of_time[:, :-n])) * np.count_nonzero(good)
-        for n in FRAMES_APART
-    ]
-    return taken
-
-
-def _each_once(
-    within: tuple[F64, F64], between: tuple[F64, F64], near: F64, apart: Sequence[float]
-) -> F64:
-    """Pairs within a line (matrices without their diagonals), between lines, near, and in time."""
-    pairs = [m[np.triu_indices(len(m), k)] for k, own in ((1, within), (0, between)) for m in own]
-    return np.concatenate([*pairs, near.sum(axis=1), apart])
