@@ -19,7 +19,8 @@ import numpy as np
 
 from pixcal.engine.run import Runtime
 from pixcal.stages import allan, fit, ingest, reduce, report
-from pixcal.storage.cube import ArrayReader, create_array
+from pixcal.storage.cube import create_array
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.lock import flushed_last
 from workload import Workload, seconds
 

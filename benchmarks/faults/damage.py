@@ -14,7 +14,7 @@ from faults import Outcome
 from faults.bench import STAGES, Bench
 from faults.forks import Command, pixcal
 from pixcal.model.errors import DamagedError
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 
 OWNERS = {"ingest": "ingest", "reduce": "reduce", "sweep": "fit", "fit": "fit"}
 """The command that makes each artefact."""

@@ -16,7 +16,7 @@ from pixcal.model.yaml_file import to_yaml
 from pixcal.stages import allan, crests, fit, ingest, reduce, simulate
 from pixcal.stages.fit.sweep import load_run
 from pixcal.stages.fitted_shape import nominal_vector as declared_vector
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.manifest import read_json
 from truth import Truth
 

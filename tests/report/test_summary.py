@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from pixcal.report.contents import Contents, MapContents, SetContents
+from pixcal.report.findings import findings
 from pixcal.report.map_summary import ArraySource, summarise, summarise_flags
 from pixcal.report.page import fill
-from pixcal.report.summary import cards, findings, headline
+from pixcal.report.summary import cards, headline
 
 WHITE = {"slope": -0.499, "slope_err": 0.004, "knee_frames": None, "frames": [1], "warnings": []}
 

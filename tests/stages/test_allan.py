@@ -17,7 +17,8 @@ from pixcal.model.errors import DamagedError, InputError, PlanError
 from pixcal.stages import allan
 from pixcal.stages.allan import Config
 from pixcal.storage.artefact import build
-from pixcal.storage.cube import ArrayReader, create_array, create_group, write_array
+from pixcal.storage.cube import create_array, create_group, write_array
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.manifest import read_json, write_json
 
 F64 = NDArray[np.float64]

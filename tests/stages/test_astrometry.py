@@ -39,7 +39,7 @@ from pixcal.stages.astrometry.stars import (
 from pixcal.stages.astrometry.summary import scientific, table, with_error
 from pixcal.stages.fitted_shape import fitted_shape
 from pixcal.storage.artefact import build
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.manifest import read_json, write_json
 from pixcal.storage.products import write_map
 

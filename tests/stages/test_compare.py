@@ -16,7 +16,8 @@ from pixcal.kernels.optics import PARAMETERS, Geometry, fringe_vector, phase, ph
 from pixcal.model.errors import DamagedError, InputError, PlanError
 from pixcal.stages import compare, fit
 from pixcal.stages.compare import Config, stage
-from pixcal.storage.cube import ArrayReader, create_array, create_group, write_array
+from pixcal.storage.cube import create_array, create_group, write_array
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.manifest import Manifest, write_json
 
 F64 = NDArray[np.float64]

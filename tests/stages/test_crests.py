@@ -14,7 +14,7 @@ from pixcal.kernels.optics import PARAMETERS
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.stages import crests, fit
 from pixcal.stages.crests import Config, stage
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.manifest import read_json, write_json
 
 pytestmark = pytest.mark.long

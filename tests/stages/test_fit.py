@@ -12,7 +12,8 @@ from pixcal.estimators.fringe_fit import fit_flags
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.flags import PixelFlag
 from pixcal.stages import fit
-from pixcal.storage.cube import ArrayReader, write_array
+from pixcal.storage.cube import write_array
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.products import read_map
 
 SETS = {"vertical": "delta_x", "horizontal": "delta_y"}

@@ -6,7 +6,8 @@ import pytest
 from pixcal.estimators.detector.pair_noise import LineNoise, flat_pair_sums, without_bands
 from pixcal.model.arrays import F64
 from pixcal.stages.reduce.flat_survey import FlatSurvey
-from pixcal.storage.cube import CHUNK, ArrayReader
+from pixcal.storage.cube import CHUNK
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.memory import MemoryArray, MemoryPath
 
 SHAPE, CHARGE = (8, 300, 256), 4000.0

@@ -14,7 +14,7 @@ from pixcal.engine.run import Runtime
 from pixcal.model.flags import PixelFlag
 from pixcal.stages import reduce
 from pixcal.stages.ingest import stage as ingest
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 
 
 @pytest.mark.parametrize("kind", ["bias", "flat"])

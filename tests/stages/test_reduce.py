@@ -22,7 +22,8 @@ from pixcal.model.errors import DamagedError, InputError, PlanError
 from pixcal.model.flags import PixelFlag
 from pixcal.stages import ingest, reduce
 from pixcal.storage import artefact
-from pixcal.storage.cube import ArrayReader, create_array, create_group
+from pixcal.storage.cube import create_array, create_group
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.manifest import digest, write_json
 
 SYNC = Runtime(cluster="sync")

@@ -20,8 +20,9 @@ from pixcal.engine import run as local_engine
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import InputError, RemoteError
 from pixcal.stages import fit, ingest, reduce
-from pixcal.storage.cube import ArrayReader, ArrayWriter
+from pixcal.storage.cube import ArrayWriter
 from pixcal.storage.cube_place import POINTER, base_of, cubes_of
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.sources import SourceFile
 from pixcal_cli.main import invoke
 

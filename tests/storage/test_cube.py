@@ -14,14 +14,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pixcal.model.errors import DamagedError
-from pixcal.storage.cube import (
-    INDEX,
-    ArrayReader,
-    CachedReader,
-    create_array,
-    create_group,
-    write_array,
-)
+from pixcal.storage.cube import INDEX, create_array, create_group, write_array
+from pixcal.storage.cube_reader import ArrayReader, CachedReader
 
 SHAPE, CHUNKS = (11, 7, 13), (4, 3, 5)
 

@@ -11,8 +11,9 @@ import pytest
 
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.storage.artefact import Build, build
-from pixcal.storage.cube import ArrayReader, create_group, write_array
+from pixcal.storage.cube import create_group, write_array
 from pixcal.storage.cube_place import POINTER, base_of, chosen_base, cubes_of
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.folder import open_folder
 from pixcal.storage.place import Place, UrlPath, parse_place
 

@@ -19,15 +19,8 @@ from numpy.typing import NDArray
 
 from pixcal.model.errors import DamagedError, InputError, RemoteError
 from pixcal.storage import folder, read_ahead
-from pixcal.storage.cube import (
-    INDEX,
-    ArrayReader,
-    CachedReader,
-    create_array,
-    create_group,
-    remove_arrays,
-    write_array,
-)
+from pixcal.storage.cube import INDEX, create_array, create_group, remove_arrays, write_array
+from pixcal.storage.cube_reader import ArrayReader, CachedReader
 from pixcal.storage.place import Place, UrlPath, parse_place
 
 SHAPE, CHUNKS = (11, 7, 13), (4, 3, 7)

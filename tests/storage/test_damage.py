@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from pixcal.model.errors import DamagedError
 from pixcal.storage import writeback
 from pixcal.storage.artefact import build, unflushed, up_to_date
-from pixcal.storage.cube import ArrayReader, create_array, create_group, write_array
+from pixcal.storage.cube import create_array, create_group, write_array
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.formats import STAGES
 from pixcal.storage.lock import damage_noted, flushed_last, lock
 from pixcal.storage.manifest import (

@@ -14,7 +14,7 @@ from PIL import ExifTags, Image, TiffImagePlugin
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import InputError
 from pixcal.stages import ingest, reduce
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 
 RUNTIME = Runtime("sync", quiet=True)
 

@@ -16,7 +16,7 @@ from pixcal.stages.reduce.black_cut_off import Black
 from pixcal.stages.reduce.ingested import Ingested, begin_mjd, starts_of
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.tiles import Part
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.header_values import DAY_S
 from pixcal.storage.manifest import read_json
 from pixcal.storage.place import Local

@@ -9,8 +9,8 @@ import numpy as np
 from pixcal.estimators.fringe_fit.tile_fit import Coding, Tile
 from pixcal.model.arrays import F64, U8, U16
 from pixcal.stages.tiles import STRIP, Index, Part, Strip, extent, grid, indices, map_chunk, strips
-from pixcal.storage.cube import ArrayReader, CachedReader
 from pixcal.storage.cube_place import cubes_of
+from pixcal.storage.cube_reader import ArrayReader, CachedReader
 from pixcal.storage.place import Local, Place
 
 

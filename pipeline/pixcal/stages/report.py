@@ -38,7 +38,7 @@ from pixcal.report.map_summary import (
 from pixcal.report.page import render
 from pixcal.stages.advice import advice, maps_to_use
 from pixcal.storage.artefact import Build
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.folder import INDEX
 from pixcal.storage.formats import STAGES
 from pixcal.storage.manifest import MANIFEST, Manifest, read_json

@@ -1,4 +1,4 @@
-"""Read frames from their FITS files, as `pixcal.storage.cube` reads those of a cube.
+"""Read frames from their FITS files, as `pixcal.storage.cube_reader` reads those of a cube.
 
 `ingest` described and read the files once. Each later read is checked against its results: sizes,
 times of change, and the checksum of every band of rows.
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.model.errors import InputError
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.frame_decoding import BAND, read_rows
 from pixcal.storage.frame_file import FrameFile, SampleFormat
 from pixcal.storage.sources import SourceFile

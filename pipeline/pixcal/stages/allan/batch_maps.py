@@ -16,7 +16,7 @@ from pixcal.kernels.quantiles import quantiles_of_parts
 from pixcal.model.arrays import F32, F64, I64
 from pixcal.model.options import Region
 from pixcal.stages.tiles import Part, Range, spans
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 
 # chunks of the fit per task, stacked vertically: one file for each length
 TILES_HIGH = 4

@@ -23,7 +23,7 @@ from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
 from pixcal.stages.fitted_shape import fitted_shape
 from pixcal.stages.tiles import Part as Tile
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.manifest import read_json
 from pixcal.storage.stage import read_acquisition, require
 

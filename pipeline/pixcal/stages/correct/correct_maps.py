@@ -38,7 +38,8 @@ from pixcal.stages.correct.uncertainty import parameter_variance, task_bytes
 from pixcal.stages.fit.sweep import BATCH_MAPS
 from pixcal.stages.tiles import Part
 from pixcal.storage import cube
-from pixcal.storage.cube import ArrayReader, ArrayWriter
+from pixcal.storage.cube import ArrayWriter
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.folder import link_files
 from pixcal.storage.manifest import read_json, write_json
 

@@ -18,7 +18,7 @@ from pixcal.model.arrays import F64
 from pixcal.stages.correct.correct_maps import mean_of
 from pixcal.stages.correct.sweep_to_correct import HALVES, Swept
 from pixcal.stages.tiles import Part
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 
 PERIOD = 4  # rows or columns after which patterns repeat (paper, section 5.1: period of four rows)
 WORSE = 4.0  # sigma above which a pattern, or a disagreement of sets, is larger than before

@@ -22,7 +22,7 @@ from pixcal.stages.evidence import fitted_theta
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.tiles import Part
 from pixcal.stages.treatment import Treatment
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.manifest import read_json
 
 HALVES = 2  # parts of the frames that are corrected separately

@@ -32,7 +32,8 @@ from pixcal.stages.fitted_shape import nominal_geometry
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.tiles import Range
 from pixcal.storage.artefact import Build
-from pixcal.storage.cube import ArrayReader, create_group, write_array
+from pixcal.storage.cube import create_group, write_array
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.formats import STAGES
 from pixcal.storage.manifest import MANIFEST, Manifest, read_json, write_json
 from pixcal.storage.stage import make, require, working

@@ -14,7 +14,7 @@ from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
 from pixcal.stages.fitted_shape import nominal_geometry
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.place import Local
 
 MAX_STEPS = 8  # Gauss-Newton steps of a shape; it is nearly linear (physics note, section 4)

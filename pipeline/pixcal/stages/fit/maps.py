@@ -21,7 +21,8 @@ from pixcal.stages.fit.fringe_set import FittedSet
 from pixcal.stages.fit.sweep import BATCH_MAPS, DIGITS, read_frames, rounded
 from pixcal.stages.tiles import STRIP, span
 from pixcal.storage import cube
-from pixcal.storage.cube import ArrayReader, ArrayWriter, CachedReader
+from pixcal.storage.cube import ArrayWriter
+from pixcal.storage.cube_reader import ArrayReader, CachedReader
 from pixcal.storage.folder import link_files
 from pixcal.storage.place import Local
 

@@ -15,7 +15,7 @@ from pixcal.stages.fit.fringe_set import describe, fit_sets
 from pixcal.stages.fit.maps import write_maps
 from pixcal.stages.fit.sweep import load_run
 from pixcal.storage.artefact import Build
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.formats import STAGES
 from pixcal.storage.header_values import date_of
 from pixcal.storage.manifest import Manifest, read_json, write_json

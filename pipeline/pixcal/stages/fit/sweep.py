@@ -40,7 +40,8 @@ from pixcal.stages.steps import run_steps
 from pixcal.stages.tiles import STRIP
 from pixcal.storage import cube
 from pixcal.storage.artefact import Build, Workspace
-from pixcal.storage.cube import ArrayReader, ArrayWriter
+from pixcal.storage.cube import ArrayWriter
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.formats import STAGES
 from pixcal.storage.manifest import Manifest, file_digest, read_json, write_json
 from pixcal.storage.place import Local

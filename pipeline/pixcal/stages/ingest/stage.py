@@ -30,8 +30,8 @@ from pixcal.stages.ingest.headers import check_headers
 from pixcal.stages.ingest.reading import files_of, read_frames, writers_of
 from pixcal.storage import frame_decoding
 from pixcal.storage.artefact import Build, discard
-from pixcal.storage.cube import ArrayReader
 from pixcal.storage.cube_place import base_of, chosen_base, cubes_of
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.formats import STAGES
 from pixcal.storage.frame_reader import describe
 from pixcal.storage.frames import Frame, columns

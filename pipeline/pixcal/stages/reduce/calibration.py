@@ -19,7 +19,8 @@ from pixcal.model.flags import PixelFlag
 from pixcal.stages import tiles
 from pixcal.stages.reduce.frame_statistics import STATISTICS, Measuring
 from pixcal.stages.tiles import STRIP, Index, Strip
-from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group
+from pixcal.storage.cube import ArrayWriter, create_array, create_group
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.place import Place
 
 _SAMPLES = 1 << 20

@@ -14,7 +14,7 @@ from pixcal.engine.plan import Plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.stages.tiles import STRIP, Index, Strip, grid, span, strips
 from pixcal.storage.artefact import Workspace
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.frame_reader import Reader
 from pixcal.storage.place import UrlPath
 

@@ -23,7 +23,8 @@ from pixcal.stages.reduce.halves import frames_of
 from pixcal.stages.reduce.ingested import Ingested, starts_of
 from pixcal.stages.tiles import Part
 from pixcal.storage.artefact import Build
-from pixcal.storage.cube import CHUNK, ArrayReader
+from pixcal.storage.cube import CHUNK
+from pixcal.storage.cube_reader import ArrayReader
 
 _NO_ERROR = 1e-9  # ADU/s: below it all samples have one code
 # relative error of the change of dark current by correcting noise that is cut off: it is not known

@@ -22,7 +22,7 @@ from pixcal.stages.reduce.calibration import Usual, usual
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.tiles import grid
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.place import Place
 
 ROUNDING_ADU = math.sqrt(SHEPPARD)  # noise of a converter that rounds to whole ADU

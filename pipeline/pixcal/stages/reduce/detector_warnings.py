@@ -16,7 +16,7 @@ from pixcal.stages.reduce.detector_summary import Summary
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduce.read_noise import Nearby
 from pixcal.stages.tiles import centred
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.place import Place
 
 _ROUGH = 10.0  # reduced chi-square above which a photon-transfer curve is not smooth

@@ -15,7 +15,8 @@ from pixcal.stages.reduce.calibration import FLAG_ATTRS
 from pixcal.stages.reduce.columns import blocks
 from pixcal.stages.tiles import STRIP, Index, Strip
 from pixcal.storage import cube
-from pixcal.storage.cube import CHUNK, ArrayReader, ArrayWriter
+from pixcal.storage.cube import CHUNK, ArrayWriter
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.frame_reader import Reader
 from pixcal.storage.place import Place
 

@@ -25,7 +25,7 @@ from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduce.read_noise import Nearby
 from pixcal.stages.tiles import Part
 from pixcal.storage.artefact import Build
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.manifest import write_json
 
 Json = dict[str, Any]

@@ -14,7 +14,7 @@ from pixcal.stages.reduce.electrons import FringeSet
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.tiles import indices, strips
 from pixcal.storage.artefact import Workspace
-from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_reader import ArrayReader
 
 _CONVERTERS = (8, 10, 12, 14)
 

@@ -18,7 +18,8 @@ from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.tiles import Part
 from pixcal.storage.artefact import Build
-from pixcal.storage.cube import CHUNK, ArrayReader
+from pixcal.storage.cube import CHUNK
+from pixcal.storage.cube_reader import ArrayReader
 
 SIDE = 1024  # longest side of the middle of the detector whose nonuniformity is measured
 _MIN_PIXELS = 16

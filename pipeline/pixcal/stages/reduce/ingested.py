@@ -16,8 +16,8 @@ from pixcal.stages.reduce import flat_survey
 from pixcal.stages.reduce.black_cut_off import Black, CutOff, cut_offs
 from pixcal.stages.reduce.exposures import Exposures, group_exposures
 from pixcal.stages.reduce.flat_survey import FlatSurvey
-from pixcal.storage.cube import ArrayReader
 from pixcal.storage.cube_place import cubes_of
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.frame_reader import ChosenFrames, FrameReader, Reader
 from pixcal.storage.frames import first_few
 from pixcal.storage.header_values import DAY_S

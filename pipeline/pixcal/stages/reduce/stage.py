@@ -41,8 +41,9 @@ from pixcal.stages.reduce.read_noise import Nearby
 from pixcal.stages.reduce.subtracted import subtracted_rate, subtracted_warnings
 from pixcal.stages.tiles import STRIP, indices, span, strips
 from pixcal.storage.artefact import Build, Workspace
-from pixcal.storage.cube import ArrayReader, create_group
+from pixcal.storage.cube import create_group
 from pixcal.storage.cube_place import base_of, chosen_base
+from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.folder import transit_bytes
 from pixcal.storage.formats import STAGES
 from pixcal.storage.manifest import Manifest, write_json
