@@ -11,7 +11,8 @@ from all_frames import frames_of
 from pixcal.effects.lag import Lag
 from pixcal.estimators.detector.flat_ladder import warming
 from pixcal.estimators.detector.frame_lag import LagNonuniformity, lag_of_flats
-from pixcal.estimators.diagnosis.evidence import Evidence, Stack, central_crop
+from pixcal.estimators.diagnosis.central_crop import central_crop
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.kernels.charge_release import without_lag
 from pixcal.kernels.normals import Key, pixel_normals
 from pixcal.kernels.scene import Rows

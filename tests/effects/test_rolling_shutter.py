@@ -14,8 +14,9 @@ from pixcal.estimators.frame_series.row_sums import profile
 from pixcal.kernels.scene import frame_states
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
-from pixcal.simulation.effect import FittedFrames, FringeMaps
+from pixcal.simulation.effect import FringeMaps
 from pixcal.simulation.exposure import Camera
+from pixcal.simulation.fringe_maps import FittedFrames
 from pixcal.simulation.recording import recordings
 
 RINGING = tuple(0.015 * np.exp(-r / 0.9) * np.cos(12 * r) for r in np.linspace(0, 1, 25))

@@ -5,13 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pixcal.estimators.diagnosis.evidence import (
-    MIN_SIZE,
-    Evidence,
-    FringeEvidence,
-    Stack,
-    central_crop,
-)
+from pixcal.estimators.diagnosis.central_crop import MIN_SIZE, central_crop
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.estimators.fringe_fit.fringes import grid
 
 RNG = np.random.default_rng(6)

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pixcal.estimators.diagnosis.evidence import NO_SAMPLE, FringeEvidence, free_frames, stripes
+from pixcal.estimators.diagnosis.evidence import FringeEvidence
+from pixcal.estimators.diagnosis.free_frames import NO_SAMPLE, free_frames, stripes
 from pixcal.estimators.frame_series.series import (
     FrameSeries,
     _follows_phase,

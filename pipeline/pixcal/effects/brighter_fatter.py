@@ -6,7 +6,8 @@ import numpy as np
 
 from pixcal.estimators.detector.neighbours import SharedCharge, shared_charge
 from pixcal.estimators.detector.response import Boundaries, boundaries_alone, boundaries_beside
-from pixcal.estimators.diagnosis.evidence import Evidence, central_crop
+from pixcal.estimators.diagnosis.central_crop import central_crop
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.boundaries import REACH, boundary_shifts, moved_charge
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import F32, F64

@@ -16,7 +16,8 @@ from pixcal.estimators.detector.frame_lag import (
 from pixcal.estimators.detector.lag_by_level import BANDS, by_level, in_bands
 from pixcal.estimators.detector.noiseless_charge import missing_noise
 from pixcal.estimators.detector.persistence import LONGEST, persistence
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, central_crop
+from pixcal.estimators.diagnosis.central_crop import central_crop
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.charge_release import fill_traps, left_behind, released_by_frame
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import sigmas_of_best

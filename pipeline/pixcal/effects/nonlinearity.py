@@ -11,8 +11,9 @@ from pixcal.estimators.detector.ladder_curve import ladder_curve
 from pixcal.estimators.detector.neighbours import shared_charge
 from pixcal.estimators.detector.response import departure, fit_curve, fit_response
 from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
+from pixcal.estimators.diagnosis.central_crop import central_crop
 from pixcal.estimators.diagnosis.distortions import Agreement
-from pixcal.estimators.diagnosis.evidence import Evidence, central_crop
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.boundaries import boundary_shifts
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
 from pixcal.model.arrays import F32, F64

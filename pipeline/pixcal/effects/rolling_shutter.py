@@ -22,7 +22,8 @@ from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
-from pixcal.simulation.effect import Again, Effect, Estimate, FittedFrames, FringeMaps, Stage
+from pixcal.simulation.effect import Again, Effect, Estimate, FringeMaps, Stage
+from pixcal.simulation.fringe_maps import FittedFrames
 from pixcal.simulation.shot import Shot
 
 FEWEST = 4  # least number of rows of a settling profile

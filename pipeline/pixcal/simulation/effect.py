@@ -21,6 +21,7 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.forward import DOMAINS, ForwardModel, Stage, numbers, with_numbers
 from pixcal.simulation.frame_changes import acts_on_frames_alone
 from pixcal.simulation.frame_fit import fit_frames
+from pixcal.simulation.fringe_maps import FringeMaps
 from pixcal.simulation.light_fit import LightFit, LightStart, fit_light
 from pixcal.simulation.score import score, score_again
 
@@ -28,40 +29,6 @@ __all__ = ["DOMAINS", "SETS_DISAGREE", "Effect", "Estimate", "FringeMaps", "Ligh
 
 SETS_DISAGREE = "fringe sets disagree: an effect of the detector acts equally on all of them"
 NONZERO = 3.0  # sigma above which a strength of an effect counts as different from zero
-
-
-@dataclass(frozen=True)
-class FittedFrames:
-    """Frames to which maps were fitted, for effects that depend on their order."""
-
-    g: F64  # (t, 3) intensity, and amplitude times cosine and sine of the phase
-    # first and number of the rows over which effects along rows extend: those of the window or, if
-    # only a part is simulated, of the part
-    rows: tuple[int, int]
-    read_noise_e: float
-    exptime_s: float
-    period_s: float
-    vectors_free: bool  # whether each frame has its own fringe vector
-
-
-@dataclass(frozen=True)
-class FringeMaps:
-    """Fitted maps of one fringe set, for effects that are linear in the intensity."""
-
-    theta: F64  # (3, y, x) iota, alpha sin psi, alpha cos psi, e-
-    k: tuple[float, float]  # fringe vector (kx, ky) at the centre, rad/px
-    origin: tuple[int, int] = (0, 0)  # first row and column of these maps in the detector's window
-    # (y, x) relative response from flats, by which samples were divided; None without flats. An
-    # effect that also acts on flats changes it
-    flat: F64 | None = None
-    name: str = ""  # of the fringe set
-    frames: FittedFrames | None = None
-
-    def phase_shifted(self, phase: F64) -> "FringeMaps":
-        """The maps with the phase shifted by (y, x) rad; no shift where that is NaN."""
-        iota, sine, cosine = self.theta
-        z = (cosine + 1j * sine) * np.exp(1j * np.nan_to_num(phase))
-        return dataclasses.replace(self, theta=np.stack([iota, z.imag, z.real]))
 
 
 @dataclass(frozen=True)

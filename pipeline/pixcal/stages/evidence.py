@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, free_frames
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.diagnosis.free_frames import free_frames
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, grid
 from pixcal.model.acquisition import FringeSet
 from pixcal.model.arrays import F64, Indices

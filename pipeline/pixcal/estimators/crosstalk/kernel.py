@@ -21,7 +21,8 @@ from pixcal.estimators.crosstalk.links import PixelClasses, Place, links
 from pixcal.estimators.crosstalk.sources import Sources, sources_of, total
 from pixcal.estimators.crosstalk.support import significant_links
 from pixcal.estimators.crosstalk.trails import SURE, trailing
-from pixcal.estimators.diagnosis.evidence import Evidence, central_crop
+from pixcal.estimators.diagnosis.central_crop import central_crop
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling, largest_outflow
 from pixcal.model.arrays import F64, Indices
 from pixcal.model.errors import InputError

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from pixcal.estimators.detector.frame_lag import MAX_DECAY, CommonLag
+from pixcal.estimators.diagnosis.central_crop import MAX_SAMPLES, central_crop
 from pixcal.estimators.diagnosis.distortions import Freedom
-from pixcal.estimators.diagnosis.evidence import MAX_SAMPLES, Evidence, FringeEvidence, central_crop
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.charge_release import fill_traps, released_by_frame
 from pixcal.kernels.frame_order import since_gap
 from pixcal.kernels.normal_matrix import inverse_normal

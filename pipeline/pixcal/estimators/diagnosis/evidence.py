@@ -8,23 +8,16 @@ from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from pixcal.estimators.diagnosis.free_frames import NO_SAMPLE, FreeFrames, free_frames
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, grid
 from pixcal.estimators.fringe_fit.tile_fit import Coding
-from pixcal.kernels.bilinear import frame_sums
-from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 T = TypeVar("T")
 P = ParamSpec("P")
-FreeFrames = tuple[F64, F64]  # parameters (t, 5) of independent frames, and covariance
 
-STRIPE = 4  # rows of a stripe of `FringeEvidence.halves`: few neighbours lie in different halves
 SATURATED = 1e-3  # share of saturated samples above which flats are unusable for levels and noise
 DITHER = 0.38  # noise over a code from which means of rounded samples are right to 2 % of a code
-NO_SAMPLE = -(1 << 30)  # electrons that mark a sample without weight
-# most samples of a set where each costs some hundred operations
-MAX_SAMPLES = 1 << 21
-MIN_SIZE = 32  # least pixels kept along each side, and least frames, if available
 
 
 @dataclass(frozen=True)
@@ -276,90 +269,3 @@ def cached_on_evidence(
         return evidence.once(name, *keys, make=lambda: make(evidence, *given, **named))
 
     return kept
-
-
-def stripes(shape: tuple[int, ...]) -> Mask:
-    """One half of a window by stripes of rows (columns if rows are few), to broadcast to (y, x)."""
-    axis = 0 if shape[0] >= 2 * STRIPE else 1
-    return np.expand_dims(stripe_half(shape[axis]), 1 - axis)
-
-
-def stripe_half(count: int) -> Mask:
-    """Every other stripe of rows or columns, in the order of Thue and Morse."""
-    # The sequence has no period that could coincide with fringes.
-    return np.asarray(np.bitwise_count(np.arange(count) // STRIPE) % 2 == 0)
-
-
-def free_frames(
-    codes: NDArray[np.generic],
-    coding: Coding,
-    start: FrameParameters,
-    theta: F64,
-    read_variance: F64,
-    shot_factor: F64,
-    good: Mask,
-) -> tuple[FreeFrames, FreeFrames, FreeFrames]:
-    """Parameters (t, 5) of every frame independently, for known pixels, and their covariance.
-
-    From all good pixels, and from each half of them by stripes of rows: the bench is common to both
-    halves; the noise of samples, and of whole rows, is not.
-
-    ``codes``: (t, y, x) samples as they are stored, or in electrons. ``start``: at the middle
-    of the part. The maps are as in `FringeEvidence`.
-    """
-    y, x = np.broadcast_arrays(*grid((good.shape[0], good.shape[1])))
-    g, dk = start.g.astype(np.float32), start.dk.astype(np.float32)
-
-    def sums(good: Mask) -> tuple[F64, F64]:
-        used, n = np.flatnonzero(good), len(g)
-        packed, right = np.zeros((n, 15)), np.zeros((n, 5))
-        samples = np.take(codes.reshape(n, -1), used, axis=1).astype(np.float32, copy=False)
-        maps = (y, x, theta, read_variance, shot_factor)
-        pixels = (np.ascontiguousarray(one[..., good], np.float32) for one in maps)
-        frame_sums(samples, *coding, g, dk, *pixels, packed, right)
-        return packed, right
-
-    def solved(packed: F64, right: F64) -> FreeFrames:
-        covariance = inverse_normal(symmetric(packed), 1e-10)
-        step = np.einsum("tij,tj->ti", covariance, right)
-        return np.hstack([g, dk]) + step, covariance
-
-    half = stripes(good.shape)
-    one, other = sums(good & half), sums(good & ~half)
-    return solved(one[0] + other[0], one[1] + other[1]), solved(*one), solved(*other)
-
-
-def central_crop(evidence: Evidence, samples: int = MAX_SAMPLES) -> Evidence:
-    """Central pixels of a window, and first frames of very long sets, for costly estimates."""
-    ny, nx = evidence.good.shape
-    longest = max((len(f.g) for f in evidence.fringes.values()), default=1)
-    shrink = min(1.0, float(np.sqrt(samples / (longest * ny * nx))))
-    # Both ends lose the same, so coordinates relative to the centre stay right.
-    cut_y, cut_x = (max(0, int((n - max(MIN_SIZE, n * shrink)) / 2)) for n in (ny, nx))
-    rows, columns = slice(cut_y, ny - cut_y), slice(cut_x, nx - cut_x)
-    frames = max(MIN_SIZE, samples // ((ny - 2 * cut_y) * (nx - 2 * cut_x)))
-    if not cut_y and not cut_x and frames >= longest:
-        return evidence
-    return replace(
-        evidence,
-        fringes={
-            name: _part(fringes, slice(0, frames), rows, columns)
-            for name, fringes in evidence.fringes.items()
-        },
-        stacks=tuple(replace(s, adu=s.adu[:, rows, columns]) for s in evidence.stacks),
-        origin=(evidence.origin[0] + cut_y, evidence.origin[1] + cut_x),
-        **{n: getattr(evidence, n)[rows, columns] for n in ("bias", "dark_rate", "flat", "good")},
-    )
-
-
-def _part(fringes: FringeEvidence, frames: slice, rows: slice, columns: slice) -> FringeEvidence:
-    of_frames = ("frame", "time_s", "g", "dk", "free", "free_covariance")
-    of_pixels = ("theta", "sigma", "delta", "good", "read_variance", "shot_factor")
-    return replace(
-        fringes,
-        origin=(fringes.origin[0] + rows.start, fringes.origin[1] + columns.start),
-        electrons=fringes.electrons[frames, rows, columns],
-        adu=fringes.adu[frames, rows, columns],
-        **{name: getattr(fringes, name)[frames] for name in of_frames},
-        **{name: getattr(fringes, name)[..., rows, columns] for name in of_pixels},
-    )

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, stripe_half
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.diagnosis.free_frames import stripe_half
 from pixcal.estimators.frame_series.series import TimedValues, wiener
 from pixcal.estimators.frame_series.variance_components import (
     Modes,

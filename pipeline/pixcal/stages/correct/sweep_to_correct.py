@@ -16,7 +16,8 @@ from pixcal.kernels.crosstalk import FILL_REACH, filled
 from pixcal.model.arrays import F32, F64, U8, U16, Mask
 from pixcal.model.errors import InputError
 from pixcal.model.flags import PixelFlag
-from pixcal.simulation.effect import Effect, FittedFrames, FringeMaps
+from pixcal.simulation.effect import Effect, FringeMaps
+from pixcal.simulation.fringe_maps import FittedFrames
 from pixcal.stages.diagnose.fitted_set import corrected_on_samples
 from pixcal.stages.evidence import fitted_theta
 from pixcal.stages.reduced_set import ReducedSet

@@ -19,7 +19,8 @@ from pixcal.estimators.maps.two_beams import contrast_surface, light_surface
 from pixcal.kernels.beams import LightMaps, with_margin
 from pixcal.kernels.crosstalk import filled
 from pixcal.model.arrays import F32, F64
-from pixcal.simulation.effect import Effect, FittedFrames, FringeMaps
+from pixcal.simulation.effect import Effect, FringeMaps
+from pixcal.simulation.fringe_maps import FittedFrames
 
 ACROSS = 9  # side (pixels) of the uniform frames on which effects are undone
 MAP_PHASES = 12  # phases, evenly spread over a fringe, at which an effect on samples is undone

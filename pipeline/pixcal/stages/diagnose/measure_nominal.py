@@ -18,7 +18,7 @@ from pixcal.kernels.robust import median_and_sigma, robust_sigma
 from pixcal.kernels.rounding import level_before_rounding
 from pixcal.kernels.scene import DetectorMaps
 from pixcal.model.arrays import F32, F64, Indices, Mask
-from pixcal.simulation.effect import FittedFrames
+from pixcal.simulation.fringe_maps import FittedFrames
 from pixcal.stages.diagnose.description import bench_of, pedestal_of, recordings_of
 from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.flats import FlatLight, MeasuredGain
