@@ -366,13 +366,13 @@ def test_saturated_samples_cost_no_more_than_themselves(make_bench, write_reduce
 
 def test_a_slow_scan_is_looked_at_all_along(make_bench, write_reduced, tmp_path, monkeypatch):
     """Little more than a turn in the whole run, and memory for one chunk of it."""
-    from pixcal.stages.fit import sweep
+    from pixcal.stages.fit import scouting
 
     bench = make_bench(shape=(30, 37), frames=960, sets={"only": (6.0, 0.0)})
     scan = bench.scan
     bench.scan = lambda name: (*scan(name)[:2], np.linspace(0, 8.2, 960), scan(name)[3])
     run = write_reduced(bench, tmp_path / "run")
-    monkeypatch.setattr(sweep, "PRIME_BYTES", 1)
+    monkeypatch.setattr(scouting, "PRIME_BYTES", 1)
     fit.run(run, fit.Config(), Runtime())
     error, sigma, _ = error_of(bench, run, "only")
     assert 0.93 < np.nanstd(error / sigma) < 1.07

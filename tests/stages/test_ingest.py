@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import InputError, PlanError
-from pixcal.stages.ingest import reading
+from pixcal.stages.ingest import headers, reading
 from pixcal.stages.ingest import stage as ingest
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage import frame_decoding, frames
@@ -238,7 +238,7 @@ def test_up_to_date_is_skipped(
     acquisition: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
-    monkeypatch.setattr(ingest, "run_tasks", None)
+    monkeypatch.setattr(headers, "run_tasks", None)
     moved = acquisition.rename(tmp_path / "moved")
     with pytest.raises(InputError, match=r"the frames of .* are gone; run 'pixcal"):
         read(tmp_path / "run")

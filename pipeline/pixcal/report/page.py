@@ -13,6 +13,7 @@ from pixcal.report import (
     diagnosis_figures,
     diagnosis_maps,
     diagnosis_words,
+    findings,
     map_figures,
     map_panels,
     set_figures,
@@ -74,7 +75,8 @@ def fill(template: str, contents: Contents, **values: Any) -> str:
         loader=PackageLoader("pixcal.report"), autoescape=True, undefined=StrictUndefined, **blocks
     )
     environment.filters["not_tested"] = text.not_tested
-    environment.filters |= vars(summary) | vars(diagnosis_words) | vars(tables)
+    for module in (summary, findings, diagnosis_words, tables):
+        environment.filters |= vars(module)
     environment.globals |= {
         "draw": _draw,
         "figures": FIGURES,
