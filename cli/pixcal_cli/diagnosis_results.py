@@ -10,7 +10,7 @@ import click
 
 from pixcal.report.text import chance, not_tested, share_by_law, times
 from pixcal.storage.manifest import read_json
-from pixcal_cli.printing import Columns, number, show_notes, show_records, show_table, with_error
+from pixcal_cli.printing import Columns, number, show_notes, show_records, show_table
 
 MAX_NAMED = 3  # most statistics in a line
 
@@ -149,8 +149,3 @@ def show_advice(run: Path) -> None:
         click.echo(sentence)
     if summary.rows:
         show_table(summary.rows[0], summary.rows[1:])
-
-
-def _figure(value: float, error: float | None) -> str:
-    """As `with_error`; a large number without error not as a power of ten."""
-    return f"{value:.0f}" if error is None and value >= 1e4 else with_error(value, error)

@@ -41,3 +41,8 @@ def show_notes(sentences: Sequence[str]) -> None:
     """Print notes, a line each."""
     for sentence in sentences:
         click.echo(f"  note: {sentence}")
+
+
+def figure(value: float, error: float | None) -> str:
+    """As `with_error`; a large number without error not as a power of ten."""
+    return f"{value:.0f}" if error is None and value >= 1e4 else with_error(value, error)

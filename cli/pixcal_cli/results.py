@@ -13,8 +13,16 @@ import click
 from pixcal.report.text import ratio
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.manifest import MANIFEST, read_json
-from pixcal_cli.diagnosis_results import _figure, show_advice, show_diagnosis
-from pixcal_cli.printing import Columns, number, show_notes, show_records, show_table, with_error
+from pixcal_cli.diagnosis_results import show_advice, show_diagnosis
+from pixcal_cli.printing import (
+    Columns,
+    figure,
+    number,
+    show_notes,
+    show_records,
+    show_table,
+    with_error,
+)
 
 
 @contextmanager
@@ -73,7 +81,7 @@ def show_reduce(run: Path) -> None:
     quantities = {"gain e-/ADU": facts["gain_e_per_adu"], "read noise e-": facts["read_noise_e"]}
     show_records("quantity", quantities, columns)
     shown = [
-        (f["title"], f"{_figure(f['value'], f['error'])} {f['unit']}".rstrip(), f["note"])
+        (f["title"], f"{figure(f['value'], f['error'])} {f['unit']}".rstrip(), f["note"])
         for key, f in facts.get("figures_of_merit", {}).items()
         # The JSON and the report have its parts as well.
         if not key.endswith(("_row", "_column", "_pixel"))

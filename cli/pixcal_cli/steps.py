@@ -8,7 +8,7 @@ import click
 
 from pixcal.model import options
 from pixcal.model.errors import InputError
-from pixcal_cli import results
+from pixcal_cli import diagnosis_results, results
 from pixcal_cli.click_options import (
     PATH,
     acquisition_argument,
@@ -17,7 +17,6 @@ from pixcal_cli.click_options import (
     out_run_option,
     run_argument,
 )
-from pixcal_cli.diagnosis_results import show_advice, show_correction, show_diagnosis
 from pixcal_cli.results import perform
 
 if TYPE_CHECKING:
@@ -77,7 +76,7 @@ def fit(run: Path, config: options.Fit, runtime: "Runtime") -> None:
         perform("fit", run / "fit", run, config, runtime)
     results.show_fit(run)
     if config.with_diagnosis:
-        show_correction(run)
+        diagnosis_results.show_correction(run)
 
 
 allan = step(options.Allan, "pixcal allan demo", "pixcal allan demo --region 0:64,0:64")
@@ -120,8 +119,8 @@ def diagnose(
     without = tuple(name[1:] for name in chosen or () if name.startswith("-"))
     config = replace(config, only=only, without=without)
     perform("diagnose", run / "diagnose", run, config, runtime)
-    show_advice(run)
-    show_diagnosis(run)
+    diagnosis_results.show_advice(run)
+    diagnosis_results.show_diagnosis(run)
 
 
 astrometry = step(

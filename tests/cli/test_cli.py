@@ -26,7 +26,7 @@ from pixcal.engine.run import Runtime
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.report import page as report_page
 from pixcal.stages import fit, reduce
-from pixcal_cli import main, results
+from pixcal_cli import diagnosis_results, main, results
 from pixcal_cli.click_options import memory_size, region
 from pixcal_cli.main import cli, explain, invoke
 
@@ -66,7 +66,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, tuple[Any, ...]]]:
             made.append((name, args))
 
         monkeypatch.setattr(f"pixcal.stages.{name}.run", note)
-        monkeypatch.setattr(results, f"show_{SHOWN.get(name, name)}", lambda run: None)
+        shown = diagnosis_results if name == "diagnose" else results
+        monkeypatch.setattr(shown, f"show_{SHOWN.get(name, name)}", lambda run: None)
     monkeypatch.setattr(results, "show_run", lambda run, fitted, diagnosed: None)
     return made
 
@@ -489,7 +490,7 @@ def test_a_diagnosis_tells_how_large_a_difference_is(
     found = {"verdict": "unexplained", "causes": [], "gap": gap, "more_would_tell": []}
     (tmp_path / "diagnose").mkdir()
     (tmp_path / "diagnose/diagnosis.json").write_text(json.dumps(found))
-    results.show_diagnosis(tmp_path)
+    diagnosis_results.show_diagnosis(tmp_path)
     *_, header, first, second = cells(capsys.readouterr().out)
     assert header[-3:] == ["difference/scatter", "significance", "σ"]
     assert first[-2:] == ["1506", "7.3"]
@@ -528,7 +529,7 @@ def test_a_diagnosis_names_frames_that_would_decide(
     (tmp_path / "diagnose").mkdir()
     file = tmp_path / "diagnose/diagnosis.json"
     file.write_text(json.dumps(found))
-    results.show_diagnosis(tmp_path)
+    diagnosis_results.show_diagnosis(tmp_path)
     verdict, still, gap, _, lag, row_noise, *frames = (
         " ".join(row) for row in cells(capsys.readouterr().out)
     )
@@ -545,7 +546,7 @@ def test_a_diagnosis_names_frames_that_would_decide(
         "recommended frames: flat frames; a fringe set along another axis",
     ]
     file.write_text(json.dumps(found | {"causes": [sure], "more_would_tell": []}))
-    results.show_diagnosis(tmp_path)
+    diagnosis_results.show_diagnosis(tmp_path)
     assert "recommended" not in capsys.readouterr().out
 
 

@@ -15,7 +15,7 @@ from pixcal.engine.run import Runtime
 from pixcal.kernels.allan import allan_deviation, averaging_lengths
 from pixcal.model.errors import DamagedError, InputError, PlanError
 from pixcal.stages import allan
-from pixcal.stages.allan import Config
+from pixcal.stages.allan import Config, stage
 from pixcal.storage.artefact import build
 from pixcal.storage.cube import create_array, create_group, write_array
 from pixcal.storage.cube_reader import ArrayReader
@@ -298,7 +298,7 @@ def test_nothing_is_done_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     run = write_fit(tmp_path, {"vertical": noise(12)})
     first = allan.run(run, Config(), SYNC)
     (run / "products" / "allan.json").unlink()
-    monkeypatch.setattr(allan, "allan_deviation", None)
+    monkeypatch.setattr(stage, "allan_deviation", None)
     assert allan.run(run, Config(), SYNC) == first
     assert (run / "products" / "allan.json").exists(), "the product is put back"
     with pytest.raises(TypeError):
@@ -322,11 +322,11 @@ def test_a_build_that_was_cut_short_is_resumed(
 
         return body
 
-    monkeypatch.setattr(allan, "allan_deviation", counted(40))
+    monkeypatch.setattr(stage, "allan_deviation", counted(40))
     with pytest.raises(KeyboardInterrupt):
         allan.run(run, Config(), SYNC)
     assert not (run / "allan").exists()
-    monkeypatch.setattr(allan, "allan_deviation", counted(10**6))
+    monkeypatch.setattr(stage, "allan_deviation", counted(10**6))
     found = measured(run)
     tiles = 8 * 11
     assert len(calls) < tiles + 16, "only the square that was cut is done again"

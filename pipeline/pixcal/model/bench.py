@@ -1,4 +1,4 @@
-"""A bench to simulate: everything ``pixcal simulate`` needs to know, schema ``pixcal/bench/1``."""
+"""Every key of a bench file, in one place: what ``pixcal simulate`` needs (``pixcal/bench/1``)."""
 
 from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import datetime, timedelta
