@@ -44,6 +44,14 @@ def test_noise_of_lines_is_that_of_no_filter(row: float, column: float) -> None:
         assert 0.75 * size**2 <= found.lines[name] < 1.25 * size**2 + 0.02 * NOISE**2
 
 
+@pytest.mark.parametrize("width", [17, 33, 50])
+def test_levels_of_outputs_are_no_filter(width: int) -> None:
+    """Outputs whose levels change from frame to frame, as in infrared arrays."""
+    rng = np.random.default_rng(width)
+    levels = rng.normal(0, NOISE, (16, 1, SHAPE[1] // width + 1))
+    assert not seen(frames() + np.repeat(levels, width, axis=2)[..., : SHAPE[1]]).filtered
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_filters_make_no_noise_of_lines(seed: int) -> None:
     white = frames(seed=seed)

@@ -210,6 +210,9 @@ def test_exposure_and_temperature(tmp_path: Path) -> None:
     assert with_header(path, EXPTIME=0.5, EXPOSURE=7.0).exptime_s == 0.5
     assert with_header(path, EXPOSURE=7.0).exptime_s == 7.0
     assert with_header(path, EXPTIME=-1.0).exptime_s is None
+    for comment, unit in (("[s]", 1.0), ("[ms]", 1e-3), ("exposure, microseconds", 1e-6)):
+        assert with_header(path, EXPTIME=(20.0, comment)).exptime_s == 20 * unit
+    assert with_header(path, EXPTIME=(20.0, "seconds, to 1 ms")).exptime_s == 20
     for key in ("CCD_TEMP", "DET_TEMP", "TEMPERAT", "CCDTEMP", "TEMP"):
         assert with_header(path, **{key: -10.5}).temperature_c == -10.5
     kelvin = with_header(path, TEMP=(263.15, "[K] detector")).temperature_c

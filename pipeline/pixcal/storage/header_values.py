@@ -5,6 +5,7 @@ needed to read the data (`integer`) are an error.
 """
 
 import math
+import re
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
@@ -18,6 +19,8 @@ DAY_S = 86400.0
 
 
 _CARD = 80  # characters
+_SMALL = {"m": 1e-3, "milli": 1e-3, "u": 1e-6, "micro": 1e-6}  # of a second
+_UNIT = re.compile(r"\b(m|milli|u|micro)?s(?:ecs?|econds?)?\b")
 
 
 class Header:
@@ -96,8 +99,13 @@ def _numbers(headers: tuple[Header, ...], *keys: str) -> Iterator[tuple[float, s
 
 
 def exposure_s(headers: tuple[Header, ...]) -> float | None:
-    """Exposure time (s) from EXPTIME, else EXPOSURE."""
-    return next((time for time, _ in _numbers(headers, "EXPTIME", "EXPOSURE") if time >= 0), None)
+    """Exposure time (s) from EXPTIME, else EXPOSURE, converted if the comment has another unit."""
+    for time, comment in _numbers(headers, "EXPTIME", "EXPOSURE"):
+        if time >= 0:
+            # The first unit counts: "seconds, to 1 ms" are seconds.
+            unit = _UNIT.search(comment)
+            return time * (_SMALL[unit[1]] if unit and unit[1] else 1.0)
+    return None
 
 
 def temperature_c(headers: tuple[Header, ...]) -> float | None:

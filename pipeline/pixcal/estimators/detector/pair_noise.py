@@ -23,7 +23,8 @@ _OUT = 5.0  # standard deviations of outlying samples
 _PAIR_LAMP_CHANGE = 0.05
 _NEARLY = 5.0  # standard deviations below saturation from which a pixel's noise is clipped
 _ROUNDS = 12  # each leaves less than a third of the part that block means removed
-_FAR = BLOCK // 2  # pixels over which no filter of a camera reaches
+# Pixels from one to the next along a line. No filter of a camera reaches the last.
+_ALONG = (1, BLOCK // 4, BLOCK // 2 - 1)
 _NO_BLOCKS = np.zeros((0, COLUMNS))
 
 
@@ -91,15 +92,15 @@ def _clipped(difference: F32, quantum: float) -> F64:
 
 
 def along_lines(difference: F32, quantum: float) -> F64:
-    """Covariances (2 lines, 2 lags) of pixels along a row, and along a column, next and far (ADU²).
+    """Covariances (2 lines, 3 lags) of pixels along a row, and along a column (ADU²).
 
-    Noise of a whole line is the same at both lags; that of a filter is absent at the far one.
+    Noise of a whole line is the same at all lags, and that of outputs many columns wide falls
+    evenly: the lags are next, far, and midway. Noise of a filter is at the first only.
     ``difference``: as in `shared_by_blocks`.
     """
     blocks = _clipped(difference, quantum)
     turned = blocks, blocks.swapaxes(1, 2)
-    lags = (1, _FAR)
-    products = [[(b[:, :, :-lag] * b[:, :, lag:]).mean() for lag in lags] for b in turned]
+    products = [[(b[:, :, :-lag] * b[:, :, lag:]).mean() for lag in _ALONG] for b in turned]
     return np.array(products) / 2
 
 

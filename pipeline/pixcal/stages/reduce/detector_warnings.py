@@ -47,10 +47,10 @@ def detector_warnings(
     if nearby is not None and filtered:
         along = " and ".join(f"{size:.2g} along {line}s" for line, size in nearby.near.items())
         warnings.append(
-            "the noise of neighbouring pixels is correlated in frames without light ( "
-            f"{along}): the samples "
-            "were filtered, smoothed or resampled before they were written; gain and noise are "
-            "those of the filtered samples, and photon transfer is invalid; record raw frames"
+            "the noise of neighbouring pixels is correlated in frames without light ("
+            f"{along}): the samples were filtered, smoothed or resampled before they were "
+            "written; gain and noise are those of the filtered samples, and photon transfer is "
+            "invalid; record raw frames"
         )
     # Without a level that saturates, only hot pixels do.
     if saturation is not None and not summary.usable.all():

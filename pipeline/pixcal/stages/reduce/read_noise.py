@@ -46,7 +46,9 @@ def lost_in_blocks(job: Measuring) -> Measure:
 class Nearby:
     """Noise that neighbours share in frames without light."""
 
-    near: dict[str, float]  # by line: correlation of next neighbours beyond that of far ones
+    near: dict[
+        str, float
+    ]  # by line: correlation of next neighbours beyond a line through far ones
     lines: dict[str, float]  # most variance (ADU²) that all pixels of the line share
 
     @classmethod
@@ -55,10 +57,10 @@ class Nearby:
         shared = np.array([along_lines(pair, job.quantum) for pair in _pairs(job)])
         if len(shared) < 2 or not variance > 0:
             return None
-        near, far = np.moveaxis(shared.mean(axis=0), 1, 0)
-        error = shared[:, :, 1].std(axis=0, ddof=1) / math.sqrt(len(shared))
+        near, midway, far = np.moveaxis(shared.mean(axis=0), 1, 0)
+        error = shared[:, :, 2].std(axis=0, ddof=1) / math.sqrt(len(shared))
         return cls(
-            dict(zip(LINES, ((near - far) / variance).tolist(), strict=True)),
+            dict(zip(LINES, ((near - 2 * midway + far) / variance).tolist(), strict=True)),
             dict(zip(LINES, (far + _LINE_ERRORS * error).tolist(), strict=True)),
         )
 
