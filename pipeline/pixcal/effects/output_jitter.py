@@ -7,7 +7,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.offset import unlit_stacks
+from pixcal.estimators.frame_series.offset import FEWEST, unlit_stacks
 from pixcal.estimators.frame_series.variance_components import walk_modes
 from pixcal.kernels.processes import HOUR_S, brownian
 from pixcal.kernels.robust import robust_sigma
@@ -21,7 +21,6 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 _WALK = 1000  # first key of the walk's random numbers
-MIN_FRAMES = 8
 MAX_EDGES = 15  # along each axis
 NARROWEST = 8  # least rows or columns of an output; even, so that alternate lines cancel
 # numbers of lines on either side whose means are compared: small steps need many lines
@@ -97,7 +96,7 @@ class OutputJitter(Effect):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """From edges where means of lines differ anew in each frame, and levels between them."""
-        stacks = [s for s in unlit_stacks(evidence, "bias", "dark") if len(s.adu) >= MIN_FRAMES]
+        stacks = [s for s in unlit_stacks(evidence, "bias", "dark") if len(s.adu) >= FEWEST]
         gain = np.float32(evidence.gain)
         rests = [(s.adu - s.adu.mean(axis=0)) * gain for s in stacks]
         outputs = find_outputs(rests, [s.time_s for s in stacks], evidence.good)
@@ -136,7 +135,7 @@ def find_outputs(stacks: Sequence[F32], times: Sequence[F64], good: Mask) -> Out
 
     None with too few frames. If no edge is significant, the most significant one is given.
     """
-    chosen = [n for n, rest in enumerate(stacks) if len(rest) >= MIN_FRAMES]
+    chosen = [n for n, rest in enumerate(stacks) if len(rest) >= FEWEST]
     rests = [_calm(stacks[n], good) for n in chosen]
     if not rests:
         return None
