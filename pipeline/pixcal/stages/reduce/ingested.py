@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pixcal.model.acquisition import Detector
 from pixcal.model.arrays import Mask
@@ -155,15 +156,18 @@ class Ingested:
             )
         exposures.warnings += [
             f"flat frames {reason[0]} are left out ({mask.sum()} of {len(mask)}): "
-            f"{first_few(self._names_of_flats(mask))}; {reason[1]}"
+            f"{first_few(self._files('flat', np.array(self._whole['flat'])[mask]))}; {reason[1]}"
             for reason, mask in self._left_out.items()
             if mask.any()
         ]
         return exposures
 
-    def _names_of_flats(self, mask: Mask) -> list[str]:
-        table = self._catalogue["flat"]
-        numbers = np.array(self._whole["flat"])[mask]
+    def names(self, array: str, numbers: Sequence[int]) -> list[str]:
+        """Files, and planes of cubes, of used frames of an array."""
+        return self._files(array, np.array(self._used[array])[numbers])
+
+    def _files(self, array: str, numbers: NDArray[Any]) -> list[str]:
+        table = self._catalogue[array]
         return [table["file"][n] + f" [{table['plane'][n]}]" * any(table["plane"]) for n in numbers]
 
     @cached_property

@@ -46,9 +46,7 @@ def lost_in_blocks(job: Measuring) -> Measure:
 class Nearby:
     """Noise that neighbours share in frames without light."""
 
-    near: dict[
-        str, float
-    ]  # by line: correlation of next neighbours beyond a line through far ones
+    near: dict[str, float]  # by line: correlation of next neighbours beyond a line through far ones
     lines: dict[str, float]  # most variance (ADU²) that all pixels of the line share
 
     @classmethod

@@ -23,6 +23,7 @@ from pixcal.model.options import Reduce
 from pixcal.stages.reduce.black_cut_off import cut_off_warnings
 from pixcal.stages.reduce.calibration import FLAT_FLOOR, Finishing, calibration_writers, finish
 from pixcal.stages.reduce.columns import run_noted, strip_width
+from pixcal.stages.reduce.dark_levels import level_warnings
 from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
 from pixcal.stages.reduce.detector_warnings import detector_warnings, lamp_warnings, trail_warnings
 from pixcal.stages.reduce.electrons import convert_bytes
@@ -244,6 +245,7 @@ def _report(
     if source.survey is not None and source.exposures.known:
         light = source.survey.levels
         warnings += lamp_warnings([(g.exptime, light[list(g.frames)]) for g in job.flat])
+    warnings += level_warnings(source, reduction.gain, summary.read_noise_e(reduction.gain))
     warnings += trail_warnings(made.folder / "calibration.zarr", source, reduction.gain)
     warnings += _dark_lines(ArrayReader(made.folder / "calibration.zarr" / "mask"), source.shape)
     for name, facts in sets.items():
