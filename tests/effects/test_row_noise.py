@@ -74,8 +74,9 @@ def test_sizes_are_found(
     assert found is not None
     assert found.significance > 5
     # Groups of rows are only there where they are needed.
-    assert getattr(found.effect, NAMES[-1]) == 0
-    for name, value, error in zip(NAMES[:-1], given, errors, strict=True):
+    assert isinstance(found.effect, RowNoise)
+    assert found.effect.group_rms == 0
+    for name, value, error in zip(NAMES[:5], given, errors, strict=True):
         assert found.errors[name] < error, name
         # Of variances the errors are alike on both sides; of their roots the longer side is given.
         size, longer = getattr(found.effect, name), found.errors[name]
@@ -94,6 +95,18 @@ def test_other_noise_is_not_taken_for_it(
     found = RowNoise.estimate(in_the_dark(acquired(), make_effect_bench(), other))
     assert found is not None
     assert found.significance < 4
+
+
+@pytest.mark.parametrize("odd", [0.0, 2.0])
+def test_levels_of_even_and_odd_columns_are_found(
+    acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench], odd: float
+) -> None:
+    effect = RowNoise(1.6, 0.0, 0.0, 0.8, odd_column_rms=odd)
+    found = RowNoise.estimate(in_the_dark(acquired(), make_effect_bench(), effect))
+    assert found is not None
+    assert isinstance(found.effect, RowNoise)
+    for name, value in (("column_rms", 0.8), ("odd_column_rms", odd)):
+        assert abs(getattr(found.effect, name) - value) < 4 * found.errors[name] < 1.2, name
 
 
 def test_crosstalk_is_not_taken_for_it(acquired: Callable[..., Evidence]) -> None:

@@ -44,7 +44,8 @@ class RowNoise(Effect):
     order = 2
     domains = ("noise", "time")
     strengths = tuple(
-        f"{kind}_rms" for kind in ("row", "flicker", "interlace", "column", "alternate", "group")
+        f"{kind}_rms"
+        for kind in ("row", "flicker", "interlace", "column", "alternate", "group", "odd_column")
     )
     left_because = "noise that is independent in each frame averages out"
     frames_needed = ("dark",)
@@ -70,6 +71,7 @@ class RowNoise(Effect):
     group_rows: int = quantity(
         2, low=2, high=64, doc="rows read together, counted from the first of the window"
     )
+    odd_column_rms: float = _rms(0.0, doc="as `interlace_rms`, of even and odd columns")
 
     def read_variance(self, detector: SimulatedDetector) -> float:
         white = [getattr(self, n) for n in self.strengths if n != "flicker_rms"]
@@ -101,6 +103,8 @@ class RowNoise(Effect):
         if self.group_rms:
             groups = rng.standard_normal(-(-ny // self.group_rows))
             rows += self.group_rms * np.repeat(groups, self.group_rows)[:ny]
+        if self.odd_column_rms:
+            columns += self.odd_column_rms * rng.standard_normal() * (1 - 2 * (np.arange(nx) % 2))
         return rows, columns
 
     @classmethod
@@ -113,10 +117,10 @@ class RowNoise(Effect):
         ]
         fringes = [] if dark else list(evidence.fringes.values())
         rows = [line_spectrum(*frames) for frames in dark]
-        columns = [line_spectrum(_turned(r), good.T, n) for r, good, n in dark]
+        columns = [line_spectrum(r.swapaxes(1, 2), good.T, n) for r, good, n in dark]
         rows += [_of_fringes(f, across=False) for f in fringes]
         columns += [_of_fringes(f, across=True) for f in fringes]
-        size, error, sigmas = np.zeros(6), np.full(6, np.nan), []
+        size, error, sigmas = np.zeros(7), np.full(7, np.nan), []
         grouped: dict[str, Any] = {}
         if of_rows := [s for s in rows if s is not None]:
             noise, together = _fit_rows(of_rows)
@@ -125,8 +129,8 @@ class RowNoise(Effect):
             size[part], error[part] = noise.roots
             sigmas += [float(z) for z in noise.sigmas]
         if of_columns := [s for s in columns if s is not None]:
-            noise = fit_lines(of_columns, [np.ones((1, len(s.power))) for s in of_columns])
-            size[3:4], error[3:4] = noise.roots
+            noise = fit_lines(of_columns, [_row_shapes(s)[::2] for s in of_columns])
+            size[[3, 6]], error[[3, 6]] = noise.roots
             sigmas += [float(z) for z in noise.sigmas]
         if not sigmas:
             return None
@@ -137,10 +141,6 @@ class RowNoise(Effect):
             f"covariance of distant pixels of a row or column in "
             f"{'frames without light' if dark else 'the residuals of the fringes'}",
         )
-
-
-def _turned(residual: F32) -> F32:
-    return residual.transpose(0, 2, 1)
 
 
 def _row_shapes(spectrum: "LineSpectrum") -> F64:
@@ -178,7 +178,7 @@ def _of_fringes(fringes: FringeEvidence, across: bool) -> "LineSpectrum | None":
     if abs(turns) < TURNS:
         return None
     if across:
-        spectrum = line_spectrum(_turned(fringes.residual), fringes.good.T, FREEDOM)
+        spectrum = line_spectrum(fringes.residual.swapaxes(1, 2), fringes.good.T, FREEDOM)
     else:
         spectrum = line_spectrum(fringes.residual, fringes.good, FREEDOM)
     if spectrum is None:
