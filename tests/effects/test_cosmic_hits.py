@@ -166,15 +166,18 @@ def test_tracks_of_another_law_are_described(acquired: Callable[..., Evidence]) 
         assert own * per_frame == pytest.approx(true * 1.5, rel=0.25)
 
 
-def test_one_hit_is_no_claim_and_two_are(acquired: Callable[..., Evidence]) -> None:
+@pytest.mark.parametrize("count", [3, 12])
+def test_one_hit_is_no_claim_and_two_are(acquired: Callable[..., Evidence], count: int) -> None:
     evidence = acquired()
     (dark,) = evidence.of_kind("dark")
+    few = slice(count)
+    dark = replace(dark, adu=dark.adu[few], frame=dark.frame[few], time_s=dark.time_s[few])
     rates = []
     for hits in (1, 2):
         adu = dark.adu.copy()
         y, x = np.argwhere(evidence.good)[[500, 2500][:hits]].T
-        adu[np.arange(hits) + 4, y, x] += 800
-        stacks = tuple(s for s in evidence.stacks if s is not dark)
+        adu[np.arange(hits) + count - 2, y, x] += 800
+        stacks = tuple(s for s in evidence.stacks if s.kind != "dark")
         found = CosmicHits.estimate(replace(evidence, stacks=(*stacks, replace(dark, adu=adu))))
         assert found is not None
         assert isinstance(found.effect, CosmicHits)
