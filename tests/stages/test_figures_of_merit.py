@@ -320,7 +320,7 @@ def test_a_gain_that_is_not_declared_is_that_of_the_flats(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     ("kinds", "why"),
-    [(("bias", "dark"), "without flat frames"), (("flat",), "neither bias nor dark frames")],
+    [(("bias", "dark"), "without flat frames"), (("flat",), "without bias or dark frames")],
 )
 def test_a_gain_that_nothing_tells_is_asked_for(
     kinds: tuple[str, ...], why: str, tmp_path: Path

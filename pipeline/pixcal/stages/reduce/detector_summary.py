@@ -67,8 +67,11 @@ class Summary:
         top = self.gain.levels[1] if self.gain and self.gain.step else np.inf
         return np.asarray(self.levels > top)
 
-    def gain_to_use(self, choice: str) -> float:
-        """Gain (e-/ADU), ``declared`` or ``measured``; InputError if there is no measured one."""
+    def gain_to_use(self, choice: str, dark: bool) -> float:
+        """Gain (e-/ADU), ``declared`` or ``measured``; InputError if there is no measured one.
+
+        ``dark``: whether there are frames without light.
+        """
         declared = self.declared.gain_e_per_adu
         if choice == "declared" and declared is not None:
             return declared
@@ -76,10 +79,11 @@ class Summary:
             asked, remedy = "gain: 'measured'", "use gain: declared"
             if declared is None:
                 asked, remedy = "detector.gain_e_per_adu: missing", "give it in e-/ADU"
-            raise InputError(
-                f"{asked}, but the flats show no photon noise above the read noise, or there are "
-                f"neither bias nor dark frames; {remedy}"
-            )
+            why = "the flats show no photon noise above the read noise"
+            if not dark:
+                why = "without bias or dark frames the flats cannot measure it"
+                remedy = f"list bias frames, or {remedy}"
+            raise InputError(f"{asked}, but {why}; {remedy}")
         return self.gain.of_electrons[0]
 
     def read_noise_e(self, gain: float) -> float:

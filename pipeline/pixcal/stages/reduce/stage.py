@@ -150,7 +150,7 @@ def reduce_frames(made: Workspace, source: Ingested, config: Config, runtime: Ru
         writer.finish()
     summary = summarise(job, made.scratch / "statistics", source)
     summary = with_excess_noise(summary, source, job)
-    gain = summary.gain_to_use(config.gain)
+    gain = summary.gain_to_use(config.gain, bool(exposures.dark))
     bounds = _calibrate(made, source, summary, job, gain, runtime)
     sets = {}
     for name in exposures.fringes:
