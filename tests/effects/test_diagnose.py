@@ -417,6 +417,12 @@ def test_halves_share_no_frame_but_first_flats_without_fringes() -> None:
     assert set(parts.learn["flat"]) & set(parts.test["flat"]) == {0, 5, 6, 7, 8}
 
 
+def test_of_five_darks_three_are_fitted() -> None:
+    """A median of three frames rejects a cosmic ray; a mean of two does not."""
+    parts = split({"dark": {"exptime_s": [60.0] * 5}}, 128 * 128)
+    assert [len(half["dark"]) for half in (parts.learn, parts.test)] == [3, 2]
+
+
 @pytest.mark.parametrize("count", [32, 200, 600, 732, 9000])
 def test_both_halves_see_the_whole_of_time(count: int) -> None:
     table: dict[str, list[Any]] = {"exptime_s": [0.1] * count, "time_s": list(range(count))}

@@ -168,7 +168,8 @@ def _halves(frames: Indices, most: int) -> tuple[Indices, Indices]:
     if len(frames) < FEWEST:
         return frames, frames
     count = next(blocks for blocks, fewest in BLOCKS if len(frames) >= fewest)
-    edges = [n * len(frames) // count for n in range(count + 1)]
+    # Of an odd number, the half that effects are fitted to has one more: medians need three.
+    edges = [-(-n * len(frames) // count) for n in range(count + 1)]
     halves: tuple[list[Indices], list[Indices]] = ([], [])
     for n, (first, last) in enumerate(itertools.pairwise(edges)):
         size = min(last - first, 2 * most // count)
