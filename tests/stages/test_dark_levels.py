@@ -15,8 +15,9 @@ from pixcal.stages.reduce.exposures import Group
 NOISE, GAIN = 5.0, 2.0  # ADU, e-/ADU
 
 
-def warned(**levels: Any) -> list[str]:
-    """Warnings on frames of given levels, ADU."""
+def warned(times: F64 | None = None, **levels: Any) -> list[str]:
+    """Warnings on frames of given levels, ADU; ``times``: of the darks, s."""
+    times = np.full(len(levels["dark"]), 60.0) if times is None else times
     rng = np.random.default_rng(4)
     frames = {
         k: np.rint(rng.normal(300, NOISE, (len(v), 40, 60)) + frames_of(v))
@@ -26,7 +27,10 @@ def warned(**levels: Any) -> list[str]:
     source: Any = SimpleNamespace(
         arrays={name: Frames(samples) for name, samples in frames.items()},
         exposures=SimpleNamespace(
-            dark=[Group(name, 0.0, tuple(range(len(own)))) for name, own in frames.items()]
+            dark=[
+                Group("bias", 0.0, tuple(range(len(levels["bias"])))),
+                *(Group("dark", t, tuple(np.flatnonzero(times == t))) for t in np.unique(times)),
+            ]
         ),
         quantum=1.0,
         names=lambda array, numbers: [f"{array}{n}" for n in numbers],
@@ -52,3 +56,13 @@ def test_a_jump_and_a_step_are_named_with_their_size(off: list[int], named: str)
     assert named + " differs" in sentence
     size = float(sentence.split("by ")[1].split()[0])
     assert size == pytest.approx(-12 * GAIN, abs=1.0)
+
+
+@pytest.mark.parametrize("off", [0.0, 15.0])
+def test_bias_frames_that_are_not_those_of_the_darks_are_named(off: float) -> None:
+    times = np.repeat([30.0, 60.0], 5)
+    sentences = warned(times, bias=np.zeros(12), dark=off + 0.3 * times)
+    assert len(sentences) == (off > 0)
+    for sentence in sentences:
+        size = float(sentence.split("level ")[1].split()[0])
+        assert size == pytest.approx(off * GAIN, abs=1.5)

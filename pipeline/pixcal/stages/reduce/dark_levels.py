@@ -1,4 +1,4 @@
-"""Frames without light whose level is not that of the other frames of their exposure time."""
+"""Frames without light whose level is not that of the others."""
 
 import math
 
@@ -14,6 +14,7 @@ from pixcal.storage.frames import first_few
 _FEWEST = 3  # frames of one exposure time, whose median level is that of most of them
 _HOT = 5.0  # standard deviations from the median beyond which a pixel is hot
 _WILD = 6.0  # standard deviations of the usual scatter of levels
+_NOTABLE = 0.1  # of the dark signal of the shortest darks
 
 
 def level_warnings(source: Ingested, gain: float, noise: float) -> list[str]:
@@ -24,9 +25,10 @@ def level_warnings(source: Ingested, gain: float, noise: float) -> list[str]:
     series = [group for group in source.exposures.dark if len(group.frames) >= _FEWEST]
     if not series:
         return []
-    rests = [gain * _departures(source, group) for group in series]
+    levels = [gain * _levels(source, group) for group in series]
+    rests = [level - np.median(level) for level in levels]
     usual = robust_sigma(np.concatenate(rests))
-    sentences = []
+    sentences = _of_bias(series, levels, usual, noise)
     for group, rest in zip(series, rests, strict=True):
         wild = np.abs(rest) > max(_WILD * usual, noise / math.sqrt(len(rest)))
         if not wild.any():
@@ -41,12 +43,32 @@ def level_warnings(source: Ingested, gain: float, noise: float) -> list[str]:
     return sentences
 
 
-def _departures(source: Ingested, group: Group) -> F64:
-    """Level of each frame in the middle rows, without hot pixels, less their median, ADU."""
+def _of_bias(series: list[Group], levels: list[F64], usual: float, noise: float) -> list[str]:
+    """A sentence if darks of two exposure times or more do not extrapolate to the bias frames."""
+    middles = {g.array: float(np.median(e)) for g, e in zip(series, levels, strict=True)}
+    dark = [n for n, group in enumerate(series) if group.array == "dark"]
+    if len(dark) < 2 or "bias" not in middles:
+        return []
+    times, counts = np.array([[series[n].exptime, len(levels[n])] for n in dark]).T
+    of_darks = np.array([np.median(levels[n]) for n in dark]) - middles["bias"]
+    at_zero = np.linalg.pinv(np.stack([np.ones(len(times)), times], axis=1))[0]
+    off, error = float(at_zero @ of_darks), usual * math.sqrt(float(at_zero**2 @ (1 / counts)))
+    least = _NOTABLE * float(of_darks[times.argmin()])
+    if abs(off) < max(_WILD * error, noise / math.sqrt(counts.min()), least):
+        return []
+    return [
+        f"the darks extrapolate to a level {off:+.3g} e- from that of the bias frames: these have "
+        "another offset or gain setting, or were taken at another time or temperature; the bias of "
+        "flats and fringes may be wrong by as much: record all frames with the same settings"
+    ]
+
+
+def _levels(source: Ingested, group: Group) -> F64:
+    """Level of each frame in the middle rows, without hot pixels, ADU."""
     levels = []
     for n in group.frames:
         samples = middle_rows(source.arrays[group.array], n, n + 1).ravel().astype(float)
         middle, sigma = median_and_sigma(samples[np.isfinite(samples)])
         near = np.abs(samples - middle) <= _HOT * max(sigma, source.quantum or 1.0)
         levels.append(samples[near].mean())
-    return np.asarray(levels - np.median(levels))
+    return np.array(levels)
