@@ -38,6 +38,10 @@ def warned(times: F64 | None = None, **levels: Any) -> list[str]:
     return level_warnings(source, GAIN, GAIN * NOISE)
 
 
+def number_in(sentence: str, after: str) -> float:
+    return float(sentence.split(after)[1].split()[0].replace("−", "-"))
+
+
 def frames_of(levels: NDArray[Any]) -> F64:
     return np.asarray(levels, float)[:, None, None]
 
@@ -54,7 +58,7 @@ def test_a_jump_and_a_step_are_named_with_their_size(off: list[int], named: str)
     levels[off] = -12
     (sentence,) = warned(bias=np.zeros(12), dark=levels)
     assert named + " differs" in sentence
-    size = float(sentence.split("by ")[1].split()[0])
+    size = number_in(sentence, "by ")
     assert size == pytest.approx(-12 * GAIN, abs=1.0)
 
 
@@ -64,5 +68,5 @@ def test_bias_frames_that_are_not_those_of_the_darks_are_named(off: float) -> No
     sentences = warned(times, bias=np.zeros(12), dark=off + 0.3 * times)
     assert len(sentences) == (off > 0)
     for sentence in sentences:
-        size = float(sentence.split("level ")[1].split()[0])
+        size = number_in(sentence, "level ")
         assert size == pytest.approx(off * GAIN, abs=1.5)

@@ -6,6 +6,7 @@ import numpy as np
 
 from pixcal.kernels.robust import median_and_sigma, robust_sigma
 from pixcal.model.arrays import F64
+from pixcal.report.text import number
 from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.flat_survey import middle_rows
 from pixcal.stages.reduce.ingested import Ingested
@@ -34,9 +35,10 @@ def level_warnings(source: Ingested, gain: float, noise: float) -> list[str]:
         if not wild.any():
             continue
         names = source.names(group.array, np.array(group.frames)[wild].tolist())
-        sizes = dict.fromkeys(f"{size:+.3g}" for size in (rest[wild].min(), rest[wild].max()))
+        sizes = dict.fromkeys(number(float(size)) for size in (rest[wild].min(), rest[wild].max()))
+        of = f" of {group.exptime:g} s" if group.array == "dark" else ""
         sentences.append(
-            f"{group.array} frames of {group.exptime:g} s: the level of {first_few(names)} differs "
+            f"{group.array} frames{of}: the level of {first_few(names)} differs "
             f"from that of the others by {' to '.join(sizes)} e- (a change of temperature,"
             " bias or light); the averages include it: record them again, or remove them"
         )
@@ -57,9 +59,10 @@ def _of_bias(series: list[Group], levels: list[F64], usual: float, noise: float)
     if abs(off) < max(_WILD * error, noise / math.sqrt(counts.min()), least):
         return []
     return [
-        f"the darks extrapolate to a level {off:+.3g} e- from that of the bias frames: these have "
-        "another offset or gain setting, or were taken at another time or temperature; the bias of "
-        "flats and fringes may be wrong by as much: record all frames with the same settings"
+        f"the darks extrapolate to a level {number(off)} e- from that of the bias frames: these "
+        "have another offset or gain setting, or were taken at another time or temperature; the "
+        "bias of flats and fringes may be wrong by as much: record all frames with the same "
+        "settings"
     ]
 
 
