@@ -80,10 +80,15 @@ class ChargeTransfer(Effect):
 
     def _trailed(self, signal: F32, loss: float, release: float, at: Indices, output: int) -> F32:
         """Signal (line, pixel) after transfer from line to line; ``at``: numbers of the lines."""
-        if not loss:
+        if not loss or not len(at):
             return signal
         if at[0] < output:
-            return self._trailed(signal[::-1], loss, release, -at[::-1], -output)[::-1]
+            # Lines up to the output are read in the other direction.
+            cut = int(np.searchsorted(at, output, "right"))
+            before, after = signal[:cut][::-1], signal[cut:]
+            before = self._trailed(before, loss, release, -at[:cut][::-1], -output)
+            after = self._trailed(after, loss, release, at[cut:], output)
+            return np.concatenate([before[::-1], after])
         charge = np.maximum(signal, np.float32(1e-6))
         left = np.minimum(loss * (at[:, None] - output + 1), _MOST) * self.level_e
         left = np.minimum(left * (charge / self.level_e) ** self.power, _MOST * charge)

@@ -10,21 +10,23 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels, hot_pixels
 from pixcal.estimators.crosstalk.links import REACH
 from pixcal.estimators.diagnosis.evidence import Evidence, cached_on_evidence
+from pixcal.kernels.normal_matrix import inverse_normal
+from pixcal.kernels.robust import median_and_sigma
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best
-from pixcal.model.arrays import F64, Indices
+from pixcal.model.arrays import F64
 
 LEAST = 10  # least number of hot pixels
 SURE = 5.0  # significance beyond which trails are no crosstalk
 
 LINKS = (*((n, 0) for n in range(1, REACH + 1)), *((0, n) for n in range(1, REACH + 1)))
-_CLEAR = 5.0  # errors of a trail from which its dependence on the charge is fitted
 _ALIKE = 1 - 1e-9  # largest correlation of ranks
-_TURNS = 2  # of the fits of the power and of the place of the output
-_FAR = 1 << 14  # most pixels from the first hot pixel to the output
+_FAR = 1 << 14  # most pixels from the window to the output
+_HIGHEST = 1.5  # power of the charge
 _LEAST_RATIO, _MOST_RATIO = 0.05, 0.95  # of the trail from one pixel to the next
 
 
@@ -63,75 +65,49 @@ def trailing(evidence: Evidence) -> float:
 
 def _along(hot: HotPixels, size: int, start: int, axis: int) -> Trail | None:
     links = slice(axis * REACH, (axis + 1) * REACH)
-    value, sigma = hot.value[:, links], hot.sigma[:, links]
-    whole = np.isfinite(sigma).all(axis=(1, 2))
-    value, sigma, charge = value[whole], sigma[whole, 0, 0], hot.charge[whole] * 1e3
+    whole = np.isfinite(hot.sigma[:, links]).all(axis=(1, 2))
+    value, charge = hot.value[whole, links], hot.charge[whole] * 1e3
     if len(value) < LEAST:
         return None
     at = (hot.y, hot.x)[axis][whole] + start
     apart = (value[:, :, 0] - value[:, :, 1]).sum(axis=1)
     back = bool(np.median(apart) < 0)
-    trail = value[:, :, int(back)]
+    trail, sign = value[:, :, int(back)], -1 if back else 1
     few = len(trail) // 10
     near = np.sort(trail, axis=0)[few : len(trail) - few].mean(axis=0)
     ratio = float(np.clip(near[1:].sum() / max(near[:-1].sum(), 1e-12), _LEAST_RATIO, _MOST_RATIO))
-    shares, noise = trail.sum(axis=1), np.sqrt(REACH) * sigma
-    level, power = float(np.median(charge)), (1.0, 1.0)
-    output = start + size - 1 if back else start
-    for _ in range(_TURNS):
-        transfers = np.maximum(output - at if back else at - output, 0) + 1
-        clear = shares > _CLEAR * noise
-        if clear.sum() >= LEAST:
-            logs = np.log(shares[clear] / transfers[clear])
-            slope, error = _slope(np.log(charge[clear] / level), logs)
-            power = float(np.clip(1 + slope, 0.0, 1.5)), error
-        pattern = (charge / level) ** (power[0] - 1)
-        weight = pattern**2 / (noise**2 + (0.5 * _scatter(shares)) ** 2)
-        output = _zero(at, shares / pattern, weight, back)
-    rise = np.corrcoef(_ranks(at), _ranks(apart / pattern))[0, 1]
-    transfers = np.maximum(output - at if back else at - output, 0) + 1
-    total = float((weight * transfers) @ transfers)
-    loss = float((weight * transfers) @ (shares / pattern)) / total
-    rest = weight * transfers * (shares / pattern - loss * transfers)
-    whole_trail = 1 - ratio**REACH
-    error = float(np.sqrt(rest @ rest)) / total
-    losses = max(loss, 0.0) / whole_trail, error / whole_trail
+    shares, place, level = trail.sum(axis=1), sign * at, float(np.median(charge))
+    edge = min(sign * start, sign * (start + size - 1))
+    noise = np.sqrt(REACH) * hot.sigma[whole, axis * REACH, 0]
+    spread = np.hypot(noise, 0.5 * median_and_sigma(shares)[1])
+
+    def rest(trial: F64) -> F64:
+        loss, power, beyond = trial
+        transfers = place - edge + 1 + size * beyond
+        return np.asarray((loss * (charge / level) ** (power - 1) * transfers - shares) / spread)
+
+    start_at = max(float(np.median(shares / (place - edge + 1))), 1e-9), 1.0, 0.0
+    lowest, highest = (0.0, 0.0, (edge - place.min()) / size), (1.0, _HIGHEST, _FAR / size)
+    fit = least_squares(
+        rest, start_at, bounds=(lowest, highest), x_scale=(start_at[0], 1.0, 1.0), loss="soft_l1"
+    )
+    variance = 2 * fit.cost / max(len(at) - 3, 1)
+    errors = np.sqrt(np.diag(inverse_normal(fit.jac.T @ fit.jac)) * variance)
+    loss, power, beyond = fit.x.tolist()
+    rise = np.corrcoef(_ranks(at), _ranks(apart * (charge / level) ** (1 - power)))[0, 1]
     sigmas = float(np.arctanh(np.clip(rise, -_ALIKE, _ALIKE))) * np.sqrt(len(at) - 3)
     first = at < np.median(at)
     signs = [np.sign(apart[half]).sum() / np.sqrt(half.sum()) for half in (first, ~first)]
     if signs[0] * signs[1] < 0 and min(np.abs(signs)) > SIGNIFICANT:
         # Charge trails away from the output, not both ways, as signals of two outputs do.
         sigmas = 0.0
-    return Trail(sigmas, losses, power, level, ratio, output)
-
-
-def _zero(at: Indices, values: F64, weight: F64, back: bool) -> int:
-    """Row or column where a line through values meets zero, before the first or after the last."""
-    sign = -1 if back else 1
-    first = int((sign * at).min())
-    slope, value = np.polyfit(sign * at - first, values, 1, w=np.sqrt(weight))
-    beyond = value / slope if slope > 0 else 0.0
-    return sign * (first - int(np.clip(beyond, 0, _FAR)))
+    part = 1 - ratio**REACH  # of a trail
+    losses = loss / part, float(errors[0]) / part
+    output = sign * (edge - round(size * beyond))
+    return Trail(sigmas, losses, (power, float(errors[1])), level, ratio, output)
 
 
 def _ranks(values: NDArray[Any]) -> F64:
     """Ranks, the mean of them for equal values; not from scipy.stats, which is slow to import."""
     _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
     return np.asarray((counts.cumsum() - (counts - 1) / 2)[places])
-
-
-def _scatter(values: F64) -> float:
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))
-
-
-def _slope(x: F64, y: F64) -> tuple[float, float]:
-    """Slope of a line through points with outliers, and its error."""
-    weight = np.ones_like(x)
-    for _ in range(10):
-        away = x - np.average(x, weights=weight)
-        slope = float((weight * away) @ y / max(float((weight * away) @ away), 1e-12))
-        rest = y - slope * x
-        rest -= np.average(rest, weights=weight)
-        weight = 1 / np.maximum(1, np.abs(rest) / max(1.5 * _scatter(rest), 1e-9))
-    spread = weight * away * rest
-    return slope, float(np.sqrt(spread @ spread) / max(float((weight * away) @ away), 1e-12))
