@@ -8,7 +8,7 @@ import pytest
 from all_frames import frames_of
 
 from pixcal.effects.brighter_fatter import BrighterFatter
-from pixcal.estimators.detector.neighbours import shared_charge
+from pixcal.estimators.crosstalk.boundaries import shared_charge
 from pixcal.estimators.detector.response import FALLOFFS_PX
 from pixcal.estimators.diagnosis.central_crop import central_crop
 from pixcal.estimators.diagnosis.evidence import Evidence

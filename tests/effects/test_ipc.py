@@ -310,11 +310,10 @@ def test_products_of_neighbours_are_the_same_in_pieces_of_any_length(
 ) -> None:
     frames = acquired({"frames.fringes.0.count": 150, "frames.fringes.1.count": 150})
     steps = links((frames.good.shape[0], frames.good.shape[1]))[:5]
-    usual = covariance.products(frames, steps)
+    usual, pieces = (covariance.Products.none(steps, frames) for _ in range(2))
+    usual.add(frames, steps, ())
     monkeypatch.setattr(covariance, "_AT_ONCE", most)
-    pieces = covariance.products(frames, steps)
-    assert usual is not None
-    assert pieces is not None
+    pieces.add(frames, steps, ())
     for name in ("right", "normal"):
         whole = getattr(usual, name)
         np.testing.assert_allclose(

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pixcal.estimators.crosstalk.covariance import BOTH, TERMS, Products
+from pixcal.estimators.crosstalk.covariance import BOTH, OF_RISE, TERMS, Products
+from pixcal.estimators.crosstalk.equations import Equations
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels
-from pixcal.estimators.crosstalk.kernel import best_period, coupling_of
-from pixcal.estimators.crosstalk.links import PixelClasses, class_sums, links, periods, sums_of
+from pixcal.estimators.crosstalk.kernel import best_period
+from pixcal.estimators.crosstalk.links import PixelClasses, class_sums, couplings_of, links, periods
 from pixcal.estimators.crosstalk.maps import Maps
 from pixcal.estimators.crosstalk.sources import Sources
 from pixcal.estimators.crosstalk.support import INDEPENDENT, sigmas_of, significant_links
@@ -43,7 +44,9 @@ def test_sums_of_classes_are_those_of_their_pixels():
         number = classes.of(y, x)
         for n in range(classes.count):
             np.testing.assert_allclose(sums[:, n], values[:, number == n].sum(-1))
-        np.testing.assert_allclose(sums, sums_of(values, classes))
+        ((same, alone),) = class_sums(values, first, (classes.rows, classes.columns))
+        assert same == classes
+        np.testing.assert_allclose(sums, alone)
         seen.append((classes.rows, classes.columns))
     assert seen == periods((37, 41))
     assert (8, 1) in seen
@@ -56,8 +59,10 @@ def test_a_partner_has_the_class_that_is_told(step):
     classes = PixelClasses(4, 3, (2, 1))
     y, x = np.indices((20, 20))
     here, there = classes.of(y, x), classes.of(y + step[0], x + step[1])
+    couplings = couplings_of(classes, [step])
     for n in range(classes.count):
-        back = coupling_of(classes, n, 1, step)
+        gives, back = couplings[2 * n : 2 * n + 2]
+        assert gives.row * classes.columns + gives.column == n
         assert set(there[here == n]) == {back.row * classes.columns + back.column}
 
 
@@ -193,41 +198,71 @@ def hot(value, charge=None, sigma=2e-4):
 
 
 def shown(pixels):
-    return pixels.by_class(PixelClasses(4, 1, (0, 0)), ((1, 0),))
+    return pixels.equations(PixelClasses(4, 1, (0, 0)), ((1, 0),))
+
+
+def mean(equations):
+    """Weight of the share that the first class gives, and its value at the mean charge."""
+    weight = equations.normal[0, 0, 0]
+    assert np.count_nonzero(weight) == 1
+    return weight[0], equations.right[0, 0, 0] / weight[0]
 
 
 def test_hot_pixels_that_agree_are_averaged():
-    found = shown(hot([0.0302, 0.0298, 0.0300, 0.0304]))
-    assert found.value[0, 0, 0] == pytest.approx(0.0301)
-    assert found.weight[0, 0, 0] == pytest.approx(4 / 2e-4**2)
-    assert np.count_nonzero(found.weight) == 1
+    weight, value = mean(shown(hot([0.0302, 0.0298, 0.0300, 0.0304])))
+    assert value == pytest.approx(0.0301)
+    assert weight == pytest.approx(4 / 2e-4**2)
 
 
 def test_a_warm_neighbour_among_several_is_left_out_and_of_two_neither_is_believed():
-    found = shown(hot([0.0001, -0.0001, 0.05, 0.0002, 0.0]))
-    assert abs(found.value[0, 0, 0]) < 2e-4
-    assert found.weight[0, 0, 0] == pytest.approx(4 / 2e-4**2)
-    found = shown(hot([0.0, 0.03]))
-    assert found.value[0, 0, 0] * np.sqrt(found.weight[0, 0, 0]) < 2
+    weight, value = mean(shown(hot([0.0001, -0.0001, 0.05, 0.0002, 0.0])))
+    assert abs(value) < 2e-4
+    assert weight == pytest.approx(4 / 2e-4**2)
+    weight, value = mean(shown(hot([0.0, 0.03])))
+    assert value * np.sqrt(weight) < 2
 
 
 def test_what_rises_with_the_charge_is_not_taken_for_a_share():
     """Brighter-fatter moves more of a brighter hot pixel: the share at small signals is none."""
     charge = np.linspace(8, 40, 12)
     for share in (0.0, 0.006):
-        normal, right = shown(hot(share + 5e-5 * charge, charge, 1e-4)).sums(np.zeros((1, 2)), 0.0)
+        normal, right = shown(hot(share + 5e-5 * charge, charge, 1e-4)).shares(0.0)
         found, error = right[0, 0] / normal[0, 0, 0], normal[0, 0, 0] ** -0.5
         assert abs(found - share) < 2.5e-4
         assert 1e-5 < error < 3e-4
 
 
 def test_a_rise_that_no_hot_pixel_shows_has_no_finite_error():
-    found = shown(hot([0.03, 0.03]))
-    share, rise, covariance = found.rises()
-    assert np.isfinite(share).all()
-    assert np.isfinite(rise).all()
-    assert np.isinf(covariance[..., 1, 1]).any()
-    assert not np.isnan(covariance).any()
+    none = np.zeros((1, 2))
+    for charge, measured in ((None, False), ([10, 20], True)):
+        share, rise, covariance = shown(hot([0.03, 0.03], charge)).rises(none, none)
+        assert np.isfinite(share).all()
+        assert np.isfinite(rise).all()
+        assert not np.isnan(covariance).any()
+        assert np.isinf(covariance[0, :, 1, 1]).tolist() == [not measured, True]
+
+
+@pytest.mark.parametrize("per_ke", [0.0, 0.02])
+def test_shares_and_their_rise_are_those_that_made_the_sums(per_ke):
+    """Of noise, which rises with the sum of both shares, and of hot pixels, with each."""
+    rng = np.random.default_rng(7)
+    shares = rng.uniform(0, 0.02, (3, 2, 2))  # link, class, direction
+    for of_rise, nuisance in ((OF_RISE, np.eye(2)), (np.eye(2), np.ones((1, 2)))):
+        root = rng.standard_normal((3, 2, 4, 9))
+        normal = np.moveaxis(root @ root.swapaxes(2, 3), 1, -1)
+        free = np.array([3e-3, 0.0]) if len(nuisance) > 1 else np.zeros(2)
+        every = np.concatenate([shares, per_ke * shares @ of_rise.T + free], axis=-1)
+        right = np.einsum("ltuc,lcu->ltc", normal, every)
+        made = Equations(normal, right, of_rise, nuisance, np.full(len(nuisance), 1e9))
+        matrix, rest = made.shares(per_ke)
+        np.testing.assert_allclose(
+            np.linalg.solve(matrix, rest[..., None])[..., 0], shares.reshape(3, 4)
+        )
+        # The same of shares that were corrected but for their rise.
+        known = np.einsum("ltuc,lcu->ltc", normal[:, :, :2], shares)
+        left = Equations(normal, right - known, of_rise, nuisance, np.full(len(nuisance), 1e9))
+        matrix, rest = left.risen(-per_ke * shares).shares(per_ke)
+        np.testing.assert_allclose(rest, 0, atol=1e-9 * np.abs(right).max())
 
 
 def test_offsets_follow_a_change_of_the_maps_less_its_modes():

@@ -17,19 +17,20 @@ def some(frames: int, seed: int) -> Residuals:
     """Frames, and a tenth as many modes; pixels without a fit, and samples without weight."""
     rng = np.random.default_rng(seed)
     good = rng.random(SHAPE) > 0.1
-    size = frames + frames // 10, int(good.sum())
-    weight = rng.uniform(0.5, 1.5, size).astype(np.float32) * (rng.random(size) > 0.1)
-    charge = rng.uniform(0.5, 2, size).astype(np.float32)
-    e = rng.standard_normal(size).astype(np.float32) * weight
-    return Residuals(e, charge, weight, frames, good, steady=False)
+    weight = rng.uniform(0.5, 1.5, (frames, *SHAPE)).astype(np.float32)
+    weight *= good & (rng.random(weight.shape) > 0.1)
+    charge = rng.uniform(0.5, 2, weight.shape).astype(np.float32)
+    frame = np.concatenate([np.arange(frames), np.arange(0, frames, 10)])
+    e = rng.standard_normal((len(frame), *SHAPE)).astype(np.float32) * weight[frame]
+    return Residuals(e, charge, weight, frame)
 
 
 def expected(parts: list[tuple[np.ndarray, ...]], step: tuple[int, int]) -> list[np.ndarray]:
     """Sums of products (y, x) of values times the terms D, D', 1, (D² + D'²) / 2, and of each."""
     sums = [np.zeros((n, *SHAPE)) for n in (4, 10)]
-    for value, charge, good in parts:
+    for value, charge in parts:
         whole = np.zeros((2, len(value), SHAPE[0] + 2, SHAPE[1] + 4))
-        whole[:, :, :-2, 2:-2][..., good] = value, charge
+        whole[:, :, :-2, 2:-2] = value, charge
         here = whole[:, :, :-2, 2:-2]
         dy, dx = step
         there = whole[:, :, dy : dy + SHAPE[0], 2 + dx : 2 + dx + SHAPE[1]]
@@ -43,7 +44,7 @@ def expected(parts: list[tuple[np.ndarray, ...]], step: tuple[int, int]) -> list
 
 @pytest.mark.parametrize("step", range(len(LINKS)))
 def test_the_sums_are_those_of_the_terms(step: int) -> None:
-    parts = [(p.e, p.charge, p.good) for p in (some(20, 1), some(35, 2))]
+    parts = [(p.e, p.charge[p.frame]) for p in (some(20, 1), some(35, 2))]
     for terms, sums in zip((TERMS, BOTH), expected(parts, LINKS[step]), strict=True):
         found = np.zeros((len(LINKS), len(terms), *SHAPE), np.float32)
         covariance._add(parts, terms, LINKS, found)
@@ -52,25 +53,20 @@ def test_the_sums_are_those_of_the_terms(step: int) -> None:
 
 def test_one_frame_stands_for_all_of_one_charge_and_few_for_many() -> None:
     part = some(200, 3)
-    flat = replace(
-        part,
-        charge=np.tile(part.charge[0], (len(part.charge), 1)),
-        weight=np.ones_like(part.weight),
-        steady=True,
-    )
-    for one, frames, accuracy in ((part, 50, 0.2), (flat, 1, 1e-4)):
-        value, charge, good = covariance._weights(one)
+    flat = replace(part, charge=part.charge[:1], frame=0 * part.frame)
+    for one, frames, accuracy in ((part, 50, 0.2), (flat, 1, 0.02)):
+        value, charge = covariance._weights(one)
         assert len(value) == len(charge) == frames
-        few = expected([(value, charge, good)], (0, 1))[1].sum(axis=(1, 2))
-        all_frames = (one.weight[: one.count], one.charge[: one.count], good)
-        every = expected([all_frames], (0, 1))[1].sum(axis=(1, 2))
-        np.testing.assert_allclose(few, every, rtol=accuracy)
+        few = expected([(value, charge)], (0, 1))[1].sum(axis=(1, 2))
+        every = np.broadcast_to(one.charge, one.weight.shape)
+        whole = expected([(one.weight, every)], (0, 1))[1].sum(axis=(1, 2))
+        np.testing.assert_allclose(few, whole, rtol=accuracy)
 
 
 def test_short_sequences_are_gathered_and_long_ones_are_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     parts = [some(n, 1) for n in (50, 10, 300, 40, 60, 70)]
-    monkeypatch.setattr(covariance, "_AT_ONCE", 100 * int(parts[0].good.sum()))
-    gathered = [[part.count for part in group] for group in covariance._gathered(parts)]
+    monkeypatch.setattr(covariance, "_AT_ONCE", 100 * SHAPE[0] * SHAPE[1])
+    gathered = [[len(part.weight) for part in group] for group in covariance._gathered(parts)]
     assert gathered == [[50, 10, 300], [40, 60], [70]]

@@ -10,12 +10,12 @@ from scipy.special import chdtrc
 
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.effects.quantisation import Quantisation
+from pixcal.estimators.crosstalk.boundaries import shared_charge
 from pixcal.estimators.crosstalk.kernel import within
 from pixcal.estimators.crosstalk.links import links
-from pixcal.estimators.crosstalk.sources import sources_of
+from pixcal.estimators.crosstalk.sources import sources_of, total
 from pixcal.estimators.detector.flat_noise import shot_share_of_flats
 from pixcal.estimators.detector.ladder_curve import ladder_curve
-from pixcal.estimators.detector.neighbours import shared_charge
 from pixcal.estimators.detector.transfer_curve import transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.estimators.test_statistics.noise import read_noise
@@ -237,6 +237,19 @@ def test_pairs_of_flats_without_shared_charge_show_none_within_the_error() -> No
     # Of 60 a standard deviation is known to a tenth.
     assert (scatter > 0.78).all()
     assert (scatter < 1.3).all()
+
+
+@pytest.mark.parametrize("count", [2, 8])
+def test_pairs_of_flats_without_couplings_show_none_within_the_error(count: int) -> None:
+    """Two residuals of a pair are the same with the other sign: one product, not two."""
+    steps, found = within(SHAPE), []
+    for seed in range(100, 112):
+        sources = sources_of([evidence(seed, count=count)], lambda _: steps)
+        assert sources is not None
+        normal, right = total(next(sources.periods())[1])
+        found.append(right.sum(axis=1) / normal.sum(axis=(1, 2)) ** 0.5)
+    # Of 144 a standard deviation is known to 6 %.
+    assert np.std(found) == pytest.approx(1, abs=0.25)
 
 
 def shared(share: float, rising: bool) -> Response:

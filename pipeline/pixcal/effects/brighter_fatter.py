@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixcal.estimators.detector.neighbours import SharedCharge, shared_charge
+from pixcal.estimators.crosstalk.boundaries import SharedCharge, shared_charge
 from pixcal.estimators.detector.response import Boundaries, boundaries_alone, boundaries_beside
 from pixcal.estimators.diagnosis.central_crop import central_crop
 from pixcal.estimators.diagnosis.evidence import Evidence

@@ -7,13 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from pixcal.estimators.crosstalk.kernel import (
-    Kernel,
-    dense_kernel,
-    measure,
-    significance,
-    significant,
-)
+from pixcal.estimators.crosstalk.kernel import dense_kernel, detect, measure, significant
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import (
     Coupling,
@@ -49,6 +43,9 @@ FOUR_ROWS = (
     Coupling(0, -1, 0.004, every_rows=4, row=2),
     Coupling(0, -1, 0.004, every_rows=4, row=3),
 )
+
+
+_NONE = "no significant signal beside hot pixels, and no significant noise common to neighbours"
 
 
 @dataclass(frozen=True)
@@ -125,34 +122,43 @@ class Ipc(Effect):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Kernel from hot pixels in darks, the noise of flats and fringes, and the maps, joined."""
-        measured = measure(evidence)
-        if measured is None:
+        found = detect(evidence)
+        if found is None:
             return None
-        kernel, sigmas = measured
+        kernel, nothing = measure(found), Estimate(cls(()), {}, found.significance, _NONE)
         if kernel is None:
-            return Estimate(cls(()), {}, sigmas, _NONE)
+            return nothing
         couplings, covariance = significant(kernel)
-        sigma = np.sqrt(np.diag(covariance))
+        if not couplings:
+            return nothing
+        (per_ke, per_ke_error), sigma = kernel.per_ke, np.sqrt(np.diag(covariance))
         errors = {f"couplings[{n}].share": float(s) for n, s in enumerate(sigma)}
-        if kernel.per_ke[0]:
-            errors |= {f"couplings[{n}].per_ke": kernel.per_ke[1] for n in range(len(sigma))}
         law = f"a kernel of {len(couplings)} couplings, all significant"
-        if kernel.per_ke[0]:
-            law += f", whose shares change by {100 * kernel.per_ke[0]:+.3g} % per ke-"
+        if per_ke:
+            errors |= {f"couplings[{n}].per_ke": per_ke_error for n in range(len(sigma))}
+            law += f", whose shares change by {100 * per_ke:+.3g} % per ke-"
             law += ", or are constant if brighter_fatter acts too" * kernel.either
+        n = int(np.abs([c.share for c in couplings]).argmax())
+        of = f"at (dy, dx) = {couplings[n].dy, couplings[n].dx}"
+        of += f", the largest of {len(couplings)} couplings" * (len(couplings) > 1)
+        rows, columns = (
+            max(getattr(c, n) for c in couplings) for n in ("every_rows", "every_columns")
+        )
         return Estimate(
             cls(couplings),
             errors,
-            sigmas,
-            _why(couplings, kernel),
+            found.significance,
+            f"{len(couplings)} couplings, repeating every {rows} rows and {columns} columns, in "
+            + " and ".join(kernel.methods),
             law=law,
-            size=_size(couplings, sigma),
-            in_full=cls(_worth_it(kernel.couplings)) if couplings else None,
+            size={"value": couplings[n].share, "error": float(sigma[n]), "unit": "", "of": of},
+            in_full=cls(_worth_it(kernel.couplings)),
         )
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
-        return significance(evidence)
+        found = detect(evidence)
+        return None if found is None else found.significance
 
     def predict(self, maps: FringeMaps) -> FringeMaps:
         """Maps with the couplings: ``L (flat theta) / L flat`` (physics note, section 5).
@@ -160,11 +166,7 @@ class Ipc(Effect):
         Signal-dependent shares are those at intensity and amplitude 1, for the flat at small
         signals. Pixels without data (NaN) stay so; as sources they are like their neighbours.
         """
-        return _on_charge(
-            maps,
-            lambda theta: couple_fringes(theta, self.couplings, maps.origin),
-            lambda flat: couple(flat, self._at_small_signals, maps.origin),
-        )
+        return self._changed(maps, couple_fringes, couple)
 
     def undo(self, maps: FringeMaps) -> FringeMaps:
         """Maps without the couplings: the inverse of `predict`, to rounding.
@@ -172,11 +174,20 @@ class Ipc(Effect):
         A part of the window needs a margin of `undo_halo` rows and columns, except at the edge of
         the window.
         """
-        return _on_charge(
-            maps,
-            lambda theta: uncouple_fringes(theta, self.couplings, maps.origin),
-            lambda flat: uncouple(flat, self._at_small_signals, maps.origin),
-        )
+        return self._changed(maps, uncouple_fringes, uncouple)
+
+    def _changed(
+        self, maps: FringeMaps, of_theta: Callable[..., F64], of_flat: Callable[..., F64]
+    ) -> FringeMaps:
+        """Maps changed as charge, that is, before the division by the flat."""
+        before = np.ones(maps.theta.shape[1:]) if maps.flat is None else maps.flat
+        after = before
+        if maps.flat is not None:
+            after = np.maximum(of_flat(before, self._at_small_signals, maps.origin), MIN_FLAT)
+        charge = filled(maps.theta * before, maps.k)
+        theta = of_theta(charge, self.couplings, maps.origin) / after
+        theta[:, ~np.isfinite(maps.theta).all(axis=0)] = np.nan
+        return replace(maps, theta=theta, flat=None if maps.flat is None else after)
 
     def measured_again(self, parts: Iterable[Evidence]) -> Estimate | None:
         """All couplings within two pixels and those detected beyond, with the known period."""
@@ -224,43 +235,6 @@ class Ipc(Effect):
         return tuple(replace(c, per_ke=0.0) for c in self.couplings)
 
 
-def _size(couplings: Sequence[Coupling], errors: F64) -> dict[str, object]:
-    """`Estimate.size` of couplings: the largest share; empty without any."""
-    if not couplings:
-        return {}
-    n = int(np.abs([c.share for c in couplings]).argmax())
-    place = couplings[n].dy, couplings[n].dx
-    largest = f", the largest of {len(couplings)} couplings" if len(couplings) > 1 else ""
-    return {
-        "value": couplings[n].share,
-        "error": float(errors[n]),
-        "unit": "",
-        "of": f"at (dy, dx) = {place}{largest}",
-    }
-
-
 def _worth_it(couplings: Sequence[Coupling]) -> tuple[Coupling, ...]:
     """The couplings, with negligible ones set to zero but kept for the covariance."""
     return tuple(c if abs(c.share) > MIN_SHARE else c.scaled(0.0) for c in couplings)
-
-
-def _on_charge(
-    maps: FringeMaps, of_theta: Callable[[F64], F64], of_flat: Callable[[F64], F64]
-) -> FringeMaps:
-    """Act on the charge, that is, on samples before their division by the flat."""
-    before = np.ones(maps.theta.shape[1:]) if maps.flat is None else maps.flat
-    after = before if maps.flat is None else np.maximum(of_flat(before), MIN_FLAT)
-    theta = of_theta(filled(maps.theta * before, maps.k)) / after
-    theta[:, ~np.isfinite(maps.theta).all(axis=0)] = np.nan
-    return replace(maps, theta=theta, flat=None if maps.flat is None else after)
-
-
-_NONE = "no significant signal beside hot pixels, and no significant noise common to neighbours"
-
-
-def _why(couplings: Sequence[Coupling], kernel: Kernel) -> str:
-    if not couplings:
-        return _NONE
-    rows, columns = (max(getattr(c, n) for c in couplings) for n in ("every_rows", "every_columns"))
-    repeats = f"repeating every {rows} rows and {columns} columns"
-    return f"{len(couplings)} couplings, {repeats}, in {' and '.join(kernel.methods)}"

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
+from pixcal.estimators.crosstalk.boundaries import shared_charge
 from pixcal.estimators.detector.flat_ladder import ladder, ladder_response
 from pixcal.estimators.detector.ladder_curve import ladder_curve
-from pixcal.estimators.detector.neighbours import shared_charge
 from pixcal.estimators.detector.response import departure, fit_curve, fit_response
 from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
 from pixcal.estimators.diagnosis.central_crop import central_crop

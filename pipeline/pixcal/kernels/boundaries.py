@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.kernels import inner, kernel
+from pixcal.kernels import kernel
 from pixcal.model.arrays import F32, F64
 
 # Pixels on either side of a boundary whose charge acts on it. With two, the shift under broad
@@ -117,14 +117,34 @@ def shared_noise(
     between columns and between rows.
     """
     out = np.zeros_like(charge)
-    dy, dx = step
+    (dy, dx), (right, below), (ny, nx) = step, pushes, charge.shape[1:]
+    rows = max(REACH, REACH - dy), ny - max(REACH, REACH + dy)
+    columns = max(REACH, REACH - dx), nx - max(REACH, REACH + dx)
+
+    def at(values: F32, y: int, x: int) -> F32:
+        return values[:, rows[0] + y : rows[1] + y, columns[0] + x : columns[1] + x]
+
+    def gain(y: int, x: int, slopes: F64) -> F32:
+        """Derivative of the gain of the pixels at a step by the charge of their partners."""
+        own, total = at(charge, y, x), np.zeros_like(at(charge, y, x))
+        pushing = at(right, y, x), at(right, y, x - 1), at(below, y, x), at(below, y - 1, x)
+        for (v, u), push, (by_shift, by_charge) in zip(_SIDES, pushing, slopes.T, strict=True):
+            if by_shift:
+                total += np.float32(by_shift) * (own + at(charge, y + v, x + u))
+            if by_charge:
+                total += np.float32(by_charge) * push
+        return total
+
     there, back = _slopes(shifts, dy, dx, axes), _slopes(shifts, -dy, -dx, axes)
-    one, other = np.empty((2, charge.shape[2]), np.float32)
-    _share(charge, *pushes, there, back, dy, dx, one, other, out)
+    shared = gain(0, 0, there) * at(charge, dy, dx) + gain(dy, dx, back) * at(charge, 0, 0)
+    at(out, 0, 0)[:] = shared
     return out
 
 
-def _slopes(shifts: F64, dy: int, dx: int, axes: tuple[float, float]) -> F32:
+_SIDES = (0, 1), (0, -1), (1, 0), (-1, 0)  # pixels across the boundaries of a pixel
+
+
+def _slopes(shifts: F64, dy: int, dx: int, axes: tuple[float, float]) -> F64:
     """Derivative of the charge a pixel gains through its boundaries by the charge of another."""
     # Two factors (2, 4) for the boundaries to the right, to the left, below and above: of the
     # charge on both sides, as the other pixel moves the boundary; and of the boundary's shift, as
@@ -136,50 +156,6 @@ def _slopes(shifts: F64, dy: int, dx: int, axes: tuple[float, float]) -> F32:
         return 0.25 * axes[axis] * shifts[i, j] if inside else 0.0
 
     by_shift = slope(dy, dx, 0), -slope(dy, dx + 1, 0), slope(dx, dy, 1), -slope(dx, dy + 1, 1)
-    sides = (0, 1), (0, -1), (1, 0), (-1, 0)
     signs = axes[0] / 2, -axes[0] / 2, axes[1] / 2, -axes[1] / 2
-    by_charge = (n if (dy, dx) == side else 0.0 for n, side in zip(signs, sides, strict=True))
-    return np.array([by_shift, tuple(by_charge)], np.float32)
-
-
-@inner()
-def _gain(
-    q: Any, push_x: Any, push_y: Any, y: int, left: int, right: int, slopes: Any, out: Any
-) -> None:
-    """Derivative of the gain of pixels of a row by the charge of the pixel of the slopes."""
-    # Views, whose indices are never negative: only then is the loop vectorised.
-    here, above, below = q[y, left:right], q[y - 1, left:right], q[y + 1, left:right]
-    before, after = q[y, left - 1 : right - 1], q[y, left + 1 : right + 1]
-    push_right, push_left = push_x[y, left:right], push_x[y, left - 1 : right - 1]
-    push_below, push_above = push_y[y, left:right], push_y[y - 1, left:right]
-    s_right, s_left, s_below, s_above = slopes[0, 0], slopes[0, 1], slopes[0, 2], slopes[0, 3]
-    c_right, c_left, c_below, c_above = slopes[1, 0], slopes[1, 1], slopes[1, 2], slopes[1, 3]
-    for x in range(right - left):
-        out[x] = (
-            s_right * (here[x] + after[x])
-            + s_left * (here[x] + before[x])
-            + s_below * (here[x] + below[x])
-            + s_above * (here[x] + above[x])
-            + c_right * push_right[x]
-            + c_left * push_left[x]
-            + c_below * push_below[x]
-            + c_above * push_above[x]
-        )
-
-
-@kernel()
-def _share(
-    charge: Any, push_x: Any, push_y: Any, there: Any, back: Any, dy: int, dx: int,
-    one: Any, other: Any, out: Any,
-) -> None:  # fmt: skip
-    frames, ny, nx = charge.shape
-    left, right = REACH + max(0, -dx), nx - REACH - max(0, dx)
-    for t in range(frames):
-        q, across, along = charge[t], push_x[t], push_y[t]
-        for y in range(REACH + max(0, -dy), ny - REACH - max(0, dy)):
-            _gain(q, across, along, y, left, right, there, one)
-            _gain(q, across, along, y + dy, left + dx, right + dx, back, other)
-            here, partner = q[y, left:right], q[y + dy, left + dx : right + dx]
-            row = out[t, y, left:right]
-            for x in range(right - left):
-                row[x] = one[x] * partner[x] + other[x] * here[x]
+    by_charge = [n if (dy, dx) == side else 0.0 for n, side in zip(signs, _SIDES, strict=True)]
+    return np.array([by_shift, by_charge])

@@ -55,10 +55,12 @@ def sigmas_of_best(*sigmas: float) -> float:
     return sigmas_of_largest(max(sigmas), len(sigmas))
 
 
-def sigmas_of_largest(largest: float, count: int) -> float:
+def sigmas_of_largest(largest: float, count: float) -> float:
     """As `sigmas_of_best`, given the largest of ``count`` normals."""
-    log_any = log_of_any(float(log_ndtr(-max(largest, -8.0))), count)
-    return -float(ndtri_exp(min(log_any, -1e-300)))
+    log_one = float(log_ndtr(-max(largest, -8.0)))
+    none = count * math.log1p(-math.exp(log_one))
+    # The logarithm of the smaller of both probabilities is the precise one.
+    return float(ndtri_exp(none) if none < -0.5 else -ndtri_exp(log_of_any(log_one, count)))
 
 
 def log_of_any(log_chance: float, count: float) -> float:

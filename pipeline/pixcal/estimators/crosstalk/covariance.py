@@ -20,14 +20,13 @@ from itertools import product
 
 import numpy as np
 
+from pixcal.estimators.crosstalk.equations import Equations
 from pixcal.estimators.crosstalk.links import Place
 from pixcal.estimators.crosstalk.residuals import MAX_SAMPLES, UNIT, Residuals, all_residuals
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
-from pixcal.model.arrays import F32, F64, Mask
-
-Frames = tuple[F32, F32, Mask]  # values and charges (t, n) of the pixels of a mask (y, x)
+from pixcal.model.arrays import F32, F64
 
 # least charge (10⁴ e-) of usable light; less is enough where its shot noise variance is this many
 # times that without light
@@ -43,12 +42,15 @@ BOTH = np.zeros((10, 5, 5), np.float32)
 for _own, _i, _j in zip(BOTH, *np.triu_indices(4), strict=True):
     for _n, _m in np.ndindex(3, 3):
         _own[_n : _n + 3, _m : _m + 3] += TERMS[_i, _n, _m] * TERMS[_j]
+OF_RISE = 2e-3 * UNIT * np.array([[0.0, 0.0], [1.0, 1.0]])  # constant and b of rising shares
 _BLOCK = 12  # columns whose products are made together
 _AT_ONCE = MAX_SAMPLES  # samples up to which sequences are gathered
 _ENOUGH = 64  # frames whose weights stand for those of a sequence
 
+Frames = tuple[F32, F32]  # values and charges (t, y, x)
 
-@dataclass(frozen=True)
+
+@dataclass
 class Products:
     """Sums over frames for each link and pixel; zero where the partner is out of the window."""
 
@@ -58,96 +60,61 @@ class Products:
     normal: F32
     line: F64  # (3, 4) normal equations of the variance of pixels: shot noise, constant, square
     read: float  # variance of a pixel without light
+    brightest: float = 0.0  # median charge of the brightest frames
+
+    @classmethod
+    def none(cls, links: Sequence[Place], evidence: Evidence) -> "Products":
+        """Of no frames yet."""
+        right, normal = (
+            np.zeros((len(links), len(t), *evidence.good.shape), np.float32) for t in (TERMS, BOTH)
+        )
+        return cls(right, normal, np.zeros((3, 4)), evidence.read_noise**2 / UNIT)
+
+    def add(self, evidence: Evidence, links: Sequence[Place], known: Sequence[Coupling]) -> None:
+        """Add all frames, corrected for the couplings that are ``known``."""
+        for parts in _gathered(all_residuals(evidence, known)):
+            self.brightest = max(self.brightest, *(part.brightness for part in parts))
+            self.line += sum(map(_variance, parts))
+            _add([(part.e, part.charge[part.frame]) for part in parts], TERMS, links, self.right)
+            _add([_weights(part) for part in parts], BOTH, links, self.normal)
+            del parts  # freed before the next ones, which are as large
 
     @property
-    def shot(self) -> tuple[float, float, float]:
-        """Measured variance over shot noise (1 for the right gain); its rise with the charge.
-
-        The latter with its error, 1/(10⁴ e-).
-        """
-        covariance = inverse_normal(self.line[:, :3], 1e-12)
-        shot, _, rise = covariance @ self.line[:, 3]
-        return float(shot), float(rise / shot), float(np.sqrt(2 * covariance[2, 2]))
+    def lit(self) -> bool:
+        """Whether frames have usable light."""
+        return self.brightest >= min(MIN_CHARGE, ABOVE_READ * self.read)
 
     def of(self, links: Sequence[int]) -> "Products":
         """Those of some links."""
         return replace(self, right=self.right[links], normal=self.normal[links])
 
+    @property
+    def shot(self) -> tuple[float, float, float]:
+        """Measured variance over shot noise (1 for the right gain), and its rise with the charge.
 
-def products(
-    evidence: Evidence, links: Sequence[Place], known: Sequence[Coupling] = ()
-) -> Products | None:
-    """Sum the products of neighbours over all frames; None where no frames have light.
+        The latter as the relative rise of shares with as much effect, with its error, 1/ke-.
+        """
+        covariance = inverse_normal(self.line[:, :3], 1e-12)
+        shot, _, rise = covariance @ self.line[:, 3]
+        error, scale = np.sqrt(2 * covariance[2, 2]), OF_RISE[1, 0]
+        return float(shot), float(rise / shot / scale), float(error / scale)
 
-    ``known``: couplings for which the frames are corrected first.
-    """
-    shape = evidence.good.shape
-    right = np.zeros((len(links), len(TERMS), *shape), np.float32)
-    normal = np.zeros((len(links), len(BOTH), *shape), np.float32)
-    line, brightest = np.zeros((3, 4)), 0.0
-    for parts in _gathered(all_residuals(evidence, known)):
-        brightest = max(brightest, *(part.brightness for part in parts))
-        line += sum(map(_variance, parts))
-        _add([(part.e, part.charge, part.good) for part in parts], TERMS, links, right)
-        _add([_weights(part) for part in parts], BOTH, links, normal)
-        del parts  # freed before the next ones, which are as large
-    if brightest < min(MIN_CHARGE, ABOVE_READ * evidence.read_noise**2 / UNIT):
-        return None
-    return Products(right, normal, line, evidence.read_noise**2 / UNIT)
-
-
-def joined(parts: Sequence[Products | None]) -> Products | None:
-    """Sum over several parts of the frames."""
-    some = [one for one in parts if one is not None]
-    if len(some) < 2:
-        return some[0] if some else None
-    names = "right", "normal", "line"
-    return replace(some[0], **{n: np.sum([getattr(o, n) for o in some], axis=0) for n in names})
-
-
-def share_sums(right: F64, normal: F64, read: float, per_ke: float = 0.0) -> tuple[F64, F64]:
-    """Least-squares sums (link, u, u), (link, u) of the shares, with the other terms free.
-
-    If shares rise with the signal (``per_ke``, 1/ke-), the last term is no longer free.
-    ``right``, ``normal``: as in `Products`, over classes instead of pixels. Unknown ``2 c`` is the
-    share that pixels of class c give over the link, ``2 c + 1`` the share that their partners give
-    back.
-    """
-    every = np.moveaxis(symmetric(np.moveaxis(normal, 1, -1)), 1, -1)
-    prior = np.diag([read**-2, (BRIGHTER_FATTER * UNIT) ** -2])
-    if per_ke > 0:
-        terms = np.eye(3, 4)
-        terms[:2, 3] = 2 * per_ke * UNIT * 1e-3
-        every, right = np.einsum("it,ltuc,ju->lijc", terms, every, terms), terms @ right
-        prior = prior[:1, :1]
-    links, _, _, count = every.shape
-    matrix: F64 = np.zeros((links, count, 2, count, 2))
-    at = np.arange(count)
-    matrix[:, at, :, at] = np.moveaxis(every[:, :2, :2], -1, 0)
-    cross = np.moveaxis(every[:, :2, 2:], -1, 1).reshape(links, 2 * count, -1)
-    nuisance = every[:, 2:, 2:].sum(-1) + prior
-    taken = cross @ np.linalg.inv(nuisance)
-    shares = right[:, :2].swapaxes(1, 2).reshape(links, -1)
-    rest = shares - np.einsum("lun,ln->lu", taken, right[:, 2:].sum(-1))
-    return matrix.reshape(links, 2 * count, -1) - taken @ cross.swapaxes(1, 2), rest
-
-
-def share_and_square(sums: Products) -> tuple[F64, F64]:
-    """Mean share of both pixels, and covariance over the product of the charges, 1/(10⁴ e-).
-
-    With their covariance: (link, 2), (link, 2, 2).
-    """
-    right, normal = (part.sum((-2, -1), dtype=float) for part in (sums.right, sums.normal))
-    mean = np.array([[0.5, 0.5, 0, 0], [0, 0, 0, 1]])
-    covariance = mean @ inverse_normal(symmetric(normal))
-    return np.einsum("lat,lt->la", covariance, right), covariance @ mean.T
+    def equations(self, right: F64, normal: F64) -> Equations:
+        """From sums (link, term, class) of ``right`` and ``normal``."""
+        every = np.moveaxis(symmetric(np.moveaxis(normal, 1, -1)), 1, -1)
+        shot, slope, _ = self.shot
+        prior = np.array([self.read, BRIGHTER_FATTER * UNIT])
+        return Equations(every, right / shot, OF_RISE, np.eye(2), prior, slope)
 
 
 def _weights(part: Residuals) -> Frames:
     """Few frames that represent all (one if all are equal), because weights have no noise."""
-    every = slice(0, part.count, part.count if part.steady else -(-part.count // _ENOUGH))
-    weight, charge = part.weight[every], part.charge[every]
-    return weight * np.float32((part.count / len(weight)) ** 0.5), charge, part.good
+    count = len(part.weight)
+    if len(part.charge) == 1:
+        return part.weight.mean(axis=0, keepdims=True) * np.float32(count**0.5), part.charge
+    every = slice(0, count, -(-count // _ENOUGH))
+    weight = part.weight[every]
+    return weight * np.float32((count / len(weight)) ** 0.5), part.charge[every]
 
 
 def _gathered(parts: Iterable[Residuals]) -> Iterator[list[Residuals]]:
@@ -168,13 +135,13 @@ def _add(parts: Sequence[Frames], terms: F32, links: Sequence[Place], sums: F32)
     ny, nx = sums.shape[-2:]
     reach, count = max((abs(dx) for _, dx in links), default=0), terms.shape[-1]
     # With margins along x, so that all columns have partners.
-    time = sum(len(value) for value, *_ in parts)
+    time = sum(len(value) for value, _ in parts)
     powers, first = np.zeros((ny, nx + 2 * reach, count, time), np.float32), 0
-    for value, charge, good in parts:
-        weighted, inside = value.T, powers[:, reach : reach + nx, :, first : first + len(value)]
+    for value, charge in parts:
+        inside = powers[:, reach : reach + nx, :, first : first + len(value)]
         for power in range(count):
-            inside[:, :, power][good] = weighted
-            weighted = weighted * charge.T
+            inside[:, :, power] = np.moveaxis(value, 0, -1)
+            value = value * charge
         first += len(value)
     for dy, x in product({dy for dy, _ in links}, range(0, nx, _BLOCK)):
         wide = min(_BLOCK, nx - x)
@@ -193,8 +160,7 @@ def _add(parts: Sequence[Frames], terms: F32, links: Sequence[Place], sums: F32)
 
 def _variance(part: Residuals) -> F64:
     """Normal equations (3, 4) of the variance of single pixels."""
-    weight, charge = part.weight, part.charge
-    terms = np.stack([weight * charge, weight, weight * charge**2]).reshape(3, -1)
-    square = (part.e**2 / np.where(weight > 0, weight, 1)).ravel()
-    used = terms[:, : weight[: part.count].size]
-    return np.column_stack([used @ used.T, terms @ square]).astype(float)
+    weight = part.weight
+    terms = np.stack([weight * part.charge, weight, weight * part.charge**2]).reshape(3, -1)
+    square = part.e[: len(weight)] ** 2 / np.where(weight > 0, weight, 1)
+    return np.column_stack([terms @ terms.T, terms @ square.ravel()]).astype(float)

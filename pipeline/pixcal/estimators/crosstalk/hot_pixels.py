@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import maximum_filter, median_filter
 
+from pixcal.estimators.crosstalk.equations import Equations
 from pixcal.estimators.crosstalk.links import REACH, PixelClasses, Place
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling, uncouple
@@ -45,77 +46,31 @@ class HotPixels:
         """Those of some links."""
         return replace(self, value=self.value[:, links], sigma=self.sigma[:, links])
 
-    def by_class(
+    def equations(
         self, classes: PixelClasses, links: Sequence[Place], doubted: bool = False
-    ) -> "ClassShares":
+    ) -> Equations:
         """Combined hot pixels of each class; ``doubted``: `DOUBT` even those that agree."""
         step = np.array(links)[:, :, None] * [0, 1]
         y, x = self.y[:, None, None] - step[:, 0], self.x[:, None, None] - step[:, 1]
         order = np.argsort(self.value, axis=0)
         value, sigma = (np.take_along_axis(a, order, 0) for a in (self.value, self.sigma))
         number = np.take_along_axis(classes.of(y, x), order, 0)
-        shares = []
+        charge: F64 = self.charge[order]
+        powers = np.stack([np.ones_like(charge), charge])
+        # Unknowns by power of the charge and by direction.
+        normal = np.zeros((len(links), 2, 2, 2, 2, classes.count))
+        right = np.zeros((len(links), 2, 2, classes.count))
         for n in range(classes.count):
             near = np.where(number == n, sigma, np.inf)
             alone = doubted | (np.isfinite(near).sum(axis=0) == 1)
             doubt = np.where(alone, DOUBT, 0.0) * value
-            shares.append(_agreed(value, np.hypot(near, doubt), self.charge[order]))
-        return ClassShares(*np.stack(shares, axis=2))
-
-
-@dataclass(frozen=True)
-class ClassShares:
-    """Shares from hot pixels, (link, class, 2) each: there and back."""
-
-    # weight, value, charge: information (1 / sigma²), weighted means of the share and of the
-    # charge (10³ e-)
-    weight: F64
-    value: F64
-    charge: F64
-    # square, product: weighted sums, about the means, of the charge squared and of charge times
-    # share
-    square: F64
-    product: F64
-
-    def sums(self, more: F64, per_ke: float) -> tuple[F64, F64]:
-        """Least-squares sums (link, u, u), (link, u) of the shares at small signals.
-
-        ``more``: rise (link, 2) of the shares that is added first; ``per_ke``: relative rise of
-        the rest, free if not positive; both 1/ke-.
-        """
-        links, more = len(self.weight), more[:, None]
-        parts = (self.weight, self.value, self.charge)
-        weight, value, charge = (part.reshape(links, -1) for part in parts)
-        value = value + (more * self.charge).reshape(links, -1)
-        product, square = (
-            part.reshape(links, -1) for part in (self.product + more * self.square, self.square)
-        )
-        if per_ke > 0:
-            here = 1 + per_ke * charge
-            normal = (weight * here**2 + square * per_ke**2)[:, :, None] * np.eye(weight.shape[1])
-            return normal, weight * here * value + per_ke * product
-        cross = weight * charge
-        rise = (cross * charge).sum(1) + square.sum(1) + RISE**-2
-        risen = (cross * value).sum(1) + product.sum(1)
-        normal = weight[:, :, None] * np.eye(weight.shape[1])
-        normal -= cross[:, :, None] * cross[:, None, :] / rise[:, None, None]
-        return normal, weight * value - cross * (risen / rise)[:, None]
-
-    def rises(self) -> tuple[F64, F64, F64]:
-        """Shares (link, 2) at small signals, their rises (1/ke-), covariance (link, 2, 2, 2).
-
-        Of the first class; the covariance is infinite where no rise can be measured.
-        """
-        weight, value, charge, square, product = (
-            part[:, 0] for part in (self.weight, self.value, self.charge, self.square, self.product)
-        )
-        variance = np.divide(1, square, out=np.full_like(square, np.inf), where=square > 0)
-        rise = product * np.where(square > 0, variance, 0)
-        of_mean = np.divide(1, weight, out=np.full_like(weight, np.inf), where=weight > 0)
-        charge = np.where(weight > 0, charge, 1.0)
-        mixed = -charge * variance
-        both = np.array([[of_mean - charge * mixed, mixed], [mixed, variance]])
-        return value - charge * rise, rise, np.moveaxis(both, (0, 1), (-2, -1))
+            weighted = powers * _agreed(value, np.hypot(near, doubt), charge)
+            for way in (0, 1):
+                own = weighted[..., way], powers[..., way]
+                normal[:, :, way, :, way, n] = np.einsum("ahl,bhl->lab", *own)
+                right[:, :, way, n] = np.einsum("ahl,hl->la", own[0], value[..., way])
+        every = normal.reshape(len(links), 4, 4, -1), right.reshape(len(links), 4, -1)
+        return Equations(*every, np.eye(2), np.ones((1, 2)), np.array([RISE]))
 
 
 def hot_pixels(
@@ -139,7 +94,7 @@ def hot_pixels(
 def hot_pixels_of(
     signal: F64, usable: Mask, links: Sequence[Place], overlap: float = OVERLAP
 ) -> HotPixels | None:
-    """As `hot_shares`, from the mean signal (y, x) of darks, e-, of pixels that do not saturate."""
+    """As `hot_pixels`, from the mean signal (y, x) of darks, e-, of pixels that do not saturate."""
     rest = signal - median_filter(signal, 2 * REACH + 5, mode="reflect")
     _, noise = median_and_sigma(rest)
     if not noise > 0:
@@ -174,7 +129,7 @@ def _surroundings(values: F64, y: Indices, x: Indices, size: int) -> F64:
 
 
 def _agreed(v: F64, s: F64, q: F64) -> F64:
-    """Sums (5, ...) of `ClassShares`, of values (h, ...) in rising order and charges."""
+    """Weights (h, ...) of values in rising order, their errors and charges: of those that agree."""
     w = s**-2.0
     used, half = w > 0, w.sum(axis=0) / 2
     middle = np.take_along_axis(v, np.argmax(np.cumsum(w, axis=0) >= half, axis=0)[None], 0)
@@ -182,13 +137,9 @@ def _agreed(v: F64, s: F64, q: F64) -> F64:
     count, agree = used.sum(axis=0), near.sum(axis=0)
     kept = np.where((agree < 2) | (2 * agree <= count), used, near)
     w = w * kept
-    total = w.sum(axis=0)
-    per = np.where(total > 0, total, 1)
-    mean, charge = (w * v).sum(axis=0) / per, (w * q).sum(axis=0) / per
-    square, product, rest = (
-        (w * a * b).sum(axis=0)
-        for a, b in ((q - charge, q - charge), (q - charge, v - mean), (v - mean, v - mean))
-    )
+    per = np.maximum(w.sum(axis=0), 1e-300)
+    v, q = (a - (w * a).sum(axis=0) / per for a in (v, q))
+    square, product, rest = ((w * a * b).sum(axis=0) for a, b in ((q, q), (q, v), (v, v)))
     freedom = kept.sum(axis=0) - 1
     # A rise with the charge is handled later.
     rising = (freedom >= ENOUGH) & (square > 0)
@@ -198,5 +149,4 @@ def _agreed(v: F64, s: F64, q: F64) -> F64:
     some = np.maximum(freedom, 1)
     usual = (1 - 2 / (9 * some) + 3.09 * np.sqrt(2 / (9 * some))) ** 3
     apart = (freedom > 0) & (rest > usual * freedom)
-    less = np.where(apart, freedom / np.where(apart, rest, 1), 1)
-    return np.stack([total * less, mean, charge, square * less, product * less])
+    return np.asarray(w * np.where(apart, freedom / np.where(apart, rest, 1), 1))

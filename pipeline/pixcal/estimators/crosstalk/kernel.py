@@ -8,7 +8,7 @@ one direction, and its own part. The sizes of these parts are learnt from all co
 with the greatest evidence is chosen.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from math import lcm
@@ -17,7 +17,8 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc
 
-from pixcal.estimators.crosstalk.links import PixelClasses, Place, links
+from pixcal.estimators.crosstalk.equations import Equations
+from pixcal.estimators.crosstalk.links import PixelClasses, Place, couplings_of, links
 from pixcal.estimators.crosstalk.sources import Sources, sources_of, total
 from pixcal.estimators.crosstalk.support import significant_links
 from pixcal.estimators.crosstalk.trails import SURE, trailing
@@ -66,39 +67,60 @@ class Kernel:
         return np.sqrt(np.diag(self.covariance))
 
 
-def significance(evidence: Evidence) -> float | None:
-    """Of the strongest coupling, in sigmas, corrected for the number of trials."""
-    sources = _examined(evidence)[1]
-    return None if sources is None else significant_links(sources)[1]
+@dataclass(frozen=True)
+class Detection:
+    """Whether pixels couple."""
+
+    significance: float  # of the strongest coupling, sigmas, corrected for the number of trials
+    evidence: Evidence  # of the pixels examined
+    sources: Sources | None  # for the links of a kernel; None without a significant coupling
+    classes: PixelClasses  # of the period of the kernel
 
 
-def measure(evidence: Evidence) -> tuple[Kernel | None, float] | None:
-    """All couplings within two pixels, if any is significant, and the significance.
+def detect(evidence: Evidence) -> Detection | None:
+    """Seek couplings within `links.REACH`; None where there is neither light nor dark signal.
 
-    None where there is neither light nor dark signal. Raises InputError if too many are significant
-    for a kernel, or its period is too long.
+    Raises InputError if too many are significant for a kernel.
     """
-    evidence, sources = _examined(evidence)
+    if trailing(evidence) > SURE:
+        raise InputError(
+            "not decided: hot pixels have trails in one direction, which grow with the distance "
+            "from the output; this is incomplete charge transfer, not crosstalk"
+        )
+    if not evidence.fringes:
+        evidence = central_crop(evidence, MOST_PIXELS)
+    every = links(evidence.good.shape)
+    sources = sources_of([evidence], lambda _: every) if every else None
     if sources is None:
         return None
     there, sigmas = significant_links(sources)
     if not there:
-        return None, sigmas
+        return Detection(sigmas, evidence, None, PixelClasses(1, 1, sources.first))
     near, classes = within(sources.shape, there), best_period(sources.of(there))
-    kernel = _kernel(sources.of(near), classes)
-    del sources  # large
+    return Detection(sigmas, evidence, sources.of(near), classes)
+
+
+def measure(found: Detection) -> Kernel | None:
+    """All couplings within two pixels and those found beyond; None without a significant one.
+
+    Raises InputError if their period is too long.
+    """
+    if found.sources is None:
+        return None
+    evidence, classes, near = found.evidence, found.classes, found.sources.links
+    kernel = _kernel(found.sources, classes)
     known = np.zeros(len(kernel.couplings), np.bool_)
     for _ in range(STEPS):
         # A coupling stays: where shares rise steeply, those at small signals are uncertain.
         known |= np.abs(kernel.shares) > THERE * kernel.errors
         updated = sources_of([evidence], lambda _: near, tuple(compress(kernel.couplings, known)))
         assert updated is not None
-        before, kernel = kernel, _kernel(updated, classes, *updated.level_dependence())
+        before, kernel = kernel, _kernel(updated, classes, *updated.level_dependence(classes))
         change = kernel.per_ke[0] - before.per_ke[0]
         moved = np.abs(kernel.shares - before.shares) * largest_outflow(kernel.couplings)
         if abs(change) < STILL * kernel.per_ke[1] and (moved < STILL * kernel.errors).all():
             break
-    return kernel, sigmas
+    return kernel
 
 
 def dense_kernel(parts: Iterable[Evidence], start: tuple[Coupling, ...]) -> Kernel | None:
@@ -157,29 +179,16 @@ def _sigmas(kernel: Kernel, column: F64) -> float:
     return abs(float(column @ kernel.shares)) / float(np.sqrt(column @ kernel.covariance @ column))
 
 
-def _examined(evidence: Evidence) -> tuple[Evidence, Sources | None]:
-    """The pixels examined, and what the frames measure of all their links."""
-    if trailing(evidence) > SURE:
-        raise InputError(
-            "not decided: hot pixels have trails in one direction, which grow with the distance "
-            "from the output; this is incomplete charge transfer, not crosstalk"
-        )
-    if not evidence.fringes:
-        evidence = central_crop(evidence, MOST_PIXELS)
-    every = links(evidence.good.shape)
-    return evidence, sources_of([evidence], lambda _: every) if every else None
-
-
 def best_period(sources: Sources) -> PixelClasses:
     """The classes of the period of the greatest evidence."""
 
-    def score(sums: tuple[PixelClasses, F64, F64]) -> float:
-        classes, normal, right = sums
+    def score(period: tuple[PixelClasses, Mapping[str, Equations]]) -> float:
+        classes, (normal, right) = period[0], total(period[1])
         fit = shrunk(block_diag(*normal), right.ravel(), sources.links, classes.count, rounds=FEW)
         pattern = 0.0 if sources.maps is None else sources.maps.pattern(classes)
         return fit[-1] + (pattern - WORTH * (classes.count - 1)) / 2
 
-    return max(sources.every_period(), key=score)[0]
+    return max(sources.periods(), key=score)[0]
 
 
 def _kernel(
@@ -193,54 +202,32 @@ def _kernel(
 
     With ``per_ke``, maps are not used, because they have one level.
     """
-    every = tuple(
-        coupling_of(classes, *divmod(u, 2), step)
-        for step in sources.links
-        for u in range(2 * classes.count)
-    )
+    every = couplings_of(classes, sources.links)
     if len(every) > MAX_SHARES:
         raise InputError(
             "not decided: a kernel of that period has more couplings than can be measured"
         )
-    known = _shares_of(every, sources.known)
-    by_source = sources.of_period(classes, per_ke)
-    normal, right = total(by_source)
+    known, rising = sources.known_shares(classes)
+    _, measured = next(sources.periods((classes.rows, classes.columns), doubted=False))
+    # The change of the frames if the known shares rose by this.
+    measured = {n: one.risen(rising - per_ke * known) for n, one in measured.items()}
+    normal, right = total(measured, per_ke)
     whole, rights, free = block_diag(*normal), right.ravel(), 0
     if sources.maps is not None and not per_ke:
         free = 2 * classes.count
         more, of_maps = sources.maps.sums(every, classes)
         whole = block_diag(whole, np.zeros((free, free))) + more
         rights = np.concatenate([rights, np.zeros(free)]) + of_maps
-    rights = rights + whole[:, : len(every)] @ known
+    rights = rights + whole[:, : len(every)] @ known.ravel()
     shares, covariance, _ = shrunk(whole, rights, sources.links, classes.count, free)
     couplings = zip(every, shares.tolist(), strict=True)
     return Kernel(
         tuple(replace(c, share=share, per_ke=per_ke) for c, share in couplings),
         covariance,
-        (*by_source, *["maps"] * bool(free)),
+        (*measured, *["maps"] * bool(free)),
         (per_ke, error),
         either,
     )
-
-
-def coupling_of(classes: PixelClasses, number: int, back: int, step: Place) -> Coupling:
-    """What a class gives over a step, or gets back; without its share."""
-    (dy, dx), (row, column) = step, divmod(number, classes.columns)
-    if back:
-        # From the partner, which is of another class.
-        row, column, dy, dx = (row + dy) % classes.rows, (column + dx) % classes.columns, -dy, -dx
-    return Coupling(dy, dx, 0.0, classes.rows, row, classes.columns, column)
-
-
-def _shares_of(every: Sequence[Coupling], known: Sequence[Coupling]) -> F64:
-    """Shares of all couplings, given some known ones, which may have a shorter period."""
-    shares = np.zeros(len(every))
-    for k in known:
-        for n, c in enumerate(every):
-            same = (k.dy, k.dx, k.row, k.column)
-            if same == (c.dy, c.dx, c.row % k.every_rows, c.column % k.every_columns):
-                shares[n] += k.share
-    return shares
 
 
 def shrunk(

@@ -1,11 +1,12 @@
 """Pairs of pixels that may couple, and classes of pixels that may couple in the same way."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
+from pixcal.kernels.crosstalk import Coupling
 from pixcal.model.arrays import F32, F64, Indices
 
 Place = tuple[int, int]
@@ -42,6 +43,29 @@ class PixelClasses:
         return np.asarray(row * self.columns + column)
 
 
+def couplings_of(classes: PixelClasses, links: Iterable[Place]) -> tuple[Coupling, ...]:
+    """Couplings over each link, there and back, of each class of pixels; without their shares."""
+    couplings = []
+    for (dy, dx), (row, column) in product(links, np.ndindex(classes.rows, classes.columns)):
+        period = {"every_rows": classes.rows, "every_columns": classes.columns}
+        couplings.append(Coupling(dy, dx, 0.0, row=row, column=column, **period))
+        # From the partner, which is of another class.
+        partner = {"row": (row + dy) % classes.rows, "column": (column + dx) % classes.columns}
+        couplings.append(Coupling(-dy, -dx, 0.0, **partner, **period))
+    return tuple(couplings)
+
+
+def shares_of(every: Iterable[Coupling], known: Iterable[Coupling]) -> F64:
+    """Shares of all couplings, given those of some, whose periods may be shorter."""
+
+    def same(c: Coupling, k: Coupling) -> bool:
+        own = c.dy, c.dx, c.row % k.every_rows, c.column % k.every_columns
+        return own == (k.dy, k.dx, k.row, k.column)
+
+    known = tuple(known)
+    return np.array([sum(k.share for k in known if same(c, k)) for c in every], float)
+
+
 def periods(shape: tuple[int, ...]) -> list[Place]:
     """Periods (rows, columns) that fit a window, the shortest first."""
     rows = range(1, max(1, min(MAX_PERIOD, shape[0] // MIN_REPEATS)) + 1)
@@ -50,10 +74,15 @@ def periods(shape: tuple[int, ...]) -> list[Place]:
     return sorted(both, key=lambda p: (p[0] * p[1], p))
 
 
-def class_sums(values: F32 | F64, first: Place) -> Iterator[tuple[PixelClasses, F64]]:
-    """Sums (..., class) of maps (..., y, x) over the pixels of each class, for every period."""
+def class_sums(
+    values: F32 | F64, first: Place, only: Place | None = None
+) -> Iterator[tuple[PixelClasses, F64]]:
+    """Sums (..., class) of maps (..., y, x) over the pixels of each class, for every period.
+
+    ``only``: for this period.
+    """
     # Rows first, then columns of those sums: row periods dominate the cost.
-    wanted = periods(values.shape[-2:])
+    wanted = periods(values.shape[-2:]) if only is None else [only]
     by_rows: dict[int, F32 | F64] = {}
     for n in sorted({n for n, _ in wanted}, reverse=True):
         # Sums for a multiple of the period are fewer to add up.
@@ -65,10 +94,3 @@ def class_sums(values: F32 | F64, first: Place) -> Iterator[tuple[PixelClasses, 
         rows = by_rows[n]
         both = np.stack([rows[..., (b - first[1]) % m :: m].sum(-1) for b in range(m)], -1)
         yield PixelClasses(n, m, first), both.reshape(*both.shape[:-2], n * m)
-
-
-def sums_of(values: F32 | F64, classes: PixelClasses) -> F64:
-    """Sums (..., class) of maps (..., y, x) over the pixels of each class."""
-    (n, m), (y, x) = (classes.rows, classes.columns), classes.first
-    places = [np.s_[..., (a - y) % n :: n, (b - x) % m :: m] for a, b in np.ndindex(n, m)]
-    return np.stack([values[at].sum((-2, -1), dtype=float) for at in places], -1)

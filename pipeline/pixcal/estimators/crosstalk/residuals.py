@@ -2,9 +2,9 @@
 
 Frames are corrected for the couplings known so far. Two parts are removed: what is common to the
 pixels of a frame (offset; light, contrast and phase, constant over the window or linear along it),
-and what is common to the frames of a pixel (its level; its fringe with harmonics). Removing the
-first correlates residuals by minus the products of the modes, which are appended as if they were
-frames. Removing the second makes residuals smaller, which is corrected here.
+and what is common to the frames of a pixel (its level and slow drift; its fringe with harmonics).
+Removing the first correlates residuals by minus the products of the modes, which are appended as if
+they were frames. Removing the second leaves less noise, and as much less information.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,6 +16,7 @@ from pixcal.estimators.diagnosis.distortions import FramesByPixels
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.crosstalk import Coupling, filled, uncouple, uncouple_fringes
+from pixcal.kernels.frame_order import slow_trends
 from pixcal.kernels.line_means import without_line_means
 from pixcal.model.arrays import F32, Indices, Mask
 
@@ -24,7 +25,7 @@ CLIP = 6.0  # residuals beyond this many sigmas (particles, telegraph noise) are
 # most samples of a sequence; longer ones are thinned to frames spread over them
 MAX_SAMPLES = 6_000_000
 MIN_FRAMES = 16  # fewest frames of a fringe set for residuals
-HARMONICS = 3  # of a pixel's fringe, as a nonlinear response causes
+HARMONICS = 5  # of a pixel's fringe, as a nonlinear response causes
 # modes are kept at this interval of frames; they change little, and only their products count
 STRIDE = 16
 STEPS = 3  # of the inverse of couplings; each leaves of the error the share that leaves a pixel
@@ -33,23 +34,23 @@ MIN_NOISE_SHARE = 0.1  # least share of its noise that a usable sample retains
 
 @dataclass(frozen=True)
 class Residuals:
-    """Weighted residuals (t, n) of the good pixels, 10² e-."""
+    """Weighted residuals of t frames and of modes."""
 
-    e: F32  # (t + modes, n) residuals times weight; those of the modes are last
-    charge: F32  # (t + modes, n) mean charge, 10⁴ e-; its shot noise variance is the same number
-    weight: F32  # (t + modes, n) one over the variance; zero where a sample is not used
-    count: int  # frames without modes
-    good: Mask  # (y, x)
-    steady: bool  # whether the charge of a pixel is the same in all frames
+    e: F32  # (r, y, x) residuals, 10² e-, times weight; those of the modes are last
+    # (t, y, x) mean charge, 10⁴ e-, whose shot noise variance is the same number; (1, y, x) where
+    # it is the same in all frames
+    charge: F32
+    weight: F32  # (t, y, x) one over the variance; zero where a sample is not used
+    frame: Indices  # (r,) row of ``charge`` of each residual
 
     @property
     def brightness(self) -> float:
         """Median charge, 10⁴ e-."""
         used = self.weight > 0
-        return float(np.median(self.charge[used])) if used.any() else 0.0
+        return float(np.median(np.broadcast_to(self.charge, used.shape)[used])) if used.any() else 0
 
 
-def all_residuals(evidence: Evidence, known: Sequence[Coupling]) -> Iterator[Residuals]:
+def all_residuals(evidence: Evidence, known: Sequence[Coupling] = ()) -> Iterator[Residuals]:
     """Residuals of each sequence of frames, without the known couplings."""
     for stack in evidence.stacks:
         if len(stack.adu) > 1:
@@ -65,7 +66,7 @@ def _spread(frames: int, pixels: int) -> Indices:
 
 
 def _of_stack(stack: Stack, evidence: Evidence, known: Sequence[Coupling]) -> Residuals:
-    """Bias, darks or flats; offset and level of each frame are free, and each pixel's level."""
+    """Bias, darks or flats; offset and level of each frame are free, and each pixel's drift."""
     at = _spread(len(stack.adu), evidence.good.size)
     signal = uncouple(
         (stack.adu[at] - evidence.bias) * evidence.gain, known, evidence.origin, STEPS
@@ -73,12 +74,12 @@ def _of_stack(stack: Stack, evidence: Evidence, known: Sequence[Coupling]) -> Re
     signal /= UNIT
     light = signal.mean(axis=0)
     good = evidence.good & (stack.adu.max(axis=0) < evidence.saturation_adu)
-    noise = without_line_means(((signal - light) * UNIT**0.5).astype(np.float32), good)[:, good]
-    charge = np.maximum(light[good], 0).astype(np.float32)
+    noise = without_line_means(((signal - light) * UNIT**0.5).astype(np.float32), good)
+    charge = np.maximum(light, 0).astype(np.float32)
     common = np.stack([np.ones_like(charge), charge])[: 1 + (stack.kind == "flat")]
     read = np.full_like(charge, evidence.read_noise**2 / UNIT)
-    every = np.tile(charge, (len(at), 1))
-    return _noise(noise, every, read, np.ones((1, len(at)), np.float32), common, good, True)
+    trends = np.ascontiguousarray(slow_trends(stack.frame[at]).T)
+    return _noise(noise, charge[None], read, trends, common, good)
 
 
 def _of_fringes(fringes: FringeEvidence, known: Sequence[Coupling]) -> Residuals:
@@ -94,36 +95,39 @@ def _of_fringes(fringes: FringeEvidence, known: Sequence[Coupling]) -> Residuals
         samples = uncouple(samples, known, fringes.origin, STEPS)
         samples[~seen] = np.nan
         theta = uncouple_fringes(theta, known, fringes.origin)
-    model = replace(fringes, theta=theta).model[:, good]
-    rest = (samples[:, good] - model) * np.float32(UNIT**-0.5)
+    model = replace(fringes, theta=theta).model
+    rest = (samples - model) * np.float32(UNIT**-0.5)
     charge = np.maximum(model / np.float32(UNIT), 0)
-    read = (fringes.read_variance * flat**2)[good].astype(np.float32) / np.float32(UNIT)
+    read = (fringes.read_variance * flat**2).astype(np.float32) / np.float32(UNIT)
     # Also changes along the window: a moving fringe vector, rows that are exposed later.
     y, x = grid((good.shape[0], good.shape[1]))
-    places = np.concatenate([theta, x * theta, y * theta])[:, good] / np.abs(theta).max()
+    places = np.concatenate([theta, x * theta, y * theta]) / np.abs(theta).max()
     turn = np.exp(1j * np.outer(range(1, HARMONICS + 1), fringes.phi))
     harmonics = np.concatenate([np.ones((1, len(at))), turn.real, turn.imag])
     of_time = np.ascontiguousarray(np.linalg.qr(harmonics.T)[0].T, np.float32)
-    return _noise(rest, charge, read, of_time, places.astype(np.float32), good, False)
+    return _noise(rest, charge, read, of_time, places.astype(np.float32), good)
 
 
-def _noise(
-    rest: F32, charge: F32, read: F32, of_time: F32, of_place: F32, good: Mask, steady: bool
-) -> Residuals:
-    """Residuals (t, n) of the good pixels without the parts common to pixels or to frames."""
-    variance = charge + read
-    weight = np.where(rest**2 < CLIP**2 * variance, 1 / variance, np.float32(0))
+def _noise(rest: F32, charge: F32, read: F32, of_time: F32, of_place: F32, good: Mask) -> Residuals:
+    """Residuals (t, y, x) without the parts common to pixels or to frames."""
+    (frames, *place), variance = rest.shape, charge + read
+    used = good & (rest**2 < CLIP**2 * variance)
+    weight = np.divide(1, variance, out=np.zeros_like(rest), where=used)
+    weight, of_place = weight.reshape(frames, -1), of_place.reshape(len(of_place), -1)
     freedom = FramesByPixels(weight, of_time, of_place)
-    rest = freedom.left_over(rest)
-    rest /= np.sqrt(np.maximum(1 - freedom.absorbed_by_pixels(), np.float32(MIN_NOISE_SHARE)))
+    rest = freedom.left_over(rest.reshape(weight.shape))
+    kept = 1 - freedom.absorbed_by_pixels()
+    weight = np.where(kept > MIN_NOISE_SHARE, weight, np.float32(0))
     # Excess noise lowers the weight of every product.
-    excess = (rest**2 * weight).sum(dtype=float) / max(np.count_nonzero(weight), 1)
+    excess = (rest**2 * weight).sum(dtype=float) / max((kept * (weight > 0)).sum(dtype=float), 1)
     weight = weight / np.float32(max(1.0, excess))
+    # A product of two residuals keeps this share of the covariance, and of the information.
+    information = np.asarray(weight * np.sqrt(np.maximum(kept, 0)), np.float32)
     size, axes = np.linalg.eigh(freedom.frame_covariance[::STRIDE])
-    size *= len(rest) / len(size)
+    size *= frames / len(size)
     to_modes = (np.sqrt(np.maximum(size, 0))[:, None] * axes).swapaxes(1, 2).astype(np.float32)
-    modes = np.concatenate(list(np.stack(to_modes, axis=1) @ of_place))
-    times = (len(of_place), 1)
-    every = np.concatenate([weight, np.tile(weight[::STRIDE], times)])
-    charge = np.concatenate([charge, np.tile(charge[::STRIDE], times)])
-    return Residuals(np.concatenate([rest, modes]) * every, charge, every, len(rest), good, steady)
+    modes = (np.stack(to_modes, axis=1) @ of_place) * information[::STRIDE]
+    e = np.concatenate([rest * weight, *modes]).reshape(-1, *place)
+    frame = np.arange(frames) * (len(charge) > 1)
+    frame = np.concatenate([frame, *[frame[::STRIDE]] * len(modes)])
+    return Residuals(e, charge, information.reshape(-1, *place), frame)

@@ -4,40 +4,31 @@ Each class of pixels has two unknown shares for a link, there and back: what rem
 known ones. Every source is linear in these, and gives least-squares sums of the same unknowns.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.estimators.crosstalk.covariance import (
-    Products,
-    joined,
-    products,
-    share_and_square,
-    share_sums,
-)
+from pixcal.estimators.crosstalk.covariance import Products
+from pixcal.estimators.crosstalk.equations import Equations
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels, hot_pixels
-from pixcal.estimators.crosstalk.links import PixelClasses, Place, class_sums, sums_of
+from pixcal.estimators.crosstalk.links import (
+    PixelClasses,
+    Place,
+    class_sums,
+    couplings_of,
+    shares_of,
+)
 from pixcal.estimators.crosstalk.maps import Maps
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.boundaries import REACH, boundary_shifts, shared_noise
 from pixcal.kernels.crosstalk import Coupling
-from pixcal.kernels.normal_matrix import symmetric
-from pixcal.model.arrays import F32, F64
+from pixcal.model.arrays import F64
 
 CHANGES = np.arange(-0.02, 1.0, 1e-4)  # relative, of shares with the signal, 1/ke-
 CERTAIN = 5.0  # sigmas beyond which such a change is accepted
 MORE = 10.0  # fall in chi-square that boundaries, as a further cause, must bring; as in a search
 FALLOFFS = (0.25, 0.5, 1.0)  # of boundary shifts with distance, px
-
-# Least-squares sums of the shares of each link, by source: normal (link, u, u), right (link, u)
-Information = dict[str, tuple[F64, F64]]
-
-
-def total(information: Information) -> tuple[F64, F64]:
-    """Sums over all sources."""
-    normal, right = zip(*information.values(), strict=True)
-    return np.sum(normal, axis=0), np.sum(right, axis=0)
 
 
 @dataclass(frozen=True)
@@ -59,97 +50,71 @@ class Sources:
         hot = None if self.hot is None else self.hot.of(at)
         return replace(self, noise=noise, hot=hot, links=tuple(steps))
 
-    def every_period(self) -> Iterator[tuple[PixelClasses, F64, F64]]:
-        """Sums of all links for each period that fits, with `DOUBT` of all hot pixels."""
-        both = zip(*(class_sums(one, self.first) for one in self._products), strict=True)
-        for (classes, right), (_, normal) in both:
-            yield classes, *total(self._information(classes, right, normal, True))
+    def periods(
+        self, only: Place | None = None, doubted: bool = True
+    ) -> Iterator[tuple[PixelClasses, dict[str, Equations]]]:
+        """Equations by source, for each period that fits, or for one (rows, columns).
 
-    def of_period(self, classes: PixelClasses, per_ke: float) -> Information:
-        """All links, for one period, and for shares that change with the signal (1/ke-)."""
-        right, normal = (sums_of(one, classes) for one in self._products)
-        return self._information(classes, right, normal, False, per_ke)
+        ``doubted``: with `DOUBT` of all hot pixels.
+        """
+        none = np.zeros((1, *self.shape), np.float32)
+        right, normal = (
+            (none, none) if self.noise is None else (self.noise.right, self.noise.normal)
+        )
+        both = (class_sums(one, self.first, only) for one in (right, normal))
+        for (classes, rights), (_, normals) in zip(*both, strict=True):
+            found = {}
+            if self.noise is not None:
+                found["covariance"] = self.noise.equations(rights, normals)
+            if self.hot is not None:
+                found["hot pixels"] = self.hot.equations(classes, self.links, doubted)
+            yield classes, found
 
-    def level_dependence(self) -> tuple[float, float, bool]:
+    def known_shares(self, classes: PixelClasses) -> tuple[F64, F64]:
+        """Known shares (link, class, 2), there and back, and their rises with the signal, 1/ke-."""
+        every = couplings_of(classes, self.links)
+        rising = [c.scaled(c.per_ke) for c in self.known]
+        shape = len(self.links), classes.count, 2
+        return shares_of(every, self.known).reshape(shape), shares_of(every, rising).reshape(shape)
+
+    def level_dependence(self, classes: PixelClasses) -> tuple[float, float, bool]:
         """Relative change of the known shares with the signal, zero if not certain; its error.
 
         Both in 1/ke-. All shares change by the same factor. A rise is attributed to boundaries
         shifted by charge (brighter-fatter) if these describe the noise much better. The last value:
         whether either is possible.
         """
-        there = self._by_link(self.known) != 0
-        shares, rises, covariances, used = [], [], [], []  # of each measured value
-        doubt = by_boundaries = 0.0
-        if self.noise is not None:
-            shot, apart, error = self.noise.shot
-            doubt = error / 20
-            value, covariance = share_and_square(self.noise)
-            share, square = value.T / shot
-            # Both pixels of a pair give; 10⁴ e- are 10 ke-.
-            share = 40 * share + 20 * self._by_link(self.known).sum(axis=1)
-            square += 20 * self._by_link(self.known, True).sum(axis=1)
-            # A slope of the variance is no change of the shares.
-            shares, rises = [share], [square - apart / 20 * share]
-            covariances = [covariance * [[1600, 40], [40, 1]]]
-            used = [there.any(axis=1)]
-            by_boundaries = _left_by_boundaries(self.links, rises[0], covariance[:, 1, 1])
-        if self.hot is not None:
-            hot = self.hot.by_class(PixelClasses(1, 1, self.first), self.links)
-            share, rise, covariance = hot.rises()
-            seen = covariance[..., 1, 1] < np.inf
-            rise = rise + self._by_link(self.known, True)
-            by_boundaries += float((rise**2 / covariance[..., 1, 1])[seen].sum())
-            shares.append((share + self._by_link(self.known))[seen])
-            rises.append(rise[seen])
-            covariances.append(covariance[seen])
-            used.append(there[seen])
-        share, rise = np.concatenate(shares), np.concatenate(rises)
-        (own, mixed), (_, other) = np.moveaxis(np.concatenate(covariances), 0, -1)
+        known, rising = (shares.mean(axis=1) for shares in self.known_shares(classes))
+        measured, by_boundaries = [], 0.0
+        for source, equations in next(self.periods((1, 1), False))[1].items():
+            share, rise, covariance = equations.rises(known, rising)
+            variance = covariance[..., 1, 1]
+            seen, used = np.isfinite(variance), (known != 0) @ equations.of_rise.T > 0
+            measured.append([a[seen] for a in (share, rise, used, covariance)])
+            if source == "covariance":
+                by_boundaries += _left_by_boundaries(self.links, rise[:, 1], variance[:, 1])
+            else:
+                by_boundaries += float((rise[seen] ** 2 / variance[seen]).sum())
+        share, rise, used, covariance = (np.concatenate(a) for a in zip(*measured, strict=True))
+        (own, mixed), (_, other) = np.moveaxis(covariance, 0, -1)
         trial = np.append(CHANGES, 0.0)[:, None]
-        left = (rise - trial * share) ** 2 / (other - 2 * trial * mixed + trial**2 * own)
-        own_left = left[:, np.concatenate(used)].sum(axis=1)
+        variance = other - 2 * trial * mixed + trial**2 * own
+        left = (rise - trial * share) ** 2 / variance
+        own_left = left[:, used].sum(axis=1)
         best = own_left.argmin()
-        weight = share**2 / (other - 2 * trial[best] * mixed + trial[best] ** 2 * own)
-        weight = float(weight[np.concatenate(used)].sum())
+        weight = float((share**2 / variance[best])[used].sum())
+        doubt = 0.0 if self.noise is None else self.noise.shot[2]
         gain = (own_left[-1] - own_left[best]) / (1 + weight * doubt**2)
         rises, better = trial[best, 0] > 0, float(left[best].sum()) - by_boundaries
         taken = gain > CERTAIN**2 and not (rises and better > MORE)
         error = float(np.hypot(max(weight, 1e-30) ** -0.5, doubt))
         return float(trial[best, 0]) if taken else 0.0, error, bool(rises and abs(better) < MORE)
 
-    def _by_link(self, couplings: Sequence[Coupling], changes: bool = False) -> F64:
-        """Shares (link, 2) there and back, mean of all pixels, or their changes with the signal."""
-        sums = np.zeros((len(self.links), 2))
-        for c in couplings:
-            back = (c.dy, c.dx) not in self.links
-            link = self.links.index((-c.dy, -c.dx) if back else (c.dy, c.dx))
-            share = c.share * c.per_ke if changes else c.share
-            sums[link, int(back)] += share / (c.every_rows * c.every_columns)
-        return sums
 
-    @property
-    def _products(self) -> tuple[F32, F32]:
-        if self.noise is None:
-            none = np.zeros((len(self.links), 0, *self.shape), np.float32)
-            return none, none
-        return self.noise.right, self.noise.normal
-
-    def _information(
-        self, classes: PixelClasses, right: F64, normal: F64, doubted: bool, per_ke: float = 0.0
-    ) -> Information:
-        sums = {}
-        # The change of the frames if the known shares changed by this.
-        more = self._by_link(self.known, True) - per_ke * self._by_link(self.known)
-        if self.noise is not None:
-            squares = symmetric(np.moveaxis(normal, 1, -1))[..., -1]
-            right = right / self.noise.shot[0] + np.moveaxis(
-                squares * (20 * more.sum(axis=1))[:, None, None], -1, 1
-            )
-            sums["covariance"] = share_sums(right, normal, self.noise.read, per_ke)
-        if self.hot is not None:
-            hot = self.hot.by_class(classes, self.links, doubted)
-            sums["hot pixels"] = hot.sums(more, per_ke)
-        return sums
+def total(equations: Mapping[str, Equations], per_ke: float = 0.0) -> tuple[F64, F64]:
+    """Sums (link, u, u), (link, u) of the shares over all sources; see `Equations.shares`."""
+    normal, right = zip(*(one.shares(per_ke) for one in equations.values()), strict=True)
+    return np.sum(normal, axis=0), np.sum(right, axis=0)
 
 
 def _left_by_boundaries(links: Sequence[Place], value: F64, variance: F64) -> float:
@@ -179,16 +144,14 @@ def sources_of(
     ``parts``: of the same pixels, each needed once. ``steps_in``: steps (dy, dx) in a window of
     given rows and columns. ``known``: couplings for which all data are corrected first.
     """
-    noise: list[Products | None] = []
-    sources: Sources | None = None
+    noise: Products | None = None
     for part in parts:
-        if sources is None:
-            shape, steps = part.good.shape, steps_in(part.good.shape)
+        if noise is None:
+            shape, first, steps = part.good.shape, part.origin, steps_in(part.good.shape)
             maps, hot = Maps.of(part.without_frames(), known), hot_pixels(part, steps, known)
-            sources = Sources(None, hot, maps, steps, shape, part.origin, known)
-        noise.append(products(part, sources.links, known))
+            noise = Products.none(steps, part)
+        noise.add(part, steps, known)
         del part  # the next one is read only then
-    total = joined(noise)
-    if sources is None or (total is None and sources.hot is None):
+    if noise is None or not (noise.lit or hot):
         return None
-    return replace(sources, noise=total)
+    return Sources(noise if noise.lit else None, hot, maps, steps, shape, first, known)

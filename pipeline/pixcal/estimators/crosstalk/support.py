@@ -6,11 +6,11 @@ tests of adjacent pixels with equal coupling everywhere.
 """
 
 import numpy as np
-from scipy.special import log_ndtr, ndtri, ndtri_exp
+from scipy.special import ndtri
 
 from pixcal.estimators.crosstalk.links import Place, periods
-from pixcal.estimators.crosstalk.sources import Sources
-from pixcal.kernels.significance import log_of_any
+from pixcal.estimators.crosstalk.sources import Sources, total
+from pixcal.kernels.significance import sigmas_of_largest
 from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
 
@@ -29,13 +29,9 @@ def sigmas_of(*families: tuple[float, int]) -> float:
     ``families``: the largest chi-square of tests made together, and their number; all families
     have the same share of the chance.
     """
-    sigmas = []
-    for best, count in families:
-        log_one, tests = np.log(2) + log_ndtr(-np.sqrt(best)), INDEPENDENT * count * len(families)
-        none = tests * np.log1p(-np.exp(log_one))
-        rare = none > -0.5
-        sigmas.append(-ndtri_exp(log_of_any(float(log_one), tests)) if rare else ndtri_exp(none))
-    return float(max(sigmas))
+    # A chi-square is the square of a normal of either sign.
+    tests = 2 * INDEPENDENT * len(families)
+    return max(sigmas_of_largest(best**0.5, tests * count) for best, count in families)
 
 
 def significant_links(sources: Sources) -> tuple[tuple[Place, ...], float]:
@@ -46,7 +42,8 @@ def significant_links(sources: Sources) -> tuple[tuple[Place, ...], float]:
     links = sources.links
     tests = len(links) * sum(3 * n * m for n, m in periods(sources.shape))
     gains = []
-    for _, normal, right in sources.every_period():
+    for _, equations in sources.periods():
+        normal, right = total(equations)
         gains.append(_best_gains(normal, right))
         if len(gains) == 1:
             at = [n for n, step in enumerate(links) if step in NEAREST]
@@ -66,8 +63,8 @@ def significant_links(sources: Sources) -> tuple[tuple[Place, ...], float]:
             f"them beyond {NEAR} pixels (at most {MAX_FAR} are measured); this is not a "
             "crosstalk kernel"
         )
-    adjacent = max(float(gains[0][close].max()), alike, 1e-9)
-    return there, sigmas_of((max(float(best.max()), 1e-9), tests), (adjacent, few))
+    adjacent = max(float(gains[0][close].max()), alike)
+    return there, sigmas_of((float(best.max()), tests), (adjacent, few))
 
 
 def _critical(tests: int) -> float:
