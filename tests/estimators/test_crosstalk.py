@@ -108,7 +108,7 @@ def noise_shared(steps, alike, share=0.01, maps=None):
     for n, step in enumerate(steps):
         right[n, :2] = 1e4 * share if step in alike else 0.0
     line = 1e6 * np.column_stack([np.eye(3), [1, 0, 0]])  # as much noise as the charge gives
-    noise = Products(right, normal, line, 0.02)
+    noise = Products(right, normal, line, 0.02, brightest=1.0)
     return Sources(noise, None, maps, steps, shape, (0, 0))
 
 

@@ -142,12 +142,17 @@ def within(shape: tuple[int, ...], far: Collection[Place] = ()) -> tuple[Place, 
 
 def significant(kernel: Kernel) -> tuple[tuple[Coupling, ...], F64]:
     """The significant couplings, as one if equal in all classes, and their covariance."""
-    each = np.eye(len(kernel.couplings))
-    steps: dict[Place, list[int]] = {}
-    for n, c in enumerate(kernel.couplings):
-        steps.setdefault((c.dy, c.dx), []).append(n)
+    each, places = np.eye(len(kernel.couplings)), [(c.dy, c.dx) for c in kernel.couplings]
+
+    def sigmas(column: F64) -> float:
+        """Significance of the sum of some shares."""
+        return abs(float(column @ kernel.shares)) / float(
+            (column @ kernel.covariance @ column) ** 0.5
+        )
+
     basis, couplings = [], []
-    for at in steps.values():
+    for place in dict.fromkeys(places):
+        at = [n for n, own in enumerate(places) if own == place]
         precision = np.linalg.inv(kernel.covariance[np.ix_(at, at)])
         rest = kernel.shares[at] - precision.sum(axis=0) @ kernel.shares[at] / precision.sum()
         alike = chdtrc(max(len(at) - 1, 1), max(float(rest @ precision @ rest), 0.0)) > ALIKE
@@ -155,8 +160,8 @@ def significant(kernel: Kernel) -> tuple[tuple[Coupling, ...], F64]:
             # Noise alone measures the sum of the shares there and back (neighbours in the list): a
             # pair whose sum is significant has both, as long as they cannot be distinguished.
             there, back = (each[[n ^ way for n in group]].sum(axis=0) for way in (0, 1))
-            both, apart = _sigmas(kernel, there + back), _sigmas(kernel, there - back)
-            if _sigmas(kernel, there) > THERE or both > THERE > apart:
+            both, apart = sigmas(there + back), sigmas(there - back)
+            if sigmas(there) > THERE or both > THERE > apart:
                 one = kernel.couplings[group[0]]
                 if alike:
                     one = replace(one, every_rows=1, row=0, every_columns=1, column=0)
@@ -172,11 +177,6 @@ def significant(kernel: Kernel) -> tuple[tuple[Coupling, ...], F64]:
         covariance[n, n] = max(covariance[n, n], np.diag(kernel.covariance)[column].mean())
     named = zip(couplings, shares.tolist(), strict=True)
     return tuple(replace(c, share=share) for c, share in named), covariance
-
-
-def _sigmas(kernel: Kernel, column: F64) -> float:
-    """Significance of the sum of some shares."""
-    return abs(float(column @ kernel.shares)) / float(np.sqrt(column @ kernel.covariance @ column))
 
 
 def best_period(sources: Sources) -> PixelClasses:

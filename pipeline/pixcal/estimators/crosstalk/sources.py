@@ -35,7 +35,7 @@ FALLOFFS = (0.25, 0.5, 1.0)  # of boundary shifts with distance, px
 class Sources:
     """Measurements of some links."""
 
-    noise: Products | None
+    noise: Products
     hot: HotPixels | None
     maps: Maps | None
     links: tuple[Place, ...]
@@ -46,9 +46,8 @@ class Sources:
     def of(self, steps: Sequence[Place]) -> "Sources":
         """Those of some links."""
         at = [self.links.index(step) for step in steps]
-        noise = None if self.noise is None else self.noise.of(at)
         hot = None if self.hot is None else self.hot.of(at)
-        return replace(self, noise=noise, hot=hot, links=tuple(steps))
+        return replace(self, noise=self.noise.of(at), hot=hot, links=tuple(steps))
 
     def periods(
         self, only: Place | None = None, doubted: bool = True
@@ -57,14 +56,11 @@ class Sources:
 
         ``doubted``: with `DOUBT` of all hot pixels.
         """
-        none = np.zeros((1, *self.shape), np.float32)
-        right, normal = (
-            (none, none) if self.noise is None else (self.noise.right, self.noise.normal)
-        )
-        both = (class_sums(one, self.first, only) for one in (right, normal))
+        sums = self.noise.right, self.noise.normal
+        both = (class_sums(one, self.first, only) for one in sums)
         for (classes, rights), (_, normals) in zip(*both, strict=True):
             found = {}
-            if self.noise is not None:
+            if self.noise.lit:
                 found["covariance"] = self.noise.equations(rights, normals)
             if self.hot is not None:
                 found["hot pixels"] = self.hot.equations(classes, self.links, doubted)
@@ -103,7 +99,7 @@ class Sources:
         own_left = left[:, used].sum(axis=1)
         best = own_left.argmin()
         weight = float((share**2 / variance[best])[used].sum())
-        doubt = 0.0 if self.noise is None else self.noise.shot[2]
+        doubt = self.noise.shot[2] if self.noise.lit else 0.0
         gain = (own_left[-1] - own_left[best]) / (1 + weight * doubt**2)
         rises, better = trial[best, 0] > 0, float(left[best].sum()) - by_boundaries
         taken = gain > CERTAIN**2 and not (rises and better > MORE)
@@ -154,4 +150,4 @@ def sources_of(
         del part  # the next one is read only then
     if noise is None or not (noise.lit or hot):
         return None
-    return Sources(noise if noise.lit else None, hot, maps, steps, shape, first, known)
+    return Sources(noise, hot, maps, steps, shape, first, known)
