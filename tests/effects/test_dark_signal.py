@@ -50,6 +50,28 @@ def test_widths_of_pixels_are_not_taken_for_it(acquired: Acquired) -> None:
     assert width is None or width.refused or width.significance < 4
 
 
+def with_own_responses(evidence: Evidence, rms: float) -> Evidence:
+    """Signals that each pixel bends by a share of its own; maps fitted again."""
+    bend = np.random.default_rng(5).normal(0, rms, evidence.good.shape).astype(np.float32)
+    fringes = {}
+    for name, f in evidence.fringes.items():
+        electrons = f.electrons * (1 - bend * f.electrons / np.nanmedian(f.electrons))
+        theta = np.einsum("it,tyx->iyx", np.linalg.pinv(f.g), np.nan_to_num(electrons))
+        fringes[name] = replace(f, electrons=electrons, theta=theta)
+    return replace(evidence, fringes=fringes)
+
+
+@pytest.mark.parametrize("rate", [0.0, 2000.0])
+def test_nonlinearity_of_single_pixels_is_not_taken_for_it(acquired: Acquired, rate: float) -> None:
+    """It bends the fringes of a pixel too, which a charge does not."""
+    effects = {"dark_signal": {"scatter": rate}} if rate else {}
+    scatter, error, significance = measured(with_own_responses(acquired(NO_DARKS, effects), 0.01))
+    if rate:
+        assert scatter == pytest.approx(rate, abs=4 * np.hypot(error, rate / np.sqrt(2 * 5000)))
+    else:
+        assert significance < 4
+
+
 def test_dark_frames_measure_it(acquired: Acquired) -> None:
     evidence = acquired({"detector.hot_fraction": 0.0}, RATE)
     found = DarkSignal.estimate(evidence)

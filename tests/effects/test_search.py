@@ -401,21 +401,6 @@ def test_a_cause_is_judged_by_what_it_changes(
     assert left > 0.5
 
 
-@pytest.mark.parametrize("random", [False, True])
-def test_statistics_of_a_random_map_are_one_observation(random: bool) -> None:
-    """Beside an unknown cause as large as each of them, they do not make the map a cause."""
-
-    class ToyOfPixels(ToyOfMaps):
-        random_map = random
-
-    effect = ToyOfPixels("left", 0.03)
-    object.__setattr__(effect, "name", "left")
-    one = Candidate("left", Estimate(effect, {"size": 3e-4}, 50.0, "told"))
-    found, left = search({"left": 0.03, "single 5": 0.03}, [one])
-    assert found.accepted == (() if random else ("left",))
-    assert left > 0.3
-
-
 @pytest.mark.parametrize("more", [False, True])
 def test_its_own_significance_alone_supports_no_cause(more: bool) -> None:
     """Fitted and held-out frames agree in it, whatever the true cause."""

@@ -30,7 +30,6 @@ class DarkSignal(Effect):
     acts_at = Stage.CHARGE
     order = 0
     domains = ("space",)
-    random_map = True
     strengths = ("scatter",)
     absorbed_because = "it changes the visibility of a pixel but not the phase; record dark frames"
     frames_needed = ("dark",)

@@ -16,6 +16,7 @@ from pixcal.estimators.maps.map_fit import (
     neighbour_products,
     polynomial,
     without,
+    without_harmonics,
 )
 from pixcal.estimators.maps.ring_power import Ring, ring_power
 from pixcal.kernels.beams import LightMaps
@@ -53,7 +54,6 @@ class FlatError(Effect):
     acts_at = Stage.PIXEL
     order = 2
     domains = ("space",)
-    random_map = True
     strengths = ("pixel_rms", "smooth_rms", "wave_cos", "wave_sin")
     absorbed_because = (
         "it scales level and fringes of a pixel equally and does not change the phase"
@@ -219,7 +219,7 @@ def _structure(
         out = np.zeros(good.shape)
         out[good] = np.where(np.abs(rest) < limit, rest, 0.0)
         maps.append(out)
-    return maps[0], maps[1]
+    return without_harmonics(maps[0], maps[1], fringes, good)
 
 
 def _smooth(neighbours: F64, ring: Ring) -> tuple[float, float, float]:

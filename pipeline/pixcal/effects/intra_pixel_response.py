@@ -43,7 +43,6 @@ class IntraPixelResponse(Effect):
     acts_at = Stage.PIXEL
     order = 1
     domains = ("space",)
-    random_map = True
     strengths = ("width_px", "width_rms_px")
     frames_needed = ("baseline",)
     sources = (

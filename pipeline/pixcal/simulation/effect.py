@@ -132,8 +132,6 @@ class Effect(ForwardModel):
         What to do about it on a detector without fringes; empty if it shows only in fringes.
     is_gain : bool
         Whether it scales all samples equally, which photon transfer measures.
-    random_map : bool
-        Whether its map is drawn at random: simulations show its size, not the detector's pattern.
     fit_model : str
         Shape of the fringes (`pixcal.estimators.fringe_fit.shapes`) that absorbs it.
     smooth_degree : int
@@ -144,7 +142,6 @@ class Effect(ForwardModel):
     left_because: ClassVar[str] = ""
     remedy: ClassVar[str] = ""
     is_gain: ClassVar[bool] = False
-    random_map: ClassVar[bool] = False
     fit_model: ClassVar[str] = ""
     smooth_degree: ClassVar[int] = 3
 

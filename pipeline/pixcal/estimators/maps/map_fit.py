@@ -17,9 +17,11 @@ from pixcal.estimators.maps.stitching import within
 from pixcal.estimators.maps.structure import CELLS
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.robust import median, robust_sigma
+from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64, Indices, Mask
 
 _CLIP = 5.0
+MIN_APART = 0.1  # least part of a harmonic that is not absorbed by the fit, for it to be compared
 _MIN_VARIANCE = 1e-30  # least variance, for a map that its signals fit exactly
 
 
@@ -142,10 +144,62 @@ def without(columns: F64, free: F64) -> F64:
 
 def half_theta(fringes: FringeEvidence, half: int, good: Mask) -> F64:
     """Maps (3, pixel) of a set at good pixels, from every second frame only (half 0 or 1)."""
+    rest = _half_residual(fringes, half, good)
+    return np.asarray(fringes.theta[:, good] + np.linalg.pinv(fringes.g[half::2]) @ rest)
+
+
+def without_harmonics(
+    first: F64, second: F64, fringes: FringeEvidence, kept: Mask
+) -> tuple[F64, F64]:
+    """Maps (y, x), one of each half of the frames, less what goes with second harmonics of pixels.
+
+    A nonlinear response that differs between pixels changes the maps and their harmonics alike.
+    """
+    one, other = (_half_harmonic(fringes, half, kept) for half in (0, 1))
+    product = one * other  # the noise of the halves is independent
+    square = float(product.sum())
+    if square <= SIGNIFICANT * float(np.sqrt((product**2).sum())):
+        return first, second
+    slopes = float((first * other).sum()) / square, float((second * one).sum()) / square
+    return first - slopes[0] * one, second - slopes[1] * other
+
+
+def _half_harmonic(fringes: FringeEvidence, half: int, kept: Mask) -> F64:
+    """Curvature (y, x) of the response at the mean light, from the second harmonic of the fringes.
+
+    Less means of rows and columns; zero where the phases do not separate it from the fringes.
+    """
+    mean, of_sine, of_cosine = fringes.theta[:, kept]
+    turns = np.exp(-2j * fringes.phi[half::2])
+    axes = np.linalg.qr(fringes.g[half::2])[0]
+    turns = turns - axes @ (axes.T @ turns)
+    square = float(np.sum(np.abs(turns) ** 2))
+    if square < MIN_APART * len(turns):
+        return np.zeros(kept.shape)
+    sizes = 2 / square * (turns @ _half_residual(fringes, half, kept))
+    # The signal goes with sin(phi + psi).
+    phasor = of_cosine + 1j * of_sine
+    alpha = np.maximum(np.abs(phasor), 1e-9)
+    # It goes with the square of the amplitude.
+    return without_lines((sizes * (phasor.conj() / alpha) ** 2).real * mean / alpha**2, kept)
+
+
+def without_lines(values: F64, kept: Mask) -> F64:
+    """Values (pixel,) of kept pixels less means of rows and columns, as (y, x); zero elsewhere."""
+    for index in np.nonzero(kept):
+        count = np.maximum(np.bincount(index), 1)
+        values = values - (np.bincount(index, values) / count)[index]
+    out = np.zeros(kept.shape)
+    out[kept] = values
+    return out
+
+
+def _half_residual(fringes: FringeEvidence, half: int, good: Mask) -> F64:
+    """Residuals (t, pixel) of half the frames at good pixels, e-; zero without weight."""
     every = fringes.residual.reshape(len(fringes.residual), -1)[half::2]
     rest = np.take(every, np.flatnonzero(good), axis=1).astype(float)
     rest[np.isnan(rest)] = 0
-    return np.asarray(fringes.theta[:, good] + np.linalg.pinv(fringes.g[half::2]) @ rest)
+    return rest
 
 
 def neighbour_products(one: F64, other: F64, good: Mask) -> F64:

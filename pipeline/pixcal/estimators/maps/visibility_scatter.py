@@ -6,7 +6,14 @@ from itertools import combinations
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
-from pixcal.estimators.maps.map_fit import gauge_terms, half_theta, neighbour_products, without
+from pixcal.estimators.maps.map_fit import (
+    gauge_terms,
+    half_theta,
+    neighbour_products,
+    without,
+    without_harmonics,
+    without_lines,
+)
 from pixcal.estimators.maps.structure import without_outliers
 from pixcal.model.arrays import F64, Mask
 
@@ -46,7 +53,8 @@ def _two_halves(fringes: FringeEvidence) -> tuple[F64, F64, Mask]:
     """Visibility of the pixels in two halves of the frames; where both are known."""
     one, other = (_visibility(fringes, half) for half in (0, 1))
     kept = np.isfinite(one) & np.isfinite(other)
-    return _structure(one, kept), _structure(other, kept), kept
+    one, other = (without_lines(half[kept], kept) for half in (one, other))
+    return *without_harmonics(one, other, fringes, kept), kept
 
 
 def _visibility(fringes: FringeEvidence, half: int) -> F64:
@@ -59,14 +67,3 @@ def _visibility(fringes: FringeEvidence, half: int) -> F64:
     used = np.isfinite(rest)
     rest[used] = without(rest[used][:, None], gauge_terms(fringes)[:, used].T)[:, 0]
     return rest
-
-
-def _structure(visibility: F64, kept: Mask) -> F64:
-    """Visibility (y, x) minus means of rows and columns; zero where not kept."""
-    rest = visibility[kept]
-    for index in np.nonzero(kept):
-        count = np.maximum(np.bincount(index), 1)
-        rest = rest - (np.bincount(index, rest) / count)[index]
-    out = np.zeros(kept.shape)
-    out[kept] = rest
-    return out

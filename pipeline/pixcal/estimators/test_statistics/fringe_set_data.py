@@ -10,6 +10,7 @@ from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.maps.map_fit import MIN_APART
 from pixcal.estimators.maps.structure import (
     fit_terms,
     flattened,
@@ -31,7 +32,6 @@ from pixcal.model.arrays import C128, F32, F64, Indices, Mask
 OUTLIER_SIGMA = 8.0  # standard deviations beyond which a residual counts only as an outlier
 OUTLIERS = (5.0, 7.0, 10.0)  # standard deviations beyond which residuals are counted
 HARMONICS = (2, 3, 4)  # orders that are looked for
-MIN_APART = 0.1  # least part of a harmonic that is not absorbed by the fit, for it to be compared
 
 
 @dataclass(frozen=True)

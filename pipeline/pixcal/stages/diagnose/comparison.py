@@ -160,23 +160,11 @@ class Comparison:
 
         Those ``apart`` do not count.
         """
-        return self._remaining(trial, where, apart).total
-
-    def most_closed(
-        self, fewer: Trial, trial: Trial, where: set[Key], apart: Set[Key] = frozenset()
-    ) -> float:
-        """Fraction of the gap in the statistic that closes most from ``fewer`` to ``trial``."""
-        before, after = (self._remaining(bench, where, apart) for bench in (fewer, trial))
-        sizes = before.weights
-        closed = (own * (before.left[key] - after.left[key]) for key, own in sizes.items())
-        return max(closed, default=0.0) / max(sum(sizes.values()), 1e-12)
-
-    def _remaining(self, trial: Trial, where: set[Key], apart: Set[Key]) -> Gap:
         before, after = (
             {k: d for k, d in compare(self.data, bench.expected).items() if k not in apart}
             for bench in (self.nominal, trial)
         )
-        return remaining(before, after, where - apart)
+        return remaining(before, after, where - apart).total
 
     def residual_size(self, trial: Trial, where: set[Key]) -> float:
         """The same by effect sizes, as in the reported gap, instead of significances."""

@@ -170,11 +170,6 @@ def doubtful(
         apart = {_own(candidates[name])} if unknown else set()
         left[name] = comparison.residual(current, where, apart)
         closed[name] = comparison.residual(trial, where, apart) - left[name]
-        estimate = candidates[name].estimate
-        if unknown and estimate is not None and estimate.effect.random_map:
-            # All statistics of the map follow from its variance: they are one observation.
-            most = comparison.most_closed(trial, current, where, apart)
-            closed[name] = min(closed[name], most)
         share = 1 if unknown and not untried else MIN_SHARE_OF_RESIDUAL
         needed[name] = max(share * left[name], MIN_GAP_CLOSED * (name in imitated))
     among = [name for name in closed if closed[name] < needed[name]]
