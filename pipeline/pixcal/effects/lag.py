@@ -20,7 +20,7 @@ from pixcal.estimators.diagnosis.central_crop import central_crop
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.charge_release import fill_traps, left_behind, released_by_frame
 from pixcal.kernels.scene import TILE, Rows, chip_map
-from pixcal.kernels.significance import sigmas_of_best
+from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best
 from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench, SimulatedDetector
 from pixcal.model.config import quantity
@@ -320,17 +320,21 @@ class Lag(Effect):
         if of_flats is None:
             return None
         share, error, carried = of_flats
-        before = "charge of the frame before"
-        if not carried:
-            pairs = all(len(s.adu) < _TELL_LAMP for s in evidence.ladder)
-            before = "clearing; a shutter or lamp that gives the first frame less light looks "
-            before += "the same: take darks at once after flats"
-            before += ", and three flats per level" if pairs else ""
-        return _estimate(
+        found = _estimate(
             cls(float(np.clip(share, 0, 0.5)), spread=0.0, carried=carried),
             {"share": error},
             share / error,
-            f"the first flat of each level is fainter, as after {before}",
+            "the first flat of each level is fainter, as after charge of the frame before",
+        )
+        if carried or found.significance < SIGNIFICANT:
+            return found
+        pairs = all(len(s.adu) < _TELL_LAMP for s in evidence.ladder)
+        # Charge that no frame gets back is not known to stay behind.
+        return replace(
+            found,
+            refused="the first flat of each level is fainter, whatever the frame before, as with a "
+            "slow shutter or a warming lamp; take darks at once after flats"
+            + (", and three flats per level" if pairs else ""),
         )
 
 
