@@ -42,6 +42,12 @@ def test_one_set_is_enough(acquired: Acquired) -> None:
     assert scatter == pytest.approx(2000.0, abs=4 * np.hypot(error, 2000 / np.sqrt(2 * 5000)))
 
 
+def test_a_nonlinearity_of_all_pixels_does_not_hide_it(acquired: Acquired) -> None:
+    """Its harmonics vary over the window as the contrast does; that is no property of pixels."""
+    scatter, error, _ = measured(acquired(NO_DARKS, RATE | {"nonlinearity": {"quadratic": -0.05}}))
+    assert scatter == pytest.approx(2000.0, abs=4 * np.hypot(error, 2000 / np.sqrt(2 * 5000)))
+
+
 def test_widths_of_pixels_are_not_taken_for_it(acquired: Acquired) -> None:
     """Crossed fringes see another width each, and share nothing."""
     found = measured(acquired(NO_DARKS, {"intra_pixel_response": {"width_rms_px": 0.02}}))

@@ -156,11 +156,11 @@ def without_harmonics(
     A nonlinear response that differs between pixels changes the maps and their harmonics alike.
     """
     one, other = (_half_harmonic(fringes, half, kept) for half in (0, 1))
-    product = one * other  # the noise of the halves is independent
-    square = float(product.sum())
-    if square <= SIGNIFICANT * float(np.sqrt((product**2).sum())):
+    square = white_products(one, other, kept)  # the noise of the halves is independent
+    if square.mean() <= SIGNIFICANT * square.std() / np.sqrt(len(square)):
         return first, second
-    slopes = float((first * other).sum()) / square, float((second * one).sum()) / square
+    along = white_products(first, other, kept).sum(), white_products(second, one, kept).sum()
+    slopes = np.array(along) / square.sum()
     return first - slopes[0] * one, second - slopes[1] * other
 
 
@@ -217,3 +217,9 @@ def neighbour_products(one: F64, other: F64, good: Mask) -> F64:
                 count += inside
         products.append(one * total / np.maximum(count, 1))
     return np.stack(products)
+
+
+def white_products(one: F64, other: F64, good: Mask) -> F64:
+    """Products (pixel,) of two maps at good pixels, without what neighbours share."""
+    same, near, farther = neighbour_products(one, other, good)
+    return np.asarray((same - (4 * near - farther) / 3)[good])

@@ -9,7 +9,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.maps.map_fit import (
     gauge_terms,
     half_theta,
-    neighbour_products,
+    white_products,
     without,
     without_harmonics,
     without_lines,
@@ -31,8 +31,7 @@ def visibility_products(evidence: Evidence, sets: Sequence[FringeEvidence]) -> P
     for at, (m, n) in enumerate(pairs):
         first, second = maps[m][:2] if m == n else (both[m], both[n])
         kept = maps[m][2] & maps[n][2]
-        same, near, farther = neighbour_products(first, second, kept)
-        white = (same - (4 * near - farther) / 3)[kept]
+        white = white_products(first, second, kept)
         errors[at] = white.std() / np.sqrt(len(white))
         # Variance of the subtracted bias, e-², which is common to all frames.
         counts = [len(s.adu) for s in evidence.of_kind("bias")]
