@@ -192,6 +192,13 @@ def test_pixels_whose_noise_is_cut_off_are_simulated_with_that_noise(tmp_path: P
     assert simulated == pytest.approx(seen, rel=0.04)
 
 
+def test_one_bias_frame_says_nothing_of_the_noise_of_pixels(tmp_path: Path) -> None:
+    evidence, _ = reduced(Detector(**CAMERA, flats=ladder([(1.0, 1)])), 16, tmp_path)
+    one = [replace(s, adu=s.adu[:1]) for s in evidence.stacks if s.kind == "bias"]
+    alone = replace(evidence, stacks=tuple(one))
+    assert _pixel_noise([alone], [{}], evidence.good) is None
+
+
 def test_a_gain_does_not_hang_on_noise_that_is_cut_off_at_code_zero(tmp_path: Path) -> None:
     """Of noise below a code hardly anything is left; the flats tell what it is, and the gain."""
     flats = ladder([(t, 1) for t in LEVELS], 10)

@@ -88,7 +88,7 @@ def _pixel_noise(
         return None
     # If frames are too few to split, every part holds the same ones.
     parts = evidence if parted("bias", halves) else evidence[:1]
-    bias = [s.adu for e in parts for s in e.of_kind("bias")]
+    bias = [s.adu for e in parts for s in e.of_kind("bias") if len(s.adu) > 1]
     # Noise that jumps between levels is an effect; white noise belongs to the nominal detector.
     noisy = ~np.logical_or.reduce([jumping(frames) for frames in bias])
     return PixelNoise.of(bias, good, 1 - (one.amplifier_noise / one.read_noise) ** 2, noisy)
