@@ -1,6 +1,8 @@
 """Frames that would decide are those that tell on the effects and that are missing."""
 
 from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -9,6 +11,7 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.forward import DOMAINS
+from pixcal.stages.diagnose.candidates import _needs
 from pixcal.stages.diagnose.frames import (
     CLOSER_LOOK,
     MORE,
@@ -151,3 +154,18 @@ def test_an_unexplained_difference_is_looked_at_more_closely_in_its_domain() -> 
     lacks = {"dark": "dark frames", "ladder": "a ladder"}
     assert recommend_closer_look(lacks, "time") == [CLOSER_LOOK["time"], "dark frames"]
     assert recommend_closer_look(lacks, "intensity") == [CLOSER_LOOK["intensity"], "a ladder"]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("bias_drift", (MORE,)),
+        ("gain_error", ("flat frames",)),
+        ("lag", ("flat frames", "flats at 3 or more exposure times")),
+    ],
+)
+def test_an_effect_that_has_its_kind_of_frames_needs_more_of_them(
+    name: str, words: tuple[str, ...]
+) -> None:
+    only_darks: Any = SimpleNamespace(sets={}, missing_frames=missing((), ()))
+    assert _needs(effects()[name], only_darks) == words

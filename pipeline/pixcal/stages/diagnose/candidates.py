@@ -148,8 +148,9 @@ def _needs(kind: type[Effect], facts: FramesUsed) -> tuple[str, ...]:
         return (FRINGES,)
     missing = facts.missing_frames
     frames = tuple(words for name, words in missing.items() if name in kind.frames_needed)
-    # Without fringes, any missing frames of a sensor may show the effect.
-    return frames or (() if facts.sets else tuple(missing.values())) or (MORE,)
+    # Without fringes, any missing frames of a sensor may show an effect of baselines or phases.
+    there = facts.sets or {"dark", "flat"} & set(kind.frames_needed)
+    return frames or (() if there else tuple(missing.values())) or (MORE,)
 
 
 def marginal_candidates(
