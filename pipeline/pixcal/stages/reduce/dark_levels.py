@@ -1,8 +1,10 @@
 """Frames without light whose level is not that of the others."""
 
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pixcal.kernels.robust import median_and_sigma, robust_sigma
 from pixcal.model.arrays import F64
@@ -67,11 +69,12 @@ def _of_bias(series: list[Group], levels: list[F64], usual: float, noise: float)
 
 
 def _levels(source: Ingested, group: Group) -> F64:
-    """Level of each frame in the middle rows, without hot pixels, ADU."""
-    levels = []
-    for n in group.frames:
-        samples = middle_rows(source.arrays[group.array], n, n + 1).ravel().astype(float)
-        middle, sigma = median_and_sigma(samples[np.isfinite(samples)])
-        near = np.abs(samples - middle) <= _HOT * max(sigma, source.quantum or 1.0)
-        levels.append(samples[near].mean())
-    return np.array(levels)
+    frames = source.arrays[group.array]
+    return np.array([frame_level(middle_rows(frames, n, n + 1), source) for n in group.frames])
+
+
+def frame_level(samples: NDArray[Any], source: Ingested) -> float:
+    """Mean of samples without light, without those of hot pixels, ADU."""
+    middle, sigma = median_and_sigma(samples)
+    near = np.abs(samples - middle) <= _HOT * max(sigma, source.quantum or 1.0)
+    return float(samples[near].mean(dtype=float))

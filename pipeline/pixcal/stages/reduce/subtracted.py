@@ -12,15 +12,14 @@ import numpy as np
 
 from pixcal.estimators.detector.calibration import usual_variance
 from pixcal.estimators.detector.emva import Measure, dark_slope
-from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
+from pixcal.stages.reduce.dark_levels import frame_level
 from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.flat_survey import middle_rows, rough_gain
 from pixcal.stages.reduce.ingested import Ingested
 
 _FRAMES = 16  # of each exposure time
-_HOT = 5.0  # standard deviations from the median beyond which a pixel is hot
 _CERTAIN = 6.0  # errors beyond which variance grows by more than the level explains
 _GAIN_ERROR = 0.1  # of a gain that is declared, or roughly measured
 _LEAST = 0.1  # smallest share of the variance of the longest darks that counts
@@ -90,10 +89,7 @@ def _of_pairs(source: Ingested, group: Group) -> tuple[list[float], list[float],
         frames = frames[:, np.isfinite(frames).all(axis=0)]
         if not frames.size:
             continue
-        for frame in frames:
-            middle, sigma = median_and_sigma(frame)
-            near = np.abs(frame - middle) <= _HOT * max(sigma, source.quantum or 1.0)
-            means.append(float(frame[near].mean()))
+        means += [frame_level(frame, source) for frame in frames]
         if len(frames) == 2:
             # A level that changes from frame to frame is no noise of samples.
             change = frames[1] - frames[0]
