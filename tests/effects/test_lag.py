@@ -9,8 +9,9 @@ import pytest
 from all_frames import frames_of
 
 from pixcal.effects.lag import Lag
+from pixcal.estimators.detector.first_flats import lag_of_flats
 from pixcal.estimators.detector.flat_ladder import warming
-from pixcal.estimators.detector.frame_lag import LagNonuniformity, lag_of_flats
+from pixcal.estimators.detector.frame_lag import LagNonuniformity
 from pixcal.estimators.diagnosis.central_crop import central_crop
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.kernels.charge_release import without_lag
@@ -196,7 +197,8 @@ def test_frames_are_restored(make_effect_bench: Callable[..., Bench], lag: Lag) 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "truth", [Lag(), Lag(2e-4, 0.0, 0.1), Lag(0.005, 1.5, 0.1), Lag(0.03, 0.0, 0.1)]
+    "truth",
+    [Lag(), Lag(2e-4, 0.0, 0.1), Lag(0.005, 1.5, 0.1), Lag(0.03, 0.0, 0.1), Lag(0.05, 2.0, 0.2)],
 )
 def test_its_share_is_found(acquired: Callable[..., Evidence], truth: Lag) -> None:
     parameters = {"share": truth.share, "decay_frames": truth.decay_frames, "spread": truth.spread}
@@ -208,6 +210,9 @@ def test_its_share_is_found(acquired: Callable[..., Evidence], truth: Lag) -> No
         assert abs(off) < 4 * found.errors[name], name
     assert found.errors["share"] < 0.03 * truth.share
     assert found.significance > 20
+    # Pixels that differ in their share do not pass for a share that depends on the level.
+    assert found.effect.bands == ()
+    assert not found.effect.capacity_e
 
 
 @pytest.mark.long
@@ -373,7 +378,9 @@ def test_traps_that_fill_up_are_measured_without_their_law(
     assert lag.releases[:5] == pytest.approx(later, abs=0.03)
     charge = np.array([3e3, 1e4, 2e4, 4e4], np.float32)
     truth = Lag(0.01, 0.0, 0.0, parts, 45_000.0, later)
-    np.testing.assert_allclose(lag._left(charge), truth._left(charge), rtol=0.05)
+    np.testing.assert_allclose(
+        lag._left(charge, np.float32(lag.share)), truth._left(charge, np.float32(0.01)), rtol=0.05
+    )
     even = Lag.estimate(acquired(None, {"lag": {"share": 0.01}}))
     assert even is not None
     assert isinstance(even.effect, Lag)
@@ -406,8 +413,23 @@ def test_traps_that_have_a_capacity_are_found(acquired: Callable[..., Evidence])
     assert found is not None
     lag = found.effect
     assert isinstance(lag, Lag)
-    assert lag.capacity_e == pytest.approx(250, rel=0.1)
+    assert lag.bands == ()
+    assert lag.quiet == 0
+    for name in ("share", "decay_frames", "capacity_e"):
+        assert abs(getattr(lag, name) - getattr(truth, name)) < 4 * found.errors[name], name
+    assert found.errors["capacity_e"] < 0.02 * truth.capacity_e
     rng = np.random.default_rng(5)
     charge = rng.uniform(0, 45e3, (30, 200, 1)).astype(np.float32)
     wanted, got = truth.lost(charge)[0], lag.lost(charge)[0]
     assert np.sqrt(np.mean((got - wanted) ** 2)) < 0.05 * np.sqrt(np.mean(wanted**2))
+
+
+@pytest.mark.long
+def test_a_bent_response_makes_no_share_depend_on_the_level(
+    acquired: Callable[..., Evidence],
+) -> None:
+    found = Lag.estimate(acquired(None, {"nonlinearity": {}, "lag": {"share": 0.05}}))
+    assert found is not None
+    assert isinstance(found.effect, Lag)
+    assert found.effect.bands == ()
+    assert not found.effect.capacity_e

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.kernels.charge_release import left_behind
+from pixcal.kernels.charge_release import in_bands, left_behind
 
 SHAPE = (211, 307)
 
@@ -13,8 +13,8 @@ def stays(charge: float, share: float, seed: int | None = 0) -> np.ndarray:
     if seed is not None:
         normal = np.random.default_rng(seed).standard_normal(SHAPE)
     full = (np.full(SHAPE, value, np.float32) for value in (charge, share))
-    bands = np.zeros(1, np.float32), np.ones(1, np.float32)
-    return left_behind(*full, *bands, normal.astype(np.float32))
+    of_charge, of_share = full
+    return left_behind(of_charge, of_share * of_charge, of_share, normal.astype(np.float32))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.5])
@@ -36,8 +36,10 @@ def test_no_more_stays_than_there_is(charge: float) -> None:
     assert found.max() <= max(charge, 0.0)
 
 
-def test_bands_of_the_charge_have_their_own_shares() -> None:
-    charge = np.array([[500.0, 1500.0, 5000.0]], np.float32)
-    bands = np.array([0.0, 1000.0, 2000.0], np.float32), np.array([2.0, 1.0, 0.5], np.float32)
-    out = left_behind(charge, np.full_like(charge, 0.1), *bands, np.zeros_like(charge))
-    np.testing.assert_allclose(out, [[100.0, 250.0, 450.0]], rtol=1e-6)
+def test_bands_of_the_charge_are_the_whole_of_it() -> None:
+    charge = np.array([[500.0, 1500.0, 5000.0, -3.0]], np.float32)
+    np.testing.assert_allclose(
+        in_bands(charge, 8000.0),
+        [[[500, 1000, 1000, 0]], [[0, 500, 1000, 0]], [[0, 0, 2000, 0]], [[0, 0, 1000, 0]]],
+    )
+    np.testing.assert_allclose(in_bands(charge, 8000.0, 2)[1], [[0, 500, 4000, 0]])

@@ -2,23 +2,24 @@
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
-from pixcal.estimators.detector.frame_lag import (
-    CLEAR,
-    MAX_DECAY,
-    LagNonuniformity,
-    common_lag,
-    lag_of_flats,
-    seen_share,
-)
-from pixcal.estimators.detector.lag_by_level import BANDS, by_level, in_bands
+from pixcal.estimators.detector.first_flats import lag_of_flats
+from pixcal.estimators.detector.frame_lag import MAX_DECAY, LagNonuniformity, common_lag, seen_share
+from pixcal.estimators.detector.lag_by_level import loss_by_level
 from pixcal.estimators.detector.noiseless_charge import missing_noise
 from pixcal.estimators.detector.persistence import LONGEST, persistence
 from pixcal.estimators.diagnosis.central_crop import central_crop
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
-from pixcal.kernels.charge_release import fill_traps, left_behind, released_by_frame
+from pixcal.kernels.charge_release import (
+    BANDS,
+    fill_traps,
+    in_bands,
+    left_behind,
+    released_by_frame,
+)
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best
 from pixcal.model.arrays import F32, F64
@@ -31,7 +32,12 @@ from pixcal.simulation.shot import Shot
 
 TAIL = 1e-4  # share of the charge left whose release is neglected
 MOST_BACK = 256  # preceding frames that count if the release follows seconds
+_LARGEST = 100.0  # factor of the share in a band
+_DECAY_OF_TRAPS = 0.15, MAX_DECAY  # that frames can measure
 _TELL_LAMP = 3  # fewest flats per level to distinguish a warming lamp from lag
+
+
+Measured = dict[str, tuple[float, float]]  # parameters with their errors
 
 
 @dataclass(frozen=True)
@@ -177,10 +183,12 @@ class Lag(Effect):
 
         One part for each kind of traps, or what each of the frames before left, from the last on.
         """
-        releases = self.releases if self._by_frame else 1 - self._kept(shot)
+        kept = self._kept(shot.end_of(shot.frame) - shot.time_s)
+        releases = self.releases if self._by_frame else 1 - kept
         held = np.zeros((len(releases), *charge.shape), np.float32) if state is None else state
         if state is not None and shot.frame == 0:
-            held = self._since_last(shot)[:, None, None] * held
+            since = self._kept(max(shot.time_s - shot.end_of(-1), 0.0)) if self.decay_s else [1.0]
+            held = (self.carried * np.array(since, np.float32))[:, None, None] * held
         left = self._left_behind(charge, shot)
         stays = self._left_behind(charge, shot, 1 - self.quiet) if self.quiet else left
         if self._by_frame:
@@ -195,24 +203,12 @@ class Lag(Effect):
         parts = np.array([1 - self.slow_part, self.slow_part][: len(each)], np.float32)
         return charge - left + sum(each), rest + parts[:, None, None] * stays
 
-    @property
-    def _decays_s(self) -> F64:
-        """Time constants (n,) of the kinds of traps, s; empty where these release by frames."""
-        every = [self.decay_s, self.slow_s] if self.slow_part else [self.decay_s]
-        return np.array(every if self.decay_s else [])
-
-    def _kept(self, shot: Shot) -> F64:
-        """Share (n,) of the charge held by each kind of traps that a frame does not release."""
+    def _kept(self, seconds: float) -> F64:
+        """Share (n,) of the charge held by each kind of traps that a time, or a frame, leaves."""
         if not self.decay_s:
             return np.array([self._keep])
-        return np.asarray(np.exp((shot.time_s - shot.end_of(shot.frame)) / self._decays_s))
-
-    def _since_last(self, shot: Shot) -> F32:
-        """Share (n,) of the held charge that is left when a recording begins."""
-        if not self.decay_s:
-            return np.array([self.carried], np.float32)
-        pause = max(shot.time_s - shot.end_of(-1), 0.0)
-        return (self.carried * np.exp(-pause / self._decays_s)).astype(np.float32)
+        decays = [self.decay_s, self.slow_s][: 1 + bool(self.slow_part)]
+        return np.asarray(np.exp(-seconds / np.array(decays)))
 
     def _released(self, held: F32, releases: F64, shot: Shot, kind: int = 0) -> F32:
         """Charge (y, x) that a frame gets from traps; each electron is released by chance."""
@@ -231,7 +227,7 @@ class Lag(Effect):
 
         ``charge``: (t, ...) e-, in the order of time without gaps; the first one after darkness.
         """
-        taken = self._left(charge)
+        taken = self._left(charge, np.float32(self.share))
         if self._by_frame:
             return released_by_frame(taken, self.releases)
         return fill_traps(taken, self._keep, self.capacity_e or np.inf)
@@ -242,17 +238,15 @@ class Lag(Effect):
         noise = np.zeros_like(charge)
         if shot.bench.shot_noise and noisy > 0:
             noise = shot.normals(self.name) * np.float32(np.sqrt(noisy))
-        return left_behind(charge, share, *_bands(self), noise)
+        return left_behind(charge, self._left(charge, share), share, noise)
 
-    def _left(self, charge: F32) -> F32:
-        """Mean charge left behind, e-."""
-        share = np.float32(self.share)
+    def _left(self, charge: F32, share: F32 | np.float32) -> F32:
+        """Mean charge left behind, e-; ``share``: of the pixels, or of all."""
         if not self.bands:
-            return share * charge
-        parts = in_bands(charge, self.level_e)
-        return np.asarray(
-            share * sum(np.float32(w) * p for w, p in zip(self.bands, parts, strict=True))
-        )
+            return np.asarray(share * charge)
+        parts = in_bands(charge, self.level_e, len(self.bands))
+        every = (np.float32(w) * part for w, part in zip(self.bands, parts, strict=True))
+        return np.asarray(share * sum(every))
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
@@ -271,93 +265,102 @@ class Lag(Effect):
             return None
         part = central_crop(evidence)
         uneven = LagNonuniformity.of(part.fringes.values())
-        sure, unalike = common.sigmas > CLEAR, uneven.sigmas > CLEAR
+        sure, unalike = common.sigmas > SIGNIFICANT, uneven.sigmas > SIGNIFICANT
         rms = uneven.rms(common.keep, common.share) if unalike else 0.0
         missed = float(np.mean([common.share - seen_share(f, common.share, rms) for f in fringes]))
         # The common share is at least as large as the scatter of the pixels' shares.
         share = float(np.clip(common.share + missed, rms, 0.5))
-        pixels = min(int(f.good.sum()) for f in fringes)
-        common = replace(common, share_error=float(np.hypot(common.share_error, rms / pixels**0.5)))
-        spread, spread_error = uneven.spread(common.keep, share, common.share_error)
-        level_e = max(float(np.nanquantile(f.electrons[::7], 0.99)) for f in fringes)
-        whole = cls(share, common.decay_frames, 0.0, (), level_e, common.later)
-        values, of_level = by_level(part, common, share, level_e) if sure else ({}, {})
-        whole = replace(whole, **values)
-        quiet, quiet_error = _quiet(part, whole) if sure else (0.0, 1.0)
-        decay = whole.decay_frames if whole.capacity_e else min(common.decay_frames, MAX_DECAY)
-        return _estimate(
-            replace(whole, decay_frames=decay, spread=min(spread, 1.0), quiet=quiet),
-            {
-                "share": common.share_error,
-                "decay_frames": common.decay_error,
-                "spread": min(spread_error, 1.0),
-                "quiet": quiet_error,
-            }
-            | of_level,
-            sigmas_of_best(common.sigmas, uneven.sigmas),
-            "the contrast falls with the phase step from the previous frame"
-            + (", unevenly from pixel to pixel" if unalike else ""),
+        of_share = float(
+            np.hypot(common.share_error, rms / min(f.good.sum() for f in fringes) ** 0.5)
         )
+        decay, of_decay = common.decay
+        measured = {"share": (share, of_share), "decay_frames": (min(decay, MAX_DECAY), of_decay)}
+        spread, of_spread = uneven.spread(common.keep, share, of_share)
+        measured["spread"] = min(spread, 1.0), min(of_spread, 1.0)
+        level_e = max(float(np.nanquantile(f.electrons[::7], 0.99)) for f in fringes)
+        whole = cls(share, decay, 0.0, (), level_e, common.later)
+        if sure:
+            whole, of_level = whole._by_level(part)
+            measured |= of_level
+        # Full traps take back what they released, with its noise: the noise tells nothing.
+        told = sure and not whole.capacity_e
+        measured["quiet"] = _quiet(part, whole) if told else (0.0, 1.0)
+        why = "the contrast falls with the phase step from the previous frame"
+        why += ", unevenly from pixel to pixel" if unalike else ""
+        return _estimate(whole, measured, sigmas_of_best(common.sigmas, uneven.sigmas), why)
+
+    def _by_level(self, evidence: Evidence) -> tuple["Lag", Measured]:
+        """With a share that depends on the level, or that traps limit; the parameters of either."""
+
+        def lag(values: F64) -> Lag:
+            alone = len(values) == len(BANDS)
+            *shares, decay, capacity = (*values, 0.0, 0.0) if alone else values
+            share = self.share if alone else min(float(shares[0]), 0.5)
+            bands = np.clip(np.array(shares) / share, 0, _LARGEST) if len(shares) > 1 else ()
+            whole = replace(self, share=share, bands=tuple(map(float, bands)))
+            if alone:
+                return whole
+            decay = float(np.clip(decay, *_DECAY_OF_TRAPS))
+            return replace(whole, decay_frames=decay, capacity_e=float(capacity), later=())
+
+        lost, scale = (lambda v, q: lag(v).lost(q)[0]), (self.share, self.level_e)
+        found = loss_by_level(evidence, lost, *scale, self.releases.tolist())
+        if found is None:
+            return self, {}
+        whole, errors = lag(found.value), found.errors.tolist()
+        pairs = zip(whole.bands, (found.errors / whole.share).tolist(), strict=False)
+        measured = {f"bands[{n}]": pair for n, pair in enumerate(pairs)}
+        if whole.capacity_e:
+            for name, error in zip(
+                ("share", "decay_frames", "capacity_e"), (errors[0], *errors[-2:]), strict=True
+            ):
+                measured[name] = getattr(whole, name), error
+        return whole, measured
 
     @classmethod
     def _without_fringes(cls, evidence: Evidence) -> Estimate | None:
         """From the level of darks after light, or else from the first flat of each level."""
         if (slow := persistence(evidence)) is not None:
-            frames, seconds = (0.0, slow.decay) if slow.in_seconds else (slow.decay, 0.0)
-            share = float(np.clip(slow.share, 0, 0.5))
-            name = "decay_s" if slow.in_seconds else "decay_frames"
-            errors = {"share": slow.share_error, name: slow.decay_error}
+            measured = {
+                "share": (float(np.clip(slow.share, 0, 0.5)), slow.share_error),
+                "decay_s" if slow.in_seconds else "decay_frames": (slow.decay, slow.decay_error),
+            }
             if slow.slow_part:
-                errors |= {"slow_part": slow.slow_part_error, "slow_s": slow.slow_error}
-            traps = cls(share, frames, 0.0, carried=1.0, decay_s=seconds)
-            return _estimate(
-                replace(traps, slow_part=slow.slow_part, slow_s=slow.slow),
-                errors,
-                slow.share / slow.share_error,
-                "the dark level decays after exposure to light",
-            )
+                measured["slow_part"] = slow.slow_part, slow.slow_part_error
+                measured["slow_s"] = slow.slow, slow.slow_error
+            why = "the dark level decays after exposure to light"
+            traps = cls(spread=0.0, carried=1.0)
+            return _estimate(traps, measured, slow.share / slow.share_error, why)
         of_flats = lag_of_flats(evidence)
         if of_flats is None:
             return None
         share, error, carried = of_flats
-        found = _estimate(
-            cls(float(np.clip(share, 0, 0.5)), spread=0.0, carried=carried),
-            {"share": error},
-            share / error,
-            "the first flat of each level is fainter, as after charge of the frame before",
-        )
+        why = "the first flat of each level is fainter, as after charge of the frame before"
+        measured = {"share": (float(np.clip(share, 0, 0.5)), error)}
+        found = _estimate(cls(spread=0.0, carried=carried), measured, share / error, why)
         if carried or found.significance < SIGNIFICANT:
             return found
         pairs = all(len(s.adu) < _TELL_LAMP for s in evidence.ladder)
         # Charge that no frame gets back is not known to stay behind.
-        return replace(
-            found,
-            refused="the first flat of each level is fainter, whatever the frame before, as with a "
-            "slow shutter or a warming lamp; take darks at once after flats"
-            + (", and three flats per level" if pairs else ""),
-        )
+        refused = "the first flat of each level is fainter, whatever the frame before, as with a "
+        refused += "slow shutter or a warming lamp; take darks at once after flats"
+        return replace(found, refused=refused + (", and three flats per level" if pairs else ""))
 
 
-def _estimate(lag: Lag, errors: dict[str, float], sigmas: float, why: str) -> Estimate:
+def _estimate(lag: Lag, measured: Measured, sigmas: float, why: str) -> Estimate:
     """An estimate whose size states the share and, where known, the decay."""
-    of, decays = "of the signal", {"decay_s": (lag.decay_s, "s")}
-    if not lag.later:
-        decays["decay_frames"] = lag.decay_frames, "frames"
-    for name, (decay, unit) in decays.items():
+    errors = {name: error for name, (_, error) in measured.items()}
+    own: dict[str, Any] = {name: v for name, (v, _) in measured.items() if hasattr(lag, name)}
+    lag = replace(lag, **own)
+    of, decays = "of the signal", {"decay_s": "s", "decay_frames": "frames"}
+    for name, unit in decays.items():
+        decay = 0.0 if name == "decay_frames" and lag.later else getattr(lag, name)
         if decay > NONZERO * errors.get(name, np.inf):
             of += f", decays over {float(f'{decay:.2g}'):g} {unit}"
     if lag.slow_part:
         of += f" and, {100 * lag.slow_part:.2g} % of it, {float(f'{lag.slow_s:.2g}'):g} s"
     size = {"value": lag.share, "error": errors["share"], "unit": "", "of": of}
     return Estimate(lag, errors, sigmas, why, size=size if lag.share else {})
-
-
-@lru_cache(maxsize=4)
-def _bands(lag: Lag) -> tuple[F32, F32]:
-    """Lower ends of bands of the charge, e-, and the share in each over the mean share."""
-    weights = lag.bands or (1.0,)
-    begins = np.array(BANDS[: len(weights)], np.float32) * np.float32(lag.level_e)
-    return begins, np.array(weights, np.float32)
 
 
 @lru_cache(maxsize=4)
@@ -383,4 +386,4 @@ def _quiet(evidence: Evidence, lag: Lag) -> tuple[float, float]:
         return lag.lost(signal)[1]
 
     part, error = missing_noise(evidence, comes_out)
-    return float(np.clip(part, 0, 1)) if part > CLEAR * error else 0.0, min(error, 1.0)
+    return float(np.clip(part, 0, 1)) if part > SIGNIFICANT * error else 0.0, min(error, 1.0)

@@ -4,21 +4,25 @@ import numpy as np
 
 from pixcal.model.arrays import F32, F64
 
+BANDS = (0.0, 0.125, 0.25, 0.5)  # where bands of the level begin, over the full scale
 
-def left_behind(charge: F32, share: F32, begins: F32, weights: F32, normal: F32) -> F32:
+
+def in_bands(level: F32, level_e: float, count: int = len(BANDS)) -> list[F32]:
+    """Electrons of a signal in each of the first bands; their sum is the signal, if positive.
+
+    ``level_e``: full scale, e-.
+    """
+    begins = [np.float32(begin * level_e) for begin in BANDS[:count]]
+    ends = [*begins[1:], np.float32(np.inf)]
+    return [np.clip(level, b, e) - b for b, e in zip(begins, ends, strict=True)]
+
+
+def left_behind(charge: F32, mean: F32, share: F32, normal: F32) -> F32:
     """Electrons that stay in each pixel: a binomial variate, approximated by a normal one.
 
-    Of a ``charge`` (y, x), e-; ``share``: (y, x) mean probability for an electron. ``begins,
-    weights``: (band,) lower ends of bands of the charge (e-), and the probability in each over the
-    mean one. ``normal``: (y, x) standard normals; zero for the mean.
+    Of a ``charge`` (y, x), e-; ``mean``: (y, x) of those that stay; ``share``: (y, x) mean
+    probability for an electron; ``normal``: (y, x) standard normals; zero for the mean.
     """
-    ends = (*begins[1:], np.float32(np.inf))
-    mean = np.zeros_like(charge)
-    for n, (begin, end, weight) in enumerate(zip(begins, ends, weights, strict=True)):
-        part = np.minimum(charge, end) - begin
-        # The first band includes all charge below the second one.
-        mean += weight * (part if n == 0 else np.maximum(part, 0))
-    mean *= share
     scatter = np.sqrt(np.maximum(mean * (1 - share), 0))
     left: F32 = np.clip(mean + scatter * normal, 0, np.maximum(charge, 0))
     return left

@@ -107,14 +107,19 @@ class Freedom(FramesByPixels):
     """The directions in which a fit of a fringe set is free.
 
     Frames are free in (B, A cos phi, A sin phi) and the fringe vector; pixels in the three maps, in
-    higher ``harmonics`` of the phase and, with ``before``, in a share of the frame before.
+    higher ``harmonics`` of the phase and in a share of a sum of the frames 1, 2, ... ``before``, of
+    these weights.
     ``margin``: pixels along the edges that are excluded. ``good``: (y, x) the n
     pixels used; ``of_time``: (k, t) orthonormal; ``of_place``: (7, n) the maps, and their slopes
     along x and y.
     """
 
     def __init__(
-        self, fringes: FringeEvidence, harmonics: int = 1, margin: int = 0, before: bool = False
+        self,
+        fringes: FringeEvidence,
+        harmonics: int = 1,
+        margin: int = 0,
+        before: Sequence[float] = (),
     ) -> None:
         inside = np.zeros_like(fringes.good)
         ny, nx = inside.shape
@@ -125,8 +130,12 @@ class Freedom(FramesByPixels):
         of_time = [fringes.g / np.abs(fringes.g).max(axis=0)]
         for n in range(2, harmonics + 1):
             of_time += [np.cos(n * fringes.phi)[:, None], np.sin(n * fringes.phi)[:, None]]
-        if before:
-            of_time.append(np.roll(of_time[0], 1, axis=0) * follows(fringes.frame)[:, None])
+        if len(before):
+            earlier = (
+                part * np.roll(of_time[0], n, axis=0) * follows(fringes.frame, n)[:, None]
+                for n, part in enumerate(before, start=1)
+            )
+            of_time.append(np.sum(list(earlier), axis=0))
         # Where there are few different phases, harmonics are not independent.
         independent, size, _ = np.linalg.svd(np.hstack(of_time), full_matrices=False)
         independent = independent[:, size > _INDEPENDENT * size[0]]

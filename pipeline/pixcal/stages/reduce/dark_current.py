@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.detector import emva
-from pixcal.estimators.detector.persistence import Persistence, released_late, told_from_drift
+from pixcal.estimators.detector.persistence import Persistence, released_late
 from pixcal.estimators.diagnosis.evidence import Stack
 from pixcal.model.arrays import F64, Mask
 from pixcal.report.text import number
@@ -232,19 +232,18 @@ def late_rate(
         time = np.array(source.tables[group.array]["time_s"], float)[frames]
         stack = Stack(group.array, group.exptime, frames, time, _NO_SAMPLES, start)
         series.append((stack, gain * (level - unlit)))
-    least = read_noise**2 / levels.pixels
-    fit = released_late(series, least)
-    if fit is None:
+    found = released_late(series, read_noise**2 / levels.pixels)
+    if found is None:
         return None
-    lag, late = fit
-    pairs = zip(levels.groups, late, strict=True)
+    pairs = zip(levels.groups, found.late, strict=True)
     dark = np.concatenate([charge for g, charge in pairs if g.array != "flat"])
     slope = emva.dark_slope(levels.times, gain * levels.means - dark)
     of_late = emva.dark_slope(levels.times, dark)
     if slope is None or of_late is None:
         return None
+    lag = found.lag
     error = float(np.hypot(slope[1], of_late[0] * lag.share_error / lag.share))
-    return LateRate(of_late[0], error, lag, told_from_drift(series, late, least))
+    return LateRate(of_late[0], error, lag, found.sure)
 
 
 def _follows_light(source: Ingested) -> bool:
