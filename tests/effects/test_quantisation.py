@@ -8,17 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pixcal.effects.quantisation import Quantisation, _uneven
-from pixcal.estimators.detector.code_density import (
-    FITS,
-    NEAREST,
-    NEAREST_OF_ALL,
-    CodeWidths,
-    Law,
-    code_widths,
-    histogram,
-    level_errors,
-    step_of,
-)
+from pixcal.estimators.detector.bit_weights import FITS, NEAREST, NEAREST_OF_ALL, Law, level_errors
+from pixcal.estimators.detector.code_density import CodeWidths, code_widths
+from pixcal.estimators.detector.code_histogram import histogram, step_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 
 TOP = 65535.0

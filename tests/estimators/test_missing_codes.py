@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.detector.code_density import step_of
+from pixcal.estimators.detector.code_histogram import step_of
 from pixcal.estimators.detector.missing_codes import (
     missing_codes,
     noise_before_missing_codes,

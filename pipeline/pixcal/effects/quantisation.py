@@ -6,16 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.estimators.detector.code_density import (
-    MIN_NOISE,
-    CodeWidths,
-    Law,
-    code_cells,
-    code_widths,
-    converter_counts,
-    histogram,
-    step_of,
-)
+from pixcal.estimators.detector.bit_weights import Law, code_cells
+from pixcal.estimators.detector.code_density import MIN_NOISE, CodeWidths, code_widths
+from pixcal.estimators.detector.code_histogram import converter_counts, histogram, step_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.variance_components import sigmas
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best, sigmas_of_chi2

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixcal.estimators.detector.calibration import usual_rate
-from pixcal.estimators.detector.code_density import step_of
+from pixcal.estimators.detector.code_histogram import step_of
 from pixcal.estimators.detector.emva import Measure
 from pixcal.estimators.detector.missing_codes import missing_codes, noise_before_missing_codes
 from pixcal.estimators.detector.pair_noise import LINES, along_lines, shared_by_blocks
