@@ -9,7 +9,8 @@ from all_frames import frames_of
 from scipy import stats
 from scipy.special import erf
 
-from pixcal.effects.cosmic_hits import CosmicHits, _rates
+from pixcal.effects.cosmic_hits import CosmicHits
+from pixcal.estimators.detector.hits import hit_rates
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.tracks import GRAZING, add_tracks, draw_tracks
 from pixcal.model.bench import Bench
@@ -93,7 +94,7 @@ def test_hits_while_frames_are_read_out_are_told_from_those_of_the_exposure(
     pulls = []
     for _ in range(40):
         counts = RNG.poisson(rate * exposures[0] + readout * exposures[1]).astype(float)
-        values, errors = _rates(counts, chances, exposures)
+        values, errors = hit_rates(counts, chances, exposures)
         assert len(errors) == 1 + (readout > 0)
         pulls += [(v - t) / e for v, t, e in zip(values, (rate, readout), errors, strict=False)]
     assert np.abs(pulls).max() < 4.5

@@ -1,26 +1,31 @@
 """Particles that leave their charge in one frame: muons, and electrons of radioactive decay."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage
 from scipy.optimize import brentq
-from scipy.special import ndtr
 
+from pixcal.estimators.detector.hits import (
+    JOINED,
+    THRESHOLD,
+    Hits,
+    HitSearch,
+    hit_counts,
+    hit_rates,
+    hit_searches,
+    recur,
+    significance_of_hits,
+)
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.kernels.robust import robust_sigma
-from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_count
 from pixcal.kernels.tracks import add_tracks, draw_tracks
-from pixcal.model.arrays import F32, F64, I64, Mask
+from pixcal.model.arrays import F32, F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.forward import numbers
 from pixcal.simulation.shot import Shot
 
 MARGIN_PX = 16  # margin around the window where tracks may begin, px
-THRESHOLD = 6.5  # standard deviations of the noise above which a sample is an outlier
-JOINED = 3.0  # standard deviations above which a sample joins an outlier near it
 
 _STRAGGLING = 0.15
 # trial laws of the tracks
@@ -32,25 +37,12 @@ _LAWS = {
 _LAW_GAIN = 5.0  # gain in log-likelihood above which another law replaces the default
 _AS_LIKELY = 3.0  # errors within which other laws widen the error of the rate
 _SHAPED = 30  # least number of hits to choose a law
-# classes of hits: number of outlying samples, in all and next to the brightest, and brightness over
-# the faintest outlier
-_SIZES = (1.5, 2.5, 4.5, 8.5)
-_NEAR = (1.5, 2.5, 3.5, 5.5)
-_BRIGHTNESS = (1.25, 1.6, 2.0, 2.8, 4.0, 8.0)
 _DRAWN = 4000
 _TILE = 48
-_MIN_FRAMES = 3
 _MIN_HITS = 5
-_OFTEN = 2
 _RARE = 0.01
 _BRIGHTEST = 16
-# number of noise outliers over that of a Gaussian, as shot noise of faint light is skewed
-_SKEW = 5.0
-# recurrent hits on the same pixels, over those by chance, and as a share of all hits
-_AGAIN, _SHARE_AGAIN = 2.0, 0.1
 _NOISY_PIXELS = "the hits recur in the same pixels: these pixels are noisy, as with telegraph noise"
-_STEPS = 300  # most steps of the maximisation
-_FEWEST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -138,7 +130,7 @@ class CosmicHits(Effect):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Upward outliers in single frames, less downward ones, in all frames."""
-        searches = list(_searches(evidence))
+        searches = list(hit_searches(evidence))
         if not searches:
             return None
         (law, _), *others = _laws(cls(), searches, evidence.pitch_um)
@@ -151,172 +143,26 @@ class CosmicHits(Effect):
             if (as_likely := _fitted(other, searches, evidence.pitch_um)) is not None:
                 steps = _steps(effect, as_likely[0], max(apart, 1.0))
                 step = max(step, steps, key=lambda one: abs(one.get("rate_cm2_s", 0.0)))
-        counts, chances = _counts(searches)
         return Estimate(
             effect,
             {n: float(np.hypot(errors.get(n, 0.0), step.get(n, 0.0))) for n in {**errors, **step}},
-            sigmas_of_count(int(counts.sum()), float(chances.sum())),
+            significance_of_hits(searches),
             "samples in single frames far above the pixel's other frames",
             (*({n: error} for n, error in errors.items()), step) if step else (),
-            refused=_NOISY_PIXELS if _recur(searches) else "",
+            refused=_NOISY_PIXELS if recur(searches) else "",
         )
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
         """Significance of the hits, for any law of the tracks."""
-        searches = list(_searches(evidence))
-        if not searches:
-            return None
-        counts, chances = _counts(searches)
-        return sigmas_of_count(int(counts.sum()), float(chances.sum()))
-
-
-def _rates(counts: F64, chances: F64, exposures: F64) -> tuple[list[float], list[float]]:
-    """Hits (n,) per exposure of both kinds, and errors; the second is zero unless significant."""
-    fits: list[tuple[F64, F64]] = []
-    for own in (exposures[:1], exposures):
-        # Maximum of the likelihood of Poisson counts, by expectation and maximisation.
-        total = own.sum(axis=1)
-        rates = counts.sum() / total / len(own)
-        for _ in range(_STEPS):
-            rates = rates * (own @ (counts / np.maximum(rates @ own + chances, _FEWEST))) / total
-        fits.append((rates, np.maximum(rates @ own + chances, _FEWEST)))
-    (_, one), (_, both) = fits
-    gain = 2 * float((counts * np.log(both / one) - both + one).sum())
-    used = 1 + (gain > SIGNIFICANT**2) if len(exposures) > 1 else 1
-    rates, expected = fits[used - 1]
-    # The posterior of a rate, without prior, has one hit more: few hits constrain it poorly.
-    normal = exposures[:used] @ (exposures[:used] / (expected + 1 / len(counts))).T
-    errors = np.sqrt(np.diag(np.linalg.inv(normal)))
-    return [*rates.tolist(), 0.0][: len(exposures)], errors.tolist()
-
-
-@dataclass(frozen=True)
-class _Hits:
-    """Detected hits (n,)."""
-
-    peaks: F64  # brightest sample, e-
-    sizes: F64  # sizes, near: number of outlying samples, in all and within a pixel of the peak
-    near: F64
-    # frames and pixels of the brightest samples, if known
-    frames: F64 = field(default_factory=lambda: np.zeros(0))
-    pixels: F64 = field(default_factory=lambda: np.zeros(0))
-
-    def classes(self, faintest: float) -> tuple[F64, F64]:
-        """Number of hits of each size and brightness, and of each size and width."""
-        size = np.digitize(self.sizes, _SIZES)
-        counts = []
-        for other, edges in ((self.peaks / faintest, _BRIGHTNESS), (self.near, _NEAR)):
-            kinds = len(edges) + 1
-            number = size * kinds + np.digitize(other, edges)
-            counts.append(np.bincount(number, minlength=(len(_SIZES) + 1) * kinds).astype(float))
-        return counts[0], counts[1]
-
-
-@dataclass(frozen=True)
-class _Search:
-    """Outliers of a sequence of frames."""
-
-    seconds: float  # exposure time, s
-    area: float  # of all samples, cm²
-    samples: int
-    limit: float  # sigmas above which a sample is an outlier
-    hits: _Hits  # upward outliers
-    downwards: int  # number of downward outliers
-    sigma: F32  # (t, y, x) noise of the samples, e-; NaN for excluded ones
-    faintest: float  # usual charge above which a sample is an outlier, e-
-
-
-def _searches(evidence: Evidence) -> Iterator[_Search]:
-    area = (evidence.pitch_um * 1e-4) ** 2
-    for f in evidence.fringes.values():
-        # As in `CosmicHits.charge`.
-        seconds = f.exptime_s if f.exptime_s > 0 else float(np.median(np.diff(f.time_s)))
-        # Include pixels with a bad fit: the strongest hits cause one.
-        residual = np.where(evidence.good & np.isfinite(f.theta).all(axis=0), f.residual, np.nan)
-        yield _search(residual, np.sqrt(f.variance), seconds, area)
-    for stack in (*evidence.of_kind("bias"), *evidence.of_kind("dark")):
-        if len(stack.adu) >= _MIN_FRAMES:
-            seconds = 0.0 if stack.kind == "bias" else np.nan_to_num(stack.exptime_s)
-            yield _search(*evidence.dark_noise(stack), seconds, area)
-
-
-def _search(residual: F32, sigma: F32, seconds: float, area: float) -> _Search:
-    """Outliers of residuals (t, y, x) of given sigma; ``area`` of a pixel, cm²."""
-    ratio = residual / sigma
-    usable = np.isfinite(ratio)
-    # Ratio of actual to predicted noise, from every seventh sample.
-    wide = robust_sigma(ratio.ravel()[::7])
-    limit = np.float32(THRESHOLD * np.fmax(wide, 1.0))
-    up, down = ratio > limit, ratio < -limit
-    often = np.count_nonzero(up | down, axis=0) > _OFTEN
-    up &= ~often
-    down &= ~often
-    least = limit * np.float32(JOINED / THRESHOLD)
-    n = int(np.count_nonzero(usable))
-    return _Search(
-        seconds,
-        area * ratio.size,
-        n,
-        float(limit),
-        _hits(up, ratio > least, residual),
-        len(_hits(down, ratio < -least, -residual).peaks),
-        np.where(usable, sigma, np.float32(np.nan)),
-        float(limit * np.median(sigma)),
-    )
-
-
-def _counts(searches: Sequence[_Search]) -> tuple[F64, F64]:
-    """Number of hits of each search, and that expected by chance."""
-    by_chance = [max(_SKEW * s.samples * float(ndtr(-THRESHOLD)), s.downwards) for s in searches]
-    return np.array([float(len(s.hits.peaks)) for s in searches]), np.array(by_chance)
-
-
-def _hits(outliers: Mask, joined: Mask, residual: F32) -> _Hits:
-    """Groups of adjacent outliers in a frame, with fainter samples that join them."""
-    hits = []
-    for frame in np.flatnonzero(outliers.any(axis=(1, 2))):
-        bright = joined[frame] | outliers[frame]
-        labels, _ = ndimage.label(ndimage.binary_dilation(bright, np.ones((3, 3))), np.ones((3, 3)))
-        rows, columns = np.nonzero(bright)
-        groups = labels[rows, columns]
-        for group in np.unique(labels[outliers[frame]]):
-            y, x = rows[groups == group], columns[groups == group]
-            charge = residual[frame, y, x]
-            at = int(charge.argmax())
-            near = (abs(y - y[at]) <= 1) & (abs(x - x[at]) <= 1)
-            pixel = y[at] * residual.shape[2] + x[at]
-            hits.append((float(charge[at]), len(y), np.count_nonzero(near), frame, pixel))
-    return _Hits(*np.array(hits, float).reshape(-1, 5).T)
-
-
-def _hits_per_pixel(hits: _Hits, shape: tuple[int, ...]) -> tuple[I64, I64]:
-    """Hits on each pixel in the first and the second half of frames (t, y, x)."""
-    count, pixels = shape[0], hits.pixels.astype(np.int64)
-    late = 2 * hits.frames >= count
-    size = shape[1] * shape[2]
-    return np.bincount(pixels[~late], minlength=size), np.bincount(pixels[late], minlength=size)
-
-
-def _recur(searches: Sequence[_Search]) -> bool:
-    """Whether hits recur on the same pixels far more often than by chance."""
-    parts = np.stack(
-        [part for s in searches for part in _hits_per_pixel(s.hits, s.sigma.shape)]
-    ).astype(float)
-
-    def pairs(counts: F64) -> F64:
-        return np.asarray((counts.sum(axis=0) ** 2 - (counts**2).sum(axis=0)) / 2)
-
-    seen, hits = float(pairs(parts).sum()), float(parts.sum())
-    by_chance = float(pairs(parts.sum(axis=1))) / parts.shape[1]
-    more, chance = seen - _AGAIN * by_chance, np.sqrt(_AGAIN * by_chance + 1)
-    return bool(more > SIGNIFICANT * chance and more > _SHARE_AGAIN * hits)
+        searches = list(hit_searches(evidence))
+        return significance_of_hits(searches) if searches else None
 
 
 class _Drawn:
     """The brightest pixels of drawn tracks, placed in the frames of searches."""
 
-    def __init__(self, law: CosmicHits, searches: Sequence[_Search], pitch_um: float) -> None:
+    def __init__(self, law: CosmicHits, searches: Sequence[HitSearch], pitch_um: float) -> None:
         rng, self._searches = np.random.default_rng(0), searches
         tracks = law.tracks(rng, _DRAWN, pitch_um, (1, 1), 0)
         # At the centre of a tile; longer tracks are truncated.
@@ -343,12 +189,12 @@ class _Drawn:
         noise = sigma[t, (y + dy) % sigma.shape[1], (x + dx) % sigma.shape[2]]
         return np.where(np.isfinite(noise), noise, np.inf)
 
-    def hits(self, scale: float) -> list[_Hits]:
+    def hits(self, scale: float) -> list[Hits]:
         """Tracks that each search detects, for ``scale`` times the charge."""
         every = zip(self._searches, self._sigmas, strict=True)
         return [self._detected(scale, sigma, s.limit) for s, sigma in every]
 
-    def _detected(self, scale: float, noise: F64, limit: float) -> _Hits:
+    def _detected(self, scale: float, noise: F64, limit: float) -> Hits:
         counts = np.isfinite(noise)
         sigma = np.where(counts, noise, 1.0)
         samples = np.where(counts, scale * self._charges + sigma * self._noise, 0.0)
@@ -361,7 +207,7 @@ class _Drawn:
         )
         near = bright & (abs(y - y0) <= 1) & (abs(x - x0) <= 1)
         sizes = (np.count_nonzero(one, axis=1).astype(float) for one in (bright, near))
-        return _Hits(samples.max(axis=1, initial=0), *sizes)
+        return Hits(samples.max(axis=1, initial=0), *sizes)
 
     def _scaled(self) -> tuple[float, float | None]:
         """Charge of the hits over that of the tracks, and its error (None: too few hits)."""
@@ -402,7 +248,7 @@ class _Drawn:
 
 
 def _laws(
-    start: CosmicHits, searches: list[_Search], pitch_um: float
+    start: CosmicHits, searches: list[HitSearch], pitch_um: float
 ) -> list[tuple[CosmicHits, float]]:
     """Laws of the tracks: the likeliest, then nearly as likely ones; distances in errors."""
     if sum(len(s.hits.peaks) for s in searches) < _SHAPED:
@@ -429,7 +275,7 @@ def _laws(
 
 
 def _fitted(
-    law: CosmicHits, searches: list[_Search], pitch_um: float
+    law: CosmicHits, searches: list[HitSearch], pitch_um: float
 ) -> tuple[CosmicHits, dict[str, float]] | None:
     """A law with its best rates and charge, and errors; None without detection."""
     drawn = _Drawn(law, searches, pitch_um)
@@ -439,7 +285,7 @@ def _fitted(
     if not exposures.sum() > 0:
         return None
     exposed = np.flatnonzero(exposures.any(axis=1))
-    values, spread = _rates(*_counts(searches), exposures[exposed])
+    values, spread = hit_rates(*hit_counts(searches), exposures[exposed])
     of = [law.strengths[n] for n in exposed]
     charge = "electrons_per_um"
     errors = dict(zip(of, spread, strict=False))
