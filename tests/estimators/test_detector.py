@@ -13,7 +13,7 @@ from pixcal.estimators.detector.calibration import (
     step_levels,
     usual_variance,
 )
-from pixcal.kernels.robust import median_and_sigma
+from pixcal.kernels.medians import median_and_sigma
 
 F64 = NDArray[np.float64]
 SHAPE = (7, 11)

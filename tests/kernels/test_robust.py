@@ -6,13 +6,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.stats import kurtosis, median_abs_deviation
 
+from pixcal.kernels.medians import median, robust_sigma
 from pixcal.kernels.robust import (
     Combination,
     clipped_variance_factor,
-    median,
     median_and_deviation,
     median_around,
-    robust_sigma,
 )
 
 F32 = NDArray[np.float32]

@@ -20,7 +20,7 @@ from pixcal.estimators.maps.map_fit import (
 )
 from pixcal.estimators.maps.ring_power import Ring, ring_power
 from pixcal.kernels.beams import LightMaps
-from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.medians import robust_sigma
 from pixcal.kernels.scene import TILE, DetectorMaps, Rows, chip_map
 from pixcal.kernels.significance import root_with_error
 from pixcal.model.arrays import F32, F64, Mask

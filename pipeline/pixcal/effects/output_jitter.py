@@ -9,8 +9,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.offset import FEWEST, unlit_stacks
 from pixcal.estimators.frame_series.variance_components import walk_modes
+from pixcal.kernels.medians import robust_sigma
 from pixcal.kernels.processes import HOUR_S, brownian
-from pixcal.kernels.robust import robust_sigma
 from pixcal.kernels.scene import Rows
 from pixcal.kernels.significance import SIGNIFICANT, root_with_error, sigmas_of_best, sigmas_of_chi2
 from pixcal.kernels.synthesis import walk_normals

@@ -21,7 +21,8 @@ import numpy as np
 
 from pixcal.kernels import kernel
 from pixcal.kernels.bilinear import FAST
-from pixcal.kernels.robust import SIGMA_OF_MAD, clipped_variance_factor, median_and_deviation
+from pixcal.kernels.medians import SIGMA_OF_MAD
+from pixcal.kernels.robust import clipped_variance_factor, median_and_deviation
 from pixcal.model.arrays import F32, F64
 
 BLOCK = 16  # pixels along each side of a block

@@ -20,7 +20,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 from PIL import Image
 
-from pixcal.kernels.robust import median_and_sigma
+from pixcal.kernels.medians import median_and_sigma
 from pixcal.report.colours import DIVERGING, INK, PALETTE, SEQUENTIAL
 from pixcal.report.map_summary import MapSummary
 from pixcal.report.text import exact

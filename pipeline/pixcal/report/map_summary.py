@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.kernels.robust import median_and_sigma
+from pixcal.kernels.medians import median_and_sigma
 from pixcal.model.arrays import F32, F64, I64, U8, Mask, Source
 
 SHOWN_PIXELS = 400  # most blocks along the longer side of a map on the page

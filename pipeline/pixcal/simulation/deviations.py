@@ -18,7 +18,7 @@ from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.estimators.maps.structure import without_outliers
 from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData
-from pixcal.kernels.robust import SIGMA_OF_MAD
+from pixcal.kernels.medians import SIGMA_OF_MAD
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.simulation.map_deviation import MAPS, Deviation, change_of_maps, weighed
 from pixcal.simulation.pairs import pair_sums, pair_variance, taken_by_fit

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from pixcal.estimators.maps.structure import flattened
-from pixcal.kernels.robust import SIGMA_OF_MAD, robust_sigma
+from pixcal.kernels.medians import SIGMA_OF_MAD, robust_sigma
 from pixcal.model.arrays import F64
 
 # degree of the smooth surfaces that maps of the nominal bench may contain

@@ -15,7 +15,7 @@ from pixcal.estimators.crosstalk.equations import Equations
 from pixcal.estimators.crosstalk.links import REACH, PixelClasses, Place
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling, uncouple
-from pixcal.kernels.robust import median_and_sigma
+from pixcal.kernels.medians import median_and_sigma
 from pixcal.model.arrays import F64, Indices, Mask
 
 MIN_SIGMAS = 40.0  # dark signal of a hot pixel over the noise of the others

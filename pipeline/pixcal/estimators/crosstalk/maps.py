@@ -22,7 +22,7 @@ from pixcal.estimators.fringe_fit.fringes import grid, polynomial_basis
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.estimators.maps.corrected import phase_change
 from pixcal.kernels.crosstalk import Coupling, filled, uncouple_fringes
-from pixcal.kernels.robust import median_and_sigma
+from pixcal.kernels.medians import median_and_sigma
 from pixcal.model.arrays import F64, Mask
 
 CLIP = 5.0  # offsets and visibilities beyond this many robust deviations are outliers

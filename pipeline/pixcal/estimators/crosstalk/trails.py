@@ -15,8 +15,8 @@ from scipy.optimize import least_squares
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels, hot_pixels
 from pixcal.estimators.crosstalk.links import REACH
 from pixcal.estimators.diagnosis.evidence import Evidence, cached_on_evidence
+from pixcal.kernels.medians import median_and_sigma
 from pixcal.kernels.normal_matrix import inverse_normal
-from pixcal.kernels.robust import median_and_sigma
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best
 from pixcal.model.arrays import F64
 

@@ -11,7 +11,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from pixcal.estimators.detector.calibration import MIN_STEPS, ExposureLevel
-from pixcal.kernels.robust import lit, median_and_sigma
+from pixcal.kernels.medians import median_and_sigma
+from pixcal.kernels.robust import lit
 from pixcal.model.arrays import F64, Mask
 
 NEIGHBOURS = 16  # side (px) of the blocks whose median a pixel is compared with

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtr, chdtri
 
-from pixcal.kernels.robust import finite_median, lit, median, median_and_sigma
+from pixcal.kernels.medians import finite_median, median, median_and_sigma
+from pixcal.kernels.robust import lit
 from pixcal.model.arrays import F64, Mask
 
 MIN_STEPS = 3  # fewest exposure times that separate a line from a curve

@@ -14,7 +14,8 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
-from pixcal.kernels.robust import Combined, median_and_sigma
+from pixcal.kernels.medians import median_and_sigma
+from pixcal.kernels.robust import Combined
 from pixcal.kernels.rounding import SHEPPARD
 from pixcal.model.arrays import F64
 

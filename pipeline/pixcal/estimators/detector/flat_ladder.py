@@ -13,7 +13,7 @@ import numpy as np
 from pixcal.estimators.detector.straightness import LAMP, RATES
 from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack, cached_on_evidence
-from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.medians import robust_sigma
 from pixcal.kernels.sample_sums import frame_means
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64

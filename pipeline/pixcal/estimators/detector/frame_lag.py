@@ -9,7 +9,7 @@ from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.kernels.charge_release import without_lag
 from pixcal.kernels.frame_order import follows
-from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.medians import robust_sigma
 from pixcal.kernels.separable import fit_terms
 from pixcal.kernels.significance import SIGNIFICANT, root_with_error
 from pixcal.model.arrays import F64, Indices

@@ -8,7 +8,7 @@ from scipy import ndimage
 from scipy.special import ndtr
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.medians import robust_sigma
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_count
 from pixcal.model.arrays import F32, F64, I64, Mask
 

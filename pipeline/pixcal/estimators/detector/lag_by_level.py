@@ -17,8 +17,8 @@ from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.charge_release import BANDS, in_bands
 from pixcal.kernels.frame_order import since_gap
+from pixcal.kernels.medians import robust_sigma
 from pixcal.kernels.normal_matrix import inverse_normal
-from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F32, F64
 
 STEP = 0.01  # relative step of a parameter for its derivative: of the order of its error

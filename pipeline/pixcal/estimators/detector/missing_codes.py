@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
-from pixcal.kernels.robust import median_and_sigma
+from pixcal.kernels.medians import median_and_sigma
 from pixcal.model.arrays import F64, I64
 
 POPULATED = 20.0  # counts on both sides from which an empty code is missing

@@ -10,8 +10,9 @@ import math
 import numpy as np
 
 from pixcal.estimators.detector.emva import Measure
+from pixcal.kernels.medians import SIGMA_OF_MAD, median_and_sigma
 from pixcal.kernels.photon_transfer import BLOCK, COLUMNS, LAGS, bin_pairs, pair_statistics
-from pixcal.kernels.robust import SIGMA_OF_MAD, lit, median_and_deviation, median_and_sigma
+from pixcal.kernels.robust import lit, median_and_deviation
 from pixcal.model.arrays import F32, F64
 
 LINES = {"row": ((0, 1), (0, 2)), "column": ((1, 0), (2, 0))}  # lags along a line

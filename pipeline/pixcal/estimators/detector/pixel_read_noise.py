@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import digamma, polygamma, stdtrit
 
-from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.medians import robust_sigma
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 FEWEST = 8  # frames needed for noise by pixel

@@ -12,8 +12,8 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack, cached_on_evidence
 from pixcal.kernels.frame_order import slow_trends
 from pixcal.kernels.line_means import without_line_means
+from pixcal.kernels.medians import robust_sigma
 from pixcal.kernels.residual_sums import residual_sums
-from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F32, F64, Mask
 
 # rows and columns from a pixel to itself and to those that may share its noise

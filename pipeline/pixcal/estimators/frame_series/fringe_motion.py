@@ -13,7 +13,7 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import Evidence, cached_on_evidence
 from pixcal.estimators.frame_series.series import MEDIAN, FrameSeries, mode_variance, motion_series
 from pixcal.estimators.frame_series.spectral_line import Line, without_line
-from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.medians import robust_sigma
 from pixcal.model.arrays import F64
 
 CROSSED = 0.5  # sine of the angle between fringes from which they count as different

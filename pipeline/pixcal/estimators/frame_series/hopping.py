@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from pixcal.kernels import kernel
-from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.medians import robust_sigma
 from pixcal.model.arrays import F64
 
 BASES = 33  # start values tried for the base of each series

@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from pixcal.kernels.robust import median
+from pixcal.kernels.medians import median
 from pixcal.model.arrays import C128, F32, F64, Mask
 from pixcal.model.errors import InputError
 

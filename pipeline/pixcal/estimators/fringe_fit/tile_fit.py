@@ -8,7 +8,7 @@ import numpy as np
 
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, SmoothPhasor, smooth_phasor
 from pixcal.kernels.bilinear import GAP, GOES_ON, N_SUMS, solve_pixels, sweep_batches
-from pixcal.kernels.robust import median
+from pixcal.kernels.medians import median
 from pixcal.model.arrays import F32, F64, U16, Mask
 
 MOST_FRAMES = 64  # summed in float32

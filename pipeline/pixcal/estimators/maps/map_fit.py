@@ -15,8 +15,8 @@ from pixcal.estimators.fringe_fit.fringes import plane_wave, polynomial_basis
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.estimators.maps.stitching import within
 from pixcal.estimators.maps.structure import CELLS
+from pixcal.kernels.medians import median, robust_sigma
 from pixcal.kernels.normal_matrix import inverse_normal
-from pixcal.kernels.robust import median, robust_sigma
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64, Indices, Mask
 

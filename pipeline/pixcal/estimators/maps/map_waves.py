@@ -18,7 +18,7 @@ from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.estimators.maps import map_fit
 from pixcal.estimators.maps.map_fit import MapPart
 from pixcal.estimators.maps.structure import PERIODS
-from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.medians import robust_sigma
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import C128, F64, Mask
 

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 
 from pixcal.estimators.maps.stitching import FieldFit, fields
+from pixcal.kernels.medians import robust_sigma
 from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
-from pixcal.kernels.robust import median_around, robust_sigma
+from pixcal.kernels.robust import median_around
 from pixcal.model.arrays import C128, F64, Indices, Mask
 
 DEGREE = 3  # of a smooth surface

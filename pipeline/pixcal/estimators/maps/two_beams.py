@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
 from pixcal.estimators.maps.structure import clipped, legendre, smooth_surface
-from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.medians import robust_sigma
 from pixcal.model.arrays import F64, Mask
 
 _DEGREE = 2  # of the logarithm of the ratio of two Gaussian beams

@@ -17,7 +17,7 @@ from pixcal.estimators.test_statistics.fringe_set_data import (
     by_cell,
     neighbour_sums_by_level,
 )
-from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.medians import robust_sigma
 from pixcal.kernels.sample_sums import count_beyond, frame_means
 from pixcal.model.arrays import F32, F64, Mask
 

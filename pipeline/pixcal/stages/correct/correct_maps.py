@@ -21,7 +21,7 @@ from pixcal.estimators.fringe_fit.combine import weighted_mean
 from pixcal.estimators.fringe_fit.fringes import wrapped
 from pixcal.estimators.fringe_fit.tile_sums import TileSums, sum_row, tile_plane
 from pixcal.estimators.maps.corrected import phase_change
-from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.medians import robust_sigma
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.simulation.effect import FringeMaps
 from pixcal.stages.correct.sweep_to_correct import (

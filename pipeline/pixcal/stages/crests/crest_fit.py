@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
+from pixcal.kernels.medians import robust_sigma
 from pixcal.kernels.optics import PARAMETERS, Geometry, phase, phase_jacobian
-from pixcal.kernels.robust import robust_sigma
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
 from pixcal.stages.crests.crests import CrestPaths

@@ -5,7 +5,7 @@ from typing import TypeVar
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from pixcal.kernels.robust import robust_sigma
+from pixcal.kernels.medians import robust_sigma
 from pixcal.model.arrays import F32, F64
 
 HOT = 40.0  # robust standard deviations of the dark current above which a pixel is hot

@@ -13,8 +13,8 @@ from pixcal.estimators.maps.structure import flattened
 from pixcal.estimators.maps.two_beams import contrast_surface, light_surface
 from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData
 from pixcal.estimators.test_statistics.noise import jumping
+from pixcal.kernels.medians import median_and_sigma, robust_sigma
 from pixcal.kernels.processes import ramp_step
-from pixcal.kernels.robust import median_and_sigma, robust_sigma
 from pixcal.kernels.rounding import level_before_rounding
 from pixcal.kernels.scene import DetectorMaps
 from pixcal.model.arrays import F32, F64, Indices, Mask

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.detector.bad_pixels import dead, hot, noisy, noisy_factor, variance_nearby
 from pixcal.estimators.detector.calibration import usual_variance
-from pixcal.kernels.robust import median_and_sigma
+from pixcal.kernels.medians import median_and_sigma
 from pixcal.model.arrays import F32, F64, U8
 from pixcal.model.flags import PixelFlag
 from pixcal.stages import tiles

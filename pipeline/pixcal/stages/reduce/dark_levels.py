@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.kernels.robust import median_and_sigma, robust_sigma
+from pixcal.kernels.medians import median_and_sigma, robust_sigma
 from pixcal.model.arrays import F64
 from pixcal.report.text import number
 from pixcal.stages.reduce.exposures import Group

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from pixcal.estimators.detector.calibration import MIN_STEPS
-from pixcal.kernels.robust import finite_median
+from pixcal.kernels.medians import finite_median
 from pixcal.model.arrays import F32, F64, I64, Mask
 from pixcal.model.errors import InputError
 from pixcal.storage.frame_reader import Reader

@@ -25,8 +25,9 @@ from pixcal.estimators.detector.bad_pixels import (
 from pixcal.estimators.detector.calibration import DarkLine, ExposureLevel
 from pixcal.estimators.detector.cut_off import without_cut_off
 from pixcal.estimators.detector.pair_noise import LineNoise, dark_pair_sums, flat_pair_sums
+from pixcal.kernels.medians import finite_median
 from pixcal.kernels.photon_transfer import COLUMNS, N_BINS
-from pixcal.kernels.robust import BATCH, Combination, Combined, finite_median, lit
+from pixcal.kernels.robust import BATCH, Combination, Combined, lit
 from pixcal.kernels.rounding import SHEPPARD
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.flags import PixelFlag
