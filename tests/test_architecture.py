@@ -137,7 +137,7 @@ NAMED = {
     "pixcal.stages.budget.calibration": {"flat_error"},
     "pixcal_cli.budget": {"flat_error"},
     "pixcal.stages.reduce.fringe_sets": {"quantisation"},
-    "pixcal.stages.reduce.stage": {"quantisation"},
+    "pixcal.stages.reduce.reduction": {"quantisation"},
     "pixcal.report.tables": {"quantisation"},
 }
 """Names of effects outside their files."""

@@ -17,7 +17,7 @@ from pixcal.kernels.medians import median_and_sigma
 from pixcal.model.arrays import F32, F64, U8
 from pixcal.model.flags import PixelFlag
 from pixcal.stages import tiles
-from pixcal.stages.reduce.frame_statistics import STATISTICS, Measuring
+from pixcal.stages.reduce.measuring import STATISTICS, Measuring
 from pixcal.stages.tiles import STRIP, Index, Strip
 from pixcal.storage.cube import ArrayWriter, create_array, create_group
 from pixcal.storage.cube_reader import ArrayReader

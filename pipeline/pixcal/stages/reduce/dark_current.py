@@ -18,9 +18,9 @@ from pixcal.estimators.diagnosis.evidence import Stack
 from pixcal.model.arrays import F64, Mask
 from pixcal.report.text import number
 from pixcal.stages.reduce.exposures import Group
-from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.halves import frames_of
 from pixcal.stages.reduce.ingested import Ingested, starts_of
+from pixcal.stages.reduce.measuring import Measuring
 from pixcal.stages.tiles import Part
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import CHUNK

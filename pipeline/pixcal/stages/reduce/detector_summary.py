@@ -19,8 +19,8 @@ from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
 from pixcal.stages.reduce import read_noise
 from pixcal.stages.reduce.calibration import Usual, usual
-from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.reduce.measuring import Measuring
 from pixcal.stages.tiles import grid
 from pixcal.storage.cube_reader import ArrayReader
 from pixcal.storage.place import Place

@@ -19,9 +19,9 @@ from pixcal.model.arrays import F64, Mask
 from pixcal.report.text import with_error
 from pixcal.stages.reduce.dark_current import dark_current
 from pixcal.stages.reduce.detector_summary import Summary, pair_sums
-from pixcal.stages.reduce.frame_statistics import STATISTICS, Measuring
 from pixcal.stages.reduce.halves import Halves, middle_of, read_halves
 from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.reduce.measuring import STATISTICS, Measuring
 from pixcal.stages.reduce.read_noise import Nearby
 from pixcal.stages.tiles import Part
 from pixcal.storage.artefact import Build

@@ -14,9 +14,9 @@ from pixcal.estimators.detector.multiplication import (
 )
 from pixcal.stages.reduce.detector_summary import Summary
 from pixcal.stages.reduce.exposures import Group
-from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.halves import frames_of
 from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.reduce.measuring import Measuring
 from pixcal.stages.tiles import centred
 
 _SIDE = 512  # longest side of the middle of the detector whose frames are read

@@ -18,7 +18,7 @@ from pixcal.model.arrays import F32, F64
 from pixcal.stages.reduce.calibration import on_grid
 from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.flat_survey import middle_rows
-from pixcal.stages.reduce.frame_statistics import Measuring
+from pixcal.stages.reduce.measuring import Measuring
 from pixcal.storage.place import Place
 
 # Relative error of noise that is cut off at the lowest code: a constant, and a factor on the cube
