@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from all_frames import frames_of
 
-from pixcal.effects.telegraph_noise import MeasuredPixels, TelegraphNoise, _pixels, _series
+from pixcal.effects.telegraph_noise import MeasuredPixels, TelegraphNoise, _pixels
 from pixcal.estimators.detector.telegraph.moments import moments_of, signs
+from pixcal.estimators.detector.telegraph.series import pixel_series_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.synthesis import BLOCK_ROWS
 from pixcal.model.bench import Bench, SimulatedDetector
@@ -231,7 +232,7 @@ def test_pixels_that_are_only_noisier_are_not_taken_for_it(
         found = TelegraphNoise.estimate(noisier)
         assert found is not None
         assert found.significance < 4
-        moments = [m for s in _series(noisier) if (m := moments_of(s)) is not None]
+        moments = [m for s in pixel_series_of(noisier) if (m := moments_of(s)) is not None]
         assert signs(moments).noisy > 100
 
 

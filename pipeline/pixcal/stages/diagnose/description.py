@@ -15,8 +15,8 @@ from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import TOP_ADU, plain_bench
-from pixcal.stages.diagnose.nominal import SetTruth
 from pixcal.stages.diagnose.parts import FrameSubset, Table
+from pixcal.stages.diagnose.set_truth import SetTruth
 from pixcal.stages.evidence import frame_days, groups
 from pixcal.storage.header_values import DAY_S
 

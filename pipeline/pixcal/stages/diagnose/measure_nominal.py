@@ -23,8 +23,9 @@ from pixcal.stages.diagnose.description import bench_of, pedestal_of, recordings
 from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.flats import FlatLight, MeasuredGain
 from pixcal.stages.diagnose.hot_pixels import uncoupled
-from pixcal.stages.diagnose.nominal import Measured, NominalBench, SetTruth
+from pixcal.stages.diagnose.nominal import Measured, NominalBench
 from pixcal.stages.diagnose.parts import FrameSubset, RunFrames
+from pixcal.stages.diagnose.set_truth import SetTruth
 from pixcal.stages.reduce.calibration import FLAT_FLOOR
 
 MAX_GAIN_CHI2 = 10.0  # reduced chi-square of the photon transfer above which its gain is not used

@@ -17,7 +17,7 @@ from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.beams import Light
 from pixcal.kernels.scene import DetectorMaps, FrameStates, Rows
-from pixcal.model.arrays import F32, F64, Indices
+from pixcal.model.arrays import F32, Indices
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import Camera
@@ -28,26 +28,11 @@ from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.flats import FlatLight, MeasuredGain, photon_transfer_change
 from pixcal.stages.diagnose.hot_pixels import uncoupled
 from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, RunFrames
+from pixcal.stages.diagnose.set_truth import SetTruth
 
 _GAIN, _NOISE, _DARK = 101, 102, 103  # keys of random numbers
 _WHITE = 1e-3  # least share of the variance of the read noise that effects leave
 _ROWS = 8  # in the middle, on which the mean charge left by earlier frames is computed
-
-
-@dataclass(frozen=True)
-class SetTruth:
-    """One fringe set of the nominal bench."""
-
-    light: F32  # (y, x) mean, for unit response, e-
-    contrast: F32  # (y, x) fringe amplitude over the mean, a smooth surface
-    psi: F64  # (y, x) phase of the pixels if they had no offsets, rad
-    k: tuple[float, float]  # fringe vector, rad/px
-    step: float  # of a ramp of the phase, rad; zero: no ramp
-    phi: F64  # (t,) measured phase of every frame, rad; NaN for frames that were not fitted
-
-    def phase(self, delta_x: F32, delta_y: F32) -> F64:
-        """Phase (y, x) of the pixels at their offsets (px), rad."""
-        return np.asarray(self.psi + self.k[0] * delta_x + self.k[1] * delta_y)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import log_ndtr, ndtr
 
 from pixcal import __version__
-from pixcal.estimators.test_statistics import DETECTOR, Curve, Key, known_statistics
+from pixcal.estimators.test_statistics import DETECTOR, Curve, Key
 from pixcal.estimators.test_statistics.expectation import Reference, statistic_named
 from pixcal.estimators.test_statistics.gap import (
     Difference,
@@ -23,6 +23,7 @@ from pixcal.model.arrays import F64
 from pixcal.model.config import to_plain
 from pixcal.report.diagnosis_words import place
 from pixcal.simulation.effect import DOMAINS
+from pixcal.stages.diagnose.by_domain import not_compared, rounded
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
 from pixcal.stages.diagnose.comparison import Shrinkage, Trial, differing, gap_interval, shrinkage
 from pixcal.stages.diagnose.frames import (
@@ -42,31 +43,6 @@ MIN_P_VALUE = 1e-12  # smallest reported: the shape of the tails beyond is unkno
 SHOWN = 3  # statistics listed that identified a cause
 # attributes of a curve that describe its statistic
 FACTS = ("title", "domain", "quantity", "unit", "x_label", "kind")
-
-
-def by_domain(
-    before: Mapping[Key, Difference], after: Mapping[Key, Difference]
-) -> dict[str, list[float]]:
-    """Largest deviation (sigma, at least 0) in each domain, before and after."""
-    largest = {}
-    for domain in DOMAINS:
-        keys = [k for k in before if statistic_named(k[0]).domain == domain]
-        largest[domain] = [
-            rounded(sigmas_among(min(one[k].log_chance for k in keys), len(keys))) if keys else 0.0
-            for one in (before, after)
-        ]
-    return largest
-
-
-def not_compared(measured: Mapping[Key, Curve], data: Mapping[Key, F64]) -> list[str]:
-    """Titles of measured statistics that simulations lack, or have in another form."""
-    # Estimates used as statistics are left out: simulations compute some of them only when needed.
-    known = known_statistics()
-    return [
-        statistic_named(name).title + ("" if of == DETECTOR else f" of {of}")
-        for name, of in sorted(set(measured) - set(data))
-        if name in known
-    ]
 
 
 @dataclass(frozen=True)
@@ -313,8 +289,3 @@ def _natural(values: F64, usual: F64 | None) -> F64:
 def _closed(left: float) -> float:
     """Closed share of the gap, given the residual share; at least 0."""
     return rounded(max(1 - left, 0.0))
-
-
-def rounded(value: float) -> float:
-    """To four digits."""
-    return float(f"{value:.4g}")

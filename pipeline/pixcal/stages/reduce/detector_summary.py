@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -10,7 +9,7 @@ from pixcal.estimators.detector.bad_pixels import noisy_beyond
 from pixcal.estimators.detector.emva import Measure, full_level, saturation, transfer_points
 from pixcal.estimators.detector.missing_codes import missing_codes, step_noise
 from pixcal.estimators.detector.pair_noise import without_bands
-from pixcal.estimators.detector.straightness import Level, Straightness, straightness
+from pixcal.estimators.detector.straightness import Straightness, straightness
 from pixcal.kernels.gain_fit import LADDER, GainFit, fit_gain
 from pixcal.kernels.photon_transfer import add_neighbours
 from pixcal.kernels.rounding import SHEPPARD, UNDETERMINED_BELOW
@@ -19,6 +18,7 @@ from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
 from pixcal.stages.reduce import read_noise
 from pixcal.stages.reduce.calibration import Usual, usual
+from pixcal.stages.reduce.flat_steps import exposure_steps, levels_with_light, light_of_tiles, wells
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduce.measuring import Measuring
 from pixcal.stages.tiles import grid
@@ -28,7 +28,6 @@ from pixcal.storage.place import Place
 ROUNDING_ADU = math.sqrt(SHEPPARD)  # noise of a converter that rounds to whole ADU
 
 _LINEAR_SHARE = 0.7
-_SATURATED_STEP = 1e-2
 _KNOWN = 0.2  # largest relative error of a variance that replaces that of frames without light
 # least relative error of the noise of frames without light that is not on the curve of the flats,
 # if these do not tell it
@@ -113,16 +112,16 @@ class Summary:
 def summarise(job: Measuring, folder: Place, source: Ingested) -> Summary:
     """Combine the statistics of all columns; InputError if the flats hold no light."""
     tables = ArrayReader(folder / "levels").read()
-    levels, usable, nearly = _exposure_steps(tables, job)
+    levels, usable, nearly = exposure_steps(tables, job)
     sums = dark, lit, _ = pair_sums(folder, job)
     # Full pixels saturate the flats even if the converter does not saturate.
     points = transfer_points(add_neighbours(lit, dark)[0])
     rate = read_noise.dark_rate(folder, job)
     times = np.array([group.exptime for group in job.flat])
     charged = levels + rate * times if job.flats_timed and job.flat else levels
-    well, full = _wells(saturation(points), levels, charged, usable, nearly)
+    well, full = wells(saturation(points), levels, charged, usable, nearly)
     usable &= ~full
-    light = _light(tables, levels, usable, job)
+    light = light_of_tiles(tables, levels, usable, job)
     medians = usual(job, folder, light)
     if job.flat and not medians.response > _LIT * medians.response_error:
         if not math.isfinite(medians.response):
@@ -151,7 +150,7 @@ def summarise(job: Measuring, folder: Place, source: Ingested) -> Summary:
     elif gain is not None and gain.without_dark:
         noise, unrounded = (n and (n[0], max(n[1], _OFF_CURVE * n[0])) for n in (noise, unrounded))
     known = math.nan if gain is None else gain.read_variance[0]
-    straight = straightness(_steps_of(source, levels, usable, rate), points, known)
+    straight = straightness(levels_with_light(source, levels, usable, rate), points, known)
     return Summary(
         source.detector,
         job.quantum or 1.0,
@@ -243,101 +242,3 @@ def _steps(job: Measuring) -> tuple[float, float]:
         return rounding, 0.0
     variance, density = step_noise(read_noise.code_counts(job.flat, job))
     return rounding + variance * job.quantum**2, density * job.quantum**3
-
-
-def _exposure_steps(tables: F64, job: Measuring) -> tuple[F64, Mask, Mask]:
-    """Level of each step (ADU) over columns with a level at every step; which steps to use."""
-    # Also the steps at which some pixels are full, or nearly so.
-    if not job.flat:
-        return np.zeros(0), np.zeros(0, np.bool_), np.zeros(0, np.bool_)
-    level, pixels, lost, nearly = (tables.reshape(-1, len(job.flat), 4)[..., n] for n in range(4))
-    frames = np.array([len(group.frames) for group in job.flat])
-    usable = np.less_equal(lost.sum(axis=0), _SATURATED_STEP * frames * pixels.sum(axis=0))
-    common = np.isfinite(level[:, usable]).all(axis=1, keepdims=True)
-    weight = np.where(common & np.isfinite(level), pixels, 0.0)
-    total = (weight * np.nan_to_num(level)).sum(axis=0)
-    seen = weight.sum(axis=0)
-    ended = nearly.sum(axis=0) > _SATURATED_STEP * pixels.sum(axis=0)
-    return np.divide(total, seen, out=np.zeros_like(total), where=seen > 0), usable, ended
-
-
-def _wells(
-    well: Measure | None, levels: F64, charged: F64, usable: Mask, nearly: Mask
-) -> tuple[Measure | None, Mask]:
-    """Saturation of the wells (ADU), if it was reached, and the steps with full pixels."""
-    # ``charged``: levels with their dark signal, ADU.
-    below, ended = usable & ~nearly, usable & nearly
-    if well is None and below.any() and ended.any():
-        # Photon transfer leaves out levels that the converter's end may clip.
-        ends = float(levels[below].max()), float(levels[ended].max())
-        well = sum(ends) / 2, (ends[1] - ends[0]) / 2
-    if well is None:
-        return None, np.zeros_like(usable)
-    full = usable & (nearly | (charged > well[0]))
-    beyond = full & (levels > sum(well))
-    if beyond.any():
-        # Wells differ: some pixels may be full far below the next level of the flats.
-        half = (float(levels[beyond].min()) - well[0] + well[1]) / 2
-        well = well[0] - well[1] + half, half
-    return well, full
-
-
-def _light(tables: F64, levels: F64, usable: Mask, job: Measuring) -> F64:
-    """Light of each tile over the mean, from usable steps or those losing fewest samples."""
-    if not job.flat:
-        return np.ones(grid(job.shape))
-    lost = tables[..., 2].sum(axis=(0, 1))
-    taken = usable if usable.any() else lost == lost.min()
-    frames = np.array([len(group.frames) for group in job.flat])
-    means = tables[..., 0]
-    weight = np.where(np.isfinite(means) & taken, frames, 0.0)
-    whole = (weight * levels).sum(axis=-1)
-    charge = (weight * np.nan_to_num(means)).sum(axis=-1)
-    share: F64 = np.divide(charge, whole, out=np.full_like(whole, np.nan), where=whole != 0)
-    return share
-
-
-def _steps_of(source: Ingested, levels: F64, usable: Mask, rate: float) -> list[Level]:
-    """Levels (ADU) of timed flats with the light of each frame; ``rate``: of dark signal, ADU/s."""
-    if source.survey is None or not source.exposures.known:
-        return []
-    table = source.tables["flat"]
-    stamped = np.not_equal(table["time_source"], "number")
-    seconds = np.where(stamped, np.array(table["time_s"], float), np.nan)
-    steps = zip(source.exposures.flat, levels, usable, strict=True)
-    return [
-        Level(
-            group.exptime,
-            float(level),
-            bool(used),
-            source.survey.levels[list(group.frames)] - rate * group.exptime,
-            seconds[list(group.frames)],
-        )
-        for group, level, used in steps
-    ]
-
-
-def linearity_report(summary: Summary, job: Measuring, gain: float) -> dict[str, Any] | None:
-    """Entry of ``reduce.json`` on the exposure-time steps of flats; None without them."""
-    if summary.linearity is None:
-        return None
-    linearity, line = summary.linearity, summary.linearity.line
-    rows = zip(job.flat, summary.levels, line.deviation, strict=True)
-    return {
-        "max_deviation_percent": 100 * linearity.largest,
-        "error_percent": None if linearity.error is None else 100 * linearity.error,
-        "intercept_adu": line.intercept,
-        "exposure_offset_s": line.late[0],
-        "exposure_step_s": linearity.rounded or None,
-        "lamp_drift_percent": 100 * linearity.drift,
-        "levels": [
-            {
-                "exptime_s": group.exptime,
-                "frames": len(group.frames),
-                "level_adu": float(level),
-                "level_e": float(gain * level),
-                "deviation_percent": 100 * float(off) if math.isfinite(off) else None,
-            }
-            for group, level, off in rows
-        ],
-    }

@@ -13,7 +13,7 @@ from pixcal.model.flags import PixelFlag
 from pixcal.model.options import Reduce as Config
 from pixcal.stages.reduce.black_cut_off import cut_off_warnings
 from pixcal.stages.reduce.dark_levels import level_warnings
-from pixcal.stages.reduce.detector_summary import Summary, linearity_report
+from pixcal.stages.reduce.detector_summary import Summary
 from pixcal.stages.reduce.detector_warnings import detector_warnings, lamp_warnings, trail_warnings
 from pixcal.stages.reduce.figures_of_merit import characterise
 from pixcal.stages.reduce.fringe_sets import Bounds, set_warnings, share_at_mean
@@ -150,3 +150,29 @@ def _count_flags(mask: Place, shape: tuple[int, int]) -> dict[str, int]:
         for flag in PixelFlag:
             counts[str(flag.name).lower()] += int((values & flag > 0).sum())
     return dict(counts)
+
+
+def linearity_report(summary: Summary, job: Measuring, gain: float) -> dict[str, Any] | None:
+    """Entry of ``reduce.json`` on the exposure-time steps of flats; None without them."""
+    if summary.linearity is None:
+        return None
+    linearity, line = summary.linearity, summary.linearity.line
+    rows = zip(job.flat, summary.levels, line.deviation, strict=True)
+    return {
+        "max_deviation_percent": 100 * linearity.largest,
+        "error_percent": None if linearity.error is None else 100 * linearity.error,
+        "intercept_adu": line.intercept,
+        "exposure_offset_s": line.late[0],
+        "exposure_step_s": linearity.rounded or None,
+        "lamp_drift_percent": 100 * linearity.drift,
+        "levels": [
+            {
+                "exptime_s": group.exptime,
+                "frames": len(group.frames),
+                "level_adu": float(level),
+                "level_e": float(gain * level),
+                "deviation_percent": 100 * float(off) if math.isfinite(off) else None,
+            }
+            for group, level, off in rows
+        ],
+    }
