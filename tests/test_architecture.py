@@ -164,6 +164,27 @@ def test_no_module_imports_itself_in_a_circle() -> None:
         pytest.fail(" -> ".join(circle))
 
 
+MOST_MODULE_LINES = 300
+LONG_MODULES = {
+    "pixcal.model.options": "every option of every command, defined once",
+    "pixcal.model.bench": "every key of a bench file",
+    "pixcal.kernels.bilinear": "one file, so that Numba's cache notices changes",
+    "pixcal.stages.diagnose.search": "one search, whose steps share what it has tried",
+    "pixcal.estimators.fringe_fit.scout": "one class: the steps to the frames of a set",
+    "pixcal.estimators.detector.code_density": "widths of codes and the weights that explain them",
+    "pixcal.effects.lag": "several kinds of traps, each with its parameters",
+    "pixcal.effects.quantisation": "several kinds of converters, each with its parameters",
+}
+"""Modules of more than `MOST_MODULE_LINES`, and why."""
+
+
+@EVERY_FOLDER
+def test_modules_are_short(folder: str) -> None:
+    for module in modules_in(folder):
+        lines = len(MODULES[module].read_text(encoding="utf-8").splitlines())
+        assert (lines > MOST_MODULE_LINES) == (module in LONG_MODULES), f"{module}: {lines} lines"
+
+
 MOST_LINES, MOST_PARAMETERS = 60, 7
 LONG = {
     "pixcal.api.arrays.calibrate": "signature and docstring document every option",
@@ -231,6 +252,7 @@ def test_random_numbers_come_from_a_generator(folder: str) -> None:
         ("from distributed import Client", test_libraries_stay_in_their_folders),
         ("np.random.seed(1)", test_random_numbers_come_from_a_generator),
         ("from numpy.random import rand", test_random_numbers_come_from_a_generator),
+        (302 * "\n", test_modules_are_short),
         ("def f(a, b, c, d, e, f, g, h): ...", test_functions_are_short_and_take_few_parameters),
         ("def f():" + 60 * "\n    pass", test_functions_are_short_and_take_few_parameters),
     ],

@@ -37,8 +37,7 @@ _LAWS = {
 _LAW_GAIN = 5.0  # gain in log-likelihood above which another law replaces the default
 _AS_LIKELY = 3.0  # errors within which other laws widen the error of the rate
 _SHAPED = 30  # least number of hits to choose a law
-_DRAWN = 4000
-_TILE = 48
+_DRAWN, _TILE = 4000, 48  # tracks drawn for a law, and side of the tile of each, px
 _MIN_HITS = 5
 _RARE = 0.01
 _BRIGHTEST = 16
@@ -155,8 +154,7 @@ class CosmicHits(Effect):
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
         """Significance of the hits, for any law of the tracks."""
-        searches = list(hit_searches(evidence))
-        return significance_of_hits(searches) if searches else None
+        return significance_of_hits(s) if (s := list(hit_searches(evidence))) else None
 
 
 class _Drawn:

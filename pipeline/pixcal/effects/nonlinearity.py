@@ -4,13 +4,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from pixcal.estimators.crosstalk.boundaries import shared_charge
 from pixcal.estimators.detector.flat_ladder import ladder, ladder_response
 from pixcal.estimators.detector.ladder_curve import ladder_curve
 from pixcal.estimators.detector.response import departure, fit_curve, fit_response
-from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
+from pixcal.estimators.detector.response_of_noise import full_scale, response_of_noise
+from pixcal.estimators.detector.transfer_curve import transfer_curve
 from pixcal.estimators.diagnosis.central_crop import central_crop
 from pixcal.estimators.diagnosis.distortions import Agreement
 from pixcal.estimators.diagnosis.evidence import Evidence
@@ -30,14 +30,8 @@ KNOTS = np.array([0, 1 / 64, 1 / 32, *np.arange(1, 17) / 16])
 BEYOND = 4  # points beyond the brightest fringe, up to the brightest flat
 LOW = 0.3  # share of the range of levels whose signals set the line of a measured curve
 TAIL = 1e-3  # share of samples below, and above, the range of levels
-# least chi-square of a measured response added to a polynomial, over that of the polynomial
-BESIDE = 0.05
+BESIDE = 0.05  # least chi-square of a curve added to a polynomial, over that of the latter
 _INVERSE = 1 << 14
-_NOT_TOLD = 1e-3
-_WITH_CUBIC = 6  # fewest levels of flats whose noise shows a cubic term
-_INVERSIONS = 12  # of the response
-_LOWEST, _HIGHEST = (-0.3, -0.3), (0.3, 0.3)
-_OTHER_ORDER = 4
 
 
 @dataclass(frozen=True)
@@ -183,8 +177,7 @@ class Nonlinearity(Effect):
 
     @classmethod
     def detect(cls, evidence: Evidence) -> float | None:
-        fit = _polynomial(evidence)
-        return None if fit is None else fit.significance
+        return fit.significance if (fit := _polynomial(evidence)) else None
 
 
 @dataclass(frozen=True)
@@ -223,8 +216,8 @@ class _Polynomial:
 
 def _polynomial(evidence: Evidence) -> _Polynomial | None:
     """Polynomial from fringes or, without them, from the best constraint of the flats."""
-    level = _full_scale(evidence, Nonlinearity().level_e)
-    levels, curve = ladder_response(evidence, level), _of_noise(evidence, level)
+    level = full_scale(evidence, Nonlinearity().level_e)
+    levels, curve = ladder_response(evidence, level), response_of_noise(evidence, level)
     # Information on the quadratic term only, as the exposure-time steps also give a cubic term.
     variances = [0.0 if one is None else np.linalg.inv(one[1])[0, 0] for one in (levels, curve)]
     by_levels = variances[0] > variances[1]
@@ -288,9 +281,8 @@ def _bends(
     significant = sigmas_of_chi2(chi2, len(change) - 2) > SIGNIFICANT
     if not significant or chi2 < BESIDE * chi2_of_polynomial:
         return None, agreement
-    bends = tuple(
-        CurvePoint(float(k), float(c)) for k, c in zip(knots, [0.0, *change], strict=True)
-    )
+    points = zip(knots, [0.0, *change], strict=True)
+    bends = tuple(CurvePoint(float(k), float(c)) for k, c in points)
     return (bends, [0.0, *map(float, np.sqrt(np.diag(covariance)))]), agreement
 
 
@@ -306,51 +298,3 @@ def _straight_on(curve: Nonlinearity, evidence: Evidence) -> list[CurvePoint]:
     straight = end + (end - middle) * (levels[2:] / top - 1) * 2
     change = straight - replace(curve, bends=()).response(levels[2:])
     return [CurvePoint(float(at), float(c)) for at, c in zip(levels[2:], change, strict=True)]
-
-
-def _full_scale(evidence: Evidence, usual: float) -> float:
-    """Reference level of the deviations: the usual one, unless fringes are of another order."""
-    brightest = [float(np.nanquantile(f.electrons[::7], 0.99)) for f in evidence.fringes.values()]
-    for stack in evidence.of_kind("flat"):
-        brightest.append(float(np.median(stack.adu[0] - evidence.bias)) * evidence.gain)
-    top = max(brightest, default=usual)
-    alike = evidence.fringes and usual / _OTHER_ORDER < top < usual * _OTHER_ORDER
-    return usual if alike else float(f"{top:.1g}")
-
-
-def _of_noise(evidence: Evidence, level_e: float) -> tuple[F64, F64] | None:
-    """(quadratic, cubic) and covariance from photon transfer; None with too few levels."""
-    # A signal ``S (1 + q u)`` has variance ``S (1 + 2 q u)²``; their ratio rises as 1 + 3 q u. The
-    # cubic term is zero unless the ratio bends significantly.
-    curve = transfer_curve(evidence)
-    if curve is None:
-        return None
-    if (bent := _bent_by_noise(curve)) is not None:
-        scales = (level_e / curve.top) ** np.arange(1, 3)
-        return bent[0] * scales, bent[1] * np.outer(scales, scales)
-    scale = level_e / (3 * curve.top * curve.share)
-    error = scale * curve.slope_error
-    return np.array([scale * curve.slope, 0.0]), np.diag([error**2, _NOT_TOLD**2])
-
-
-def _bent_by_noise(curve: TransferCurve) -> tuple[F64, F64] | None:
-    """Quadratic and cubic term at the highest level, and covariance; None without a bend."""
-    signal = curve.levels / curve.top
-
-    def rest(sizes: F64) -> F64:
-        share, quadratic, cubic, read = sizes
-        u = signal
-        for _ in range(_INVERSIONS):
-            u = signal / (1 + quadratic * u + cubic * u**2)
-        rise = 1 + 2 * quadratic * u + 3 * cubic * u**2
-        ratio = share * rise**2 * u / signal + read * curve.common / curve.levels
-        return np.append((ratio - curve.shares) / curve.errors, read)
-
-    if len(signal) < _WITH_CUBIC:
-        return None
-    bounds = [0.0, *_LOWEST, -np.inf], [np.inf, *_HIGHEST, np.inf]
-    fit = least_squares(rest, [curve.share, 0.0, 0.0, 0.0], bounds=bounds)
-    covariance = np.linalg.inv(fit.jac.T @ fit.jac)[1:3, 1:3]
-    if abs(fit.x[2]) < SIGNIFICANT * np.sqrt(covariance[1, 1]):
-        return None
-    return fit.x[1:3], covariance
