@@ -13,8 +13,6 @@ from pixcal.storage.manifest import read_json
 from pixcal_cli.printing import Columns, number, show_notes, show_records, show_table
 
 MAX_NAMED = 3  # most statistics in a line
-
-
 MAX_ROWS = 8  # most differences that are printed
 
 

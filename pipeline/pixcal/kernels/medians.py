@@ -7,8 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 _SAMPLED = 4096  # values above which the median is sought near that of a sample
-
-
 SIGMA_OF_MAD = 1.482602218505602
 
 

@@ -24,19 +24,11 @@ from pixcal.simulation.frame_changes import (
 )
 
 MOTION_PARTS = ("jitter_x", "jitter_y", "walk_x", "walk_y", "walk_k")
-
-
 # shortest time constant tried (frames), for random and for steady changes; number of trials
 FASTEST, QUICKEST, TRIALS = 0.3, 3.0, 9
 SAME = 0.8  # share of a nuisance explained by the effect above which it is part of the effect
-
-
 SLOW = 0.1  # share of the modes, the lowest, that hold most of a slow change
-
-
 ROUGH = 0.5  # relative excess scatter of draws above which they are not normal
-
-
 ALIKE = (
     "; with fringes of one direction, motion of the fibres along the fringe axis and drift of the "
     "wavelength look the same"

@@ -20,11 +20,7 @@ from pixcal.simulation.replica import set_recordings
 
 MIN_PIXELS, MIN_SIDE = 200, 9  # of the good pixels of a set
 CLIP = 8.0  # clip of differences of neighbouring pixels, over their median
-
-
 KINDS = ("the mean light", "the visibility", "the phase")
-
-
 PHASE = KINDS.index("the phase")
 
 

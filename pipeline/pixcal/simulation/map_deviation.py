@@ -13,17 +13,9 @@ from pixcal.model.arrays import F64
 
 # degree of the smooth surfaces that maps of the nominal bench may contain
 DEGREES = {"offset": 3, "contrast": 2, "light": 3}
-
-
 MAPS = tuple(DEGREES)
-
-
 WILD_STEP = 5.0  # robust deviations above which a step between neighbours is an outlier
-
-
 AROUND = 5  # side (pixels) of a pixel's surroundings
-
-
 # share of the pixels' changes by which they may differ from those of their surroundings
 ALONE = 0.5
 

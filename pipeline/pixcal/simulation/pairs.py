@@ -9,8 +9,6 @@ from pixcal.model.arrays import F32, F64, Mask
 
 # offsets (rows, columns) to neighbours in other rows and columns
 DIAGONAL = ((1, 1), (1, -1), (1, 2), (1, -2), (2, 1), (2, -1))
-
-
 FRAMES_APART = (1, 2, 3, 4)
 
 

@@ -8,8 +8,6 @@ from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 
 # most samples of a set where each costs some hundred operations
 MAX_SAMPLES = 1 << 21
-
-
 MIN_SIZE = 32  # least pixels kept along each side, and least frames, if available
 
 

@@ -10,11 +10,7 @@ from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.model.arrays import F64, Mask
 
 FreeFrames = tuple[F64, F64]  # parameters (t, 5) of independent frames, and covariance
-
-
 STRIPE = 4  # rows of a stripe of `FringeEvidence.halves`: few neighbours lie in different halves
-
-
 NO_SAMPLE = -(1 << 30)  # electrons that mark a sample without weight
 
 

@@ -8,8 +8,6 @@ from numpy.typing import ArrayLike
 from pixcal.model.arrays import F64
 
 NODES = 9  # nodes of the quadrature over frame-to-frame changes
-
-
 TURN = 720  # steps per cycle for means over the phase without a closed form
 
 

@@ -12,15 +12,9 @@ from pixcal.stages.compare.agreement import Grouping, Part, halve, strongest_per
 from pixcal.stages.compare.pair import DISAGREE, Pair, PairSums, Pixels
 
 FALSE_ALARM_RATE = 1e-3  # false-alarm rate of differences, over all tests together
-
-
 # kinds of evidence: scales, columns, rows, means of blocks, scatter in blocks, single pixels
 FAMILIES = 6
-
-
 SHARE = FALSE_ALARM_RATE / FAMILIES
-
-
 LISTED = 10  # most blocks, and most pixels, that are listed
 
 

@@ -19,22 +19,12 @@ from pixcal.storage.manifest import write_json
 from pixcal.storage.place import Local
 
 SCOUT_SHARE = 0.01  # share of the tiles that the scout reads (of large windows)
-
-
 SCOUT_TILES = 5  # tiles that the scout reads if they can be kept in memory
-
-
 # memory for the scout's tiles; fixed, so that results do not depend on ``--memory``
 CACHE_BYTES = 384 << 20
-
-
 PRIME_BYTES = 48 << 20  # memory for the codes of the first fit of the scout
-
-
 # chunks along time from which the first fit takes frames: one may hold little of a slow scan
 SCOUT_BLOCKS = 16
-
-
 # most frames of the first fit: three unknowns per pixel add a fraction 3 / `FIRST_FIT_FRAMES` to
 # the variance of the frames' parameters; the time of the rank-three search grows with the square
 FIRST_FIT_FRAMES = 128

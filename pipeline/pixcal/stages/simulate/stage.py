@@ -50,8 +50,6 @@ _BYTES_PER_COMPRESSED_SAMPLE = 10
 
 _MJD_EPOCH = datetime(1858, 11, 17)
 Effects = tuple[Effect, ...]
-
-
 # a range of frames of a recording, and their files by number
 Span = tuple[Recording, range, dict[int, FrameWriter]]
 
