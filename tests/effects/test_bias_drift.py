@@ -401,6 +401,13 @@ def test_light_alone_has_no_level_without_noise(acquired: Callable[..., Evidence
     assert max(map(abs, pulls)) < 3
 
 
+def test_late_charge_is_no_level(acquired: Callable[..., Evidence]) -> None:
+    evidence = acquired(None, {"lag": {"share": 0.01, "decay_frames": 0.6}})
+    for fringes in evidence.fringes.values():
+        level, error = noiseless_level(evidence, fringes)
+        assert abs(level) < 3 * error
+
+
 def test_the_level_of_a_replayed_run_is_no_light() -> None:
     drift = BiasDrift(**RUN, tracks=(Track("vertical", (0.0, 20.0), (100.0, 300.0)),))
     theta, flat = np.full((3, 4, 5), 5000.0), np.full((4, 5), 0.8)
