@@ -3,6 +3,7 @@
 import ast
 import graphlib
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -183,6 +184,19 @@ def test_modules_are_short(folder: str) -> None:
     for module in modules_in(folder):
         lines = len(MODULES[module].read_text(encoding="utf-8").splitlines())
         assert (lines > MOST_MODULE_LINES) == (module in LONG_MODULES), f"{module}: {lines} lines"
+
+
+SAME_NAME = {"Run"}  # the options of `pixcal run`, and an opened run directory
+"""Classes that two modules may define."""
+
+
+def test_class_names_are_unique() -> None:
+    """A reader who looks for a class finds one."""
+    names: Counter[str] = Counter()
+    for file in MODULES.values():
+        classes = (node for node in ast.walk(syntax(file)) if isinstance(node, ast.ClassDef))
+        names.update(node.name for node in classes)
+    assert {name for name, count in names.items() if count > 1} == SAME_NAME
 
 
 MOST_LINES, MOST_PARAMETERS = 60, 7

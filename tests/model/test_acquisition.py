@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import yaml
 
-from pixcal.model.acquisition import SCHEMA, Acquisition, FringeSet, load_acquisition
+from pixcal.model.acquisition import SCHEMA, Acquisition, FringeScan, load_acquisition
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
 
@@ -45,7 +45,7 @@ def test_the_example_of_the_interface_is_read(tmp_path: Path) -> None:
     assert found.detector.full_well_e == 50000.0
     assert found.frames.bias == ("bias/*.fits",)
     assert found.frames.dark == ()
-    assert found.frames.fringes[1] == FringeSet("horizontal", ("horizontal/*.fits",), (0.0, 6.0))
+    assert found.frames.fringes[1] == FringeScan("horizontal", ("horizontal/*.fits",), (0.0, 6.0))
     assert parse(Acquisition, to_plain(found), "f") == found
 
 
@@ -133,4 +133,4 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["mask", "delta_x", "delta_fringe_sigma"])
 def test_a_set_is_not_named_as_a_result(name):
     with pytest.raises(InputError, match=f"'{name}' is reserved for a result"):
-        FringeSet(name, ("a.fits",), (6.0, 0.0))
+        FringeScan(name, ("a.fits",), (6.0, 0.0))

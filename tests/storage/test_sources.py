@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pixcal.model.acquisition import Frames, FringeSet
+from pixcal.model.acquisition import Frames, FringeScan
 from pixcal.model.errors import InputError
 from pixcal.storage.sources import SourceFile, find_sources, fingerprint
 
@@ -20,7 +20,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def find(folder: Path, **kinds: tuple[str, ...]) -> dict[str, list[str]]:
-    fringes = (FringeSet("v", kinds.pop("v"), (6.0, 0.0)),) if "v" in kinds else ()
+    fringes = (FringeScan("v", kinds.pop("v"), (6.0, 0.0)),) if "v" in kinds else ()
     found = find_sources(Frames(**kinds, fringes=fringes), folder / "acquisition.yaml")
     return {array: [s.name for s in sources] for array, sources in found.items()}
 

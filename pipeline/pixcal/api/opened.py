@@ -26,8 +26,8 @@ T = TypeVar("T")
 SERIES = ("time", "B", "A", "phi", "dkx", "dky")
 
 
-class Contents(cached_property[dict[str, Any]]):
-    """Contents of a JSON file of a `Run`: read on first use and kept."""
+class JsonFile(cached_property[dict[str, Any]]):
+    """A JSON file of a `Run`: read on first use and kept."""
 
     def __init__(self, stage: str, doc: str, file: str = "") -> None:
         super().__init__(lambda run: run._read(stage, file or stage))
@@ -71,18 +71,18 @@ class Run:
         """
         return self._read("ingest", "frames")
 
-    reduction = Contents(
+    reduction = JsonFile(
         "reduce",
-        "Contents of ``reduce.json``: gain, read noise, linearity, counts of flags, warnings.",
+        "JsonFile of ``reduce.json``: gain, read noise, linearity, counts of flags, warnings.",
     )
-    fit = Contents("fit", "Contents of ``fit.json``.")
-    allan = Contents("allan", "Contents of ``allan.json``.")
-    diagnosis = Contents(
-        "diagnose", "Contents of ``diagnosis.json``: verdict, causes, residual gap.", "diagnosis"
+    fit = JsonFile("fit", "JsonFile of ``fit.json``.")
+    allan = JsonFile("allan", "JsonFile of ``allan.json``.")
+    diagnosis = JsonFile(
+        "diagnose", "JsonFile of ``diagnosis.json``: verdict, causes, residual gap.", "diagnosis"
     )
-    correction = Contents(
+    correction = JsonFile(
         "corrected",
-        "Contents of ``correction.json``: how each identified effect was treated.",
+        "JsonFile of ``correction.json``: how each identified effect was treated.",
         "correction",
     )
 

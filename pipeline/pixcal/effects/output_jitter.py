@@ -119,7 +119,7 @@ class OutputJitter(Effect):
 
 
 @dataclass(frozen=True)
-class Outputs:
+class OutputEdges:
     """Edges between outputs, and the noise of their levels."""
 
     row_edges: tuple[int, ...]  # row_edges, column_edges: first line of each output after the first
@@ -130,7 +130,7 @@ class Outputs:
     sigmas: float  # significance of the clearest edge
 
 
-def find_outputs(stacks: Sequence[F32], times: Sequence[F64], good: Mask) -> Outputs | None:
+def find_outputs(stacks: Sequence[F32], times: Sequence[F64], good: Mask) -> OutputEdges | None:
     """Outputs of stacks (t, y, x), e-, minus the mean of each pixel, at times (t,), s.
 
     None with too few frames. If no edge is significant, the most significant one is given.
@@ -149,7 +149,7 @@ def find_outputs(stacks: Sequence[F32], times: Sequence[F64], good: Mask) -> Out
     rows, columns = (tuple(sorted(edges)) for edges in kept)
     numbers = output_numbers(rows, columns, np.arange(good.shape[0]), np.arange(good.shape[1]))
     size, error = _sizes(rests, [times[n] for n in chosen], good, numbers)
-    return Outputs(rows, columns, size, error, clearest[1])
+    return OutputEdges(rows, columns, size, error, clearest[1])
 
 
 def output_numbers(

@@ -83,7 +83,7 @@ def check_names(key: str, names: Sequence[str]) -> None:
 
 
 @dataclass(frozen=True)
-class FringeSet:
+class FringeScan:
     """One scan of the fringes of one pair of fibres."""
 
     name: str = quantity(doc="letters, digits, '-' and '_'")
@@ -108,7 +108,7 @@ class Frames:
     bias: tuple[str, ...] = quantity((), doc="no light, shortest exposure")
     dark: tuple[str, ...] = quantity((), doc="no light, any exposure times")
     flat: tuple[str, ...] = quantity((), doc="uniform light, any exposure times")
-    fringes: tuple[FringeSet, ...] = quantity((), doc="the fringe sets")
+    fringes: tuple[FringeScan, ...] = quantity((), doc="the fringe sets")
 
     def __post_init__(self) -> None:
         for kind in ("bias", "dark", "flat"):

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from pixcal.model.acquisition import (
     Detector,
-    FringeSet,
+    FringeScan,
     Optics,
     check_names,
     check_printable,
@@ -168,8 +168,8 @@ def _of_pair(name: str, doc: str) -> Any:
 class SimulatedSet:
     """One scan of the fringes of a pair of fibres."""
 
-    name: str = as_in(FringeSet, "name")
-    baseline_mm: tuple[float, float] = as_in(FringeSet, "baseline_mm")
+    name: str = as_in(FringeScan, "name")
+    baseline_mm: tuple[float, float] = as_in(FringeScan, "baseline_mm")
     count: int = _count(low=1)
     peak_e: float = quantity(
         unit="e-",

@@ -53,7 +53,7 @@ def fit_frames(
     if not strengths:
         return None
     plain = [s for s in strengths if not s.of_line]
-    fit = _Fit(kind(), FrameBasis(changes, every, plain))
+    fit = _StrengthFit(kind(), FrameBasis(changes, every, plain))
     for field in dict.fromkeys(s.field for s in sorted(plain, key=lambda s: s.steady)):
         fit.take([s for s in plain if s.field == field])
     model, errors = fit.values()
@@ -77,7 +77,7 @@ def fit_frames(
     )
 
 
-class _Fit:
+class _StrengthFit:
     """Fit of a model's strengths, added field by field."""
 
     def __init__(self, start: ForwardModel, basis: FrameBasis) -> None:

@@ -16,7 +16,7 @@ from pixcal.estimators.maps.map_fit import MapFit, MapPart, fit_maps, polynomial
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import F64
 from pixcal.simulation.forward import field_of, numbers, set_of, with_numbers
-from pixcal.simulation.light_maps import KINDS, PHASE, LightMaps, light_maps
+from pixcal.simulation.light_maps import KINDS, PHASE, FringeSetLight, light_maps
 
 ROUNDS = 3  # Gauss-Newton steps
 # change of a map (relative, or rad) by a step for a derivative; the first such step, and how often
@@ -80,7 +80,7 @@ def fit_light(starts: Sequence[LightStart], evidence: Evidence, degree: int) -> 
     return best
 
 
-def _fitted(start: LightStart, lit: Sequence[LightMaps], degree: int) -> LightFit:
+def _fitted(start: LightStart, lit: Sequence[FringeSetLight], degree: int) -> LightFit:
     model, here = start.model, [one.change(start.model) for one in lit]
     errors: dict[str, float] = {}
     lengths: dict[str, float] = {}
@@ -107,7 +107,7 @@ def _fitted(start: LightStart, lit: Sequence[LightMaps], degree: int) -> LightFi
 def _slopes(
     model: Any,
     values: Mapping[str, float],
-    lit: Sequence[LightMaps],
+    lit: Sequence[FringeSetLight],
     here: Sequence[F64],
     lengths: dict[str, float],
 ) -> list[F64]:
@@ -148,7 +148,7 @@ def _is_straight(change: F64, expected: F64) -> bool:
 
 
 def _least_squares(
-    lit: Sequence[LightMaps],
+    lit: Sequence[FringeSetLight],
     rest: Sequence[F64],
     signals: Sequence[F64],
     degree: int,
@@ -182,7 +182,7 @@ def _least_squares(
 
 
 def _gain(
-    lit: Sequence[LightMaps], changes: Sequence[F64], degree: int
+    lit: Sequence[FringeSetLight], changes: Sequence[F64], degree: int
 ) -> tuple[float, dict[str, float]]:
     """Fall in chi-square by the changes, and their observed share in each kind of map."""
     data, signals = [one.data for one in lit], [change[None] for change in changes]

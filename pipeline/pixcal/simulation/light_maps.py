@@ -25,7 +25,7 @@ PHASE = KINDS.index("the phase")
 
 
 @dataclass(frozen=True)
-class LightMaps:
+class FringeSetLight:
     """One fringe set: its maps, and the light that a model may change."""
 
     recording: Recording
@@ -47,7 +47,7 @@ class LightMaps:
         return self.recording.set_name
 
     @classmethod
-    def of(cls, fringes: FringeEvidence, recording: Recording) -> "LightMaps":
+    def of(cls, fringes: FringeEvidence, recording: Recording) -> "FringeSetLight":
         """A set, placed in its whole window."""
         (y0, x0), (ny, nx) = fringes.origin, fringes.good.shape
         alpha = np.hypot(fringes.theta[1], fringes.theta[2])
@@ -118,7 +118,7 @@ def _bent(turn: C128) -> F64:
 
 
 @cached_on_evidence
-def light_maps(evidence: Evidence) -> list[LightMaps]:
+def light_maps(evidence: Evidence) -> list[FringeSetLight]:
     """Maps of the fringe sets that are large enough, with their stitched fields."""
     recordings = set_recordings(evidence)
     large = {
@@ -126,15 +126,17 @@ def light_maps(evidence: Evidence) -> list[LightMaps]:
         for name, fringes in evidence.fringes.items()
         if np.count_nonzero(fringes.good) > MIN_PIXELS and min(fringes.good.shape) >= MIN_SIDE
     }
-    lit = [LightMaps.of(fringes, recordings[name]) for name, fringes in large.items()]
+    lit = [FringeSetLight.of(fringes, recordings[name]) for name, fringes in large.items()]
     stitched = _stitched(lit, [fringes.k for fringes in large.values()]) if lit else None
     return [replace(one, stitched=stitched) for one in lit]
 
 
-def _stitched(lit: Sequence[LightMaps], vectors: Sequence[tuple[float, float]]) -> Indices | None:
+def _stitched(
+    lit: Sequence[FringeSetLight], vectors: Sequence[tuple[float, float]]
+) -> Indices | None:
     """Stitching fields (y, x) of the foundry in the phases of all sets; None without any."""
     # Average sets along one axis: they measure the same offsets, which dominate the noise.
-    axes: dict[tuple[float, ...], list[tuple[float, LightMaps]]] = {}
+    axes: dict[tuple[float, ...], list[tuple[float, FringeSetLight]]] = {}
     for one, vector in zip(lit, np.array(vectors), strict=True):
         unit = vector / np.linalg.norm(vector)
         axis = next((a for a in axes if abs(float(unit @ a)) > SAME_AXIS), tuple(unit))

@@ -65,11 +65,11 @@ def score(kind: type[ForwardModel], evidence: Evidence) -> Scored | None:
         raise NotImplementedError("none of its strengths is a number: define estimate")
     changes = _changes(evidence)
     response = changes.response(start)
-    fit = _Fit(changes, response, names)
+    fit = _ScoreFit(changes, response, names)
     if response.random or response.mixes:
         # If frames without light hold all information, the others need not be simulated.
         keys, _ = fit.telling(start)
-        fit = _Fit(changes, dataclasses.replace(response, keys=keys), names)
+        fit = _ScoreFit(changes, dataclasses.replace(response, keys=keys), names)
     return fit.result(start)
 
 
@@ -79,7 +79,7 @@ def score_again(
     """Significance of an effect in other frames, with its parameters fixed."""
     # Compute the template again if it does not match these pixels.
     changes = _changes(evidence)
-    fit = _Fit(changes, response, ())
+    fit = _ScoreFit(changes, response, ())
     if template is None or not changes.fits(template):
         template = fit.template(model)
     return float(fit.together([template])[2])
@@ -89,7 +89,7 @@ _changes = cached_on_evidence(Changes)
 
 
 @dataclass(frozen=True)
-class _Fit:
+class _ScoreFit:
     """Score tests of an effect, and the fit of its parameters."""
 
     changes: Changes

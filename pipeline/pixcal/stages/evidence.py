@@ -9,7 +9,7 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.estimators.diagnosis.free_frames import free_frames
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, grid
-from pixcal.model.acquisition import FringeSet
+from pixcal.model.acquisition import FringeScan
 from pixcal.model.arrays import F64, Indices
 from pixcal.model.errors import InputError
 from pixcal.stages.fit.sweep import read_frames
@@ -103,9 +103,9 @@ def excess_noise_factor(gain: dict[str, Any]) -> float:
 
 
 def _fringes(
-    run_dir: Local, ingested: Ingested, listed: FringeSet, part: Part, frames: slice, within: Window
+    run_dir: Local, ingested: Ingested, scan: FringeScan, part: Part, frames: slice, within: Window
 ) -> FringeEvidence:
-    name, (origin, window) = listed.name, within
+    name, (origin, window) = scan.name, within
     source = ReducedSet(run_dir / "reduce" / "reduced.zarr" / name)
     swept = run_dir / "sweep" / "sweep.zarr" / name
     fitted = run_dir / "fit" / "fit.zarr" / name
@@ -136,7 +136,7 @@ def _fringes(
     exposure = table["exptime_s"][0]
     made = FringeEvidence(
         name=name,
-        baseline_mm=listed.baseline_mm,
+        baseline_mm=scan.baseline_mm,
         k=(float(facts["kx"]), float(facts["ky"])),
         origin=origin,
         window=window,

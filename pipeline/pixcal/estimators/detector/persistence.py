@@ -140,7 +140,7 @@ def released_late(levels: Levels, least: float) -> Released | None:
     kinds = ((1, False), (1, True), (2, True))
     fits = [fit for kind in kinds if (fit := _fit(sequence, dark, *kind, least)) is not None]
 
-    def misfit(fit: _Fit) -> float:
+    def misfit(fit: _LagFit) -> float:
         """Negative log-likelihood, twice, for noise of unknown size in darks and in flats."""
         rest = _centred(lit) - _centred(lit, sequence.late(fit.lag))
         of_flats = (len(rest) - len(lit)) * np.log(max(float(rest @ rest), 1e-12))
@@ -155,7 +155,7 @@ def released_late(levels: Levels, least: float) -> Released | None:
     return Released(lag, each, _told_from_drift(sequence, late, least))
 
 
-class _Fit(NamedTuple):
+class _LagFit(NamedTuple):
     lag: Persistence
     left: float  # sum of squares of the levels, and more if that is less than noise gives, e-²
     freedom: int
@@ -163,7 +163,7 @@ class _Fit(NamedTuple):
 
 def _fit(
     sequence: _Sequence, dark: Series, kinds: int, in_seconds: bool, least: float
-) -> _Fit | None:
+) -> _LagFit | None:
     """Traps of some kinds, from levels of darks; None if these do not constrain each kind."""
     levels = _centred(dark)
     freedom = len(levels) - len(dark) - _PARAMETERS * kinds
@@ -184,7 +184,7 @@ def _fit(
             return None
         lag = Persistence.of(fit, left / freedom, in_seconds)
         charge = sequence.light(sequence.late(lag), lag.share)
-    return _Fit(lag, left, freedom)
+    return _LagFit(lag, left, freedom)
 
 
 def _centred(series: Series, model: F64 | None = None) -> F64:

@@ -27,7 +27,7 @@ ALIGNED = 0.985  # least cosine between axes of sets that measure the same offse
 
 
 @dataclass(frozen=True)
-class Maps:
+class MapsOfSets:
     """Maps of the sets before and after."""
 
     before: Path  # before, after: `fit.zarr` and `corrected.zarr`
@@ -63,7 +63,7 @@ class SetSums(NamedTuple):
     square: float  # sum of the squared offsets after
 
 
-def measure_gain(maps: Maps, runtime: Runtime) -> dict[str, Any]:
+def measure_gain(maps: MapsOfSets, runtime: Runtime) -> dict[str, Any]:
     """Statistics of ``sets``, by name, and of ``pairs`` of sets along one axis."""
     source = next(iter(maps.sets.values())).source
     cy, cx = source.signal.chunks[1:]
@@ -129,7 +129,7 @@ def worsened(sets: Mapping[str, Any], pairs: Sequence[Mapping[str, Any]]) -> str
     return ""
 
 
-def _tile(maps: Maps, part: Part) -> tuple[list[SetSums], list[F64]]:
+def _tile(maps: MapsOfSets, part: Part) -> tuple[list[SetSums], list[F64]]:
     """Sums of one tile: of its sets, and of pairs of them (as `SetSums.halves`)."""
     delta, variance = (
         {
@@ -152,7 +152,7 @@ def _tile(maps: Maps, part: Part) -> tuple[list[SetSums], list[F64]]:
     return sets, pairs
 
 
-def _of_set(maps: Maps, name: str, delta: Sequence[F64], part: Part) -> SetSums:
+def _of_set(maps: MapsOfSets, name: str, delta: Sequence[F64], part: Part) -> SetSums:
     before, after = delta
     good = np.isfinite(before) & np.isfinite(after)
     swept, halves = maps.sets[name], np.zeros((2, 3))
@@ -174,7 +174,7 @@ def _of_set(maps: Maps, name: str, delta: Sequence[F64], part: Part) -> SetSums:
     )
 
 
-def _of_halves(maps: Maps, name: str, masked: F64, part: Part) -> F64:
+def _of_halves(maps: MapsOfSets, name: str, masked: F64, part: Part) -> F64:
     """Sums of half the difference of the halves of the frames, which is the noise of the map."""
     batches, arrays = maps.batches(name), ("batch_delta", "batch_sigma")
     stored = [ArrayReader(maps.before / name / n).read((0, batches), *part) for n in arrays]

@@ -28,13 +28,13 @@ from pixcal.model.options import Sweep
 from pixcal.simulation.effect import Effect
 from pixcal.stages import fit
 from pixcal.stages.correct.correct_maps import correct_sweep, sides_of
-from pixcal.stages.correct.gain import Maps, excess, measure_gain, worsened
+from pixcal.stages.correct.gain import MapsOfSets, excess, measure_gain, worsened
 from pixcal.stages.correct.sweep_to_correct import RestoredSet, Swept
 from pixcal.stages.correct.uncertainty import parameter_errors
 from pixcal.stages.diagnose.diagnosis_input import ESTIMATE_BYTES, EVIDENCE_BYTES
 from pixcal.stages.diagnose.windows import chosen_windows
 from pixcal.stages.evidence import load_evidence
-from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
+from pixcal.stages.fit.fringe_set import SetWithShape, describe, fit_set
 from pixcal.stages.fit.maps import Totals, write_maps
 from pixcal.stages.fit.stage import Header, header_of, publish_maps, published
 from pixcal.stages.fit.sweep import load_run, sweep_set
@@ -134,7 +134,7 @@ def _corrected_maps(run_dir: Path, made: Build, plan: Treatments, runtime: Runti
     group = made.folder / "corrected.zarr"
     totals = write_maps(group, fitted, runtime)
     axes = {name: tuple(before["sets"][name]["axis"]) for name in sets}
-    maps = Maps(run_dir / "fit" / "fit.zarr", group, sets, axes)
+    maps = MapsOfSets(run_dir / "fit" / "fit.zarr", group, sets, axes)
     gain = measure_gain(maps, runtime)
     if worse := worsened(gain["sets"], gain["pairs"]):
         raise InputError(
@@ -194,7 +194,9 @@ def _swept_sets(
     return sets, facts
 
 
-def _of_set(fitted: FittedSet, totals: Totals, gain: Json, before: Json, plan: Treatments) -> Json:
+def _of_set(
+    fitted: SetWithShape, totals: Totals, gain: Json, before: Json, plan: Treatments
+) -> Json:
     """Entry of a set in ``correction.json``."""
     masked, sigma_px = totals.sets[fitted.name]
     by_effect = dict(

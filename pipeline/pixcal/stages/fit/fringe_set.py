@@ -46,7 +46,7 @@ class SetFit:
 
 
 @dataclass(frozen=True)
-class FittedSet:
+class SetWithShape:
     """A set with its fitted shape, before its maps are written."""
 
     name: str
@@ -85,7 +85,7 @@ class FittedSet:
 
 def fit_sets(
     sweep: Local, reduced: Local, facts: Mapping[str, Any], acquisition: Acquisition, model: str
-) -> list[FittedSet]:
+) -> list[SetWithShape]:
     """Fit the shape of the fringes of every set, see `fit_set`."""
     swept = sweep / "sweep.zarr"
     return [
@@ -96,7 +96,7 @@ def fit_sets(
 
 def fit_set(
     swept: Local, source: ReducedSet, facts: dict[str, Any], acquisition: Acquisition, model: str
-) -> FittedSet:
+) -> SetWithShape:
     """Fit the shape of a set's fringes, of this ``model`` or ``auto``, to its sweep."""
     name, rows = source.folder.name, ArrayReader(swept / "sums").read()
     tiles = TileSums.of_rows(rows.reshape(-1, rows.shape[-1]))
@@ -112,7 +112,7 @@ def fit_set(
     fitted, evidence = _choose(model, tiles, start)
     shape = fitted.basis.shape.moved(fitted.coefficients[: len(fitted.basis.shape.names), 0])
     chosen = next(n for n, cls in fringe_models().items() if isinstance(shape, cls))
-    return FittedSet(name, source, swept, facts, tiles.planes, fitted, shape, chosen, evidence)
+    return SetWithShape(name, source, swept, facts, tiles.planes, fitted, shape, chosen, evidence)
 
 
 def _choose(model: str, tiles: TileSums, start: Start) -> tuple[SetFit, str]:
@@ -169,7 +169,7 @@ def _fit_shape(
     return SetFit(basis, c, basis.covariance(normal, spread), rest, spread, steps)
 
 
-def describe(fitted: FittedSet, masked: int, sigma_px: float) -> dict[str, Any]:
+def describe(fitted: SetWithShape, masked: int, sigma_px: float) -> dict[str, Any]:
     """Entry of a set in ``fit.json``; ``sigma_px``: median error of unmasked pixels."""
     source, facts, shape, fit = fitted.source, fitted.facts, fitted.shape, fitted.fit
     ny, nx = source.shape

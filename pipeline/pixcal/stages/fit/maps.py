@@ -17,7 +17,7 @@ from pixcal.estimators.fringe_fit.combine import axes_span_plane, combine_parall
 from pixcal.estimators.fringe_fit.fringes import wrapped
 from pixcal.estimators.fringe_fit.tile_sums import local_modes
 from pixcal.model.arrays import F32, F64, U8
-from pixcal.stages.fit.fringe_set import FittedSet
+from pixcal.stages.fit.fringe_set import SetWithShape
 from pixcal.stages.fit.sweep import BATCH_MAPS, DIGITS, read_frames, rounded
 from pixcal.stages.tiles import STRIP, span
 from pixcal.storage import cube
@@ -44,7 +44,7 @@ class Totals:
     consistency: float | None
 
 
-def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals:
+def write_maps(group: Path, fitted: list[SetWithShape], runtime: Runtime) -> Totals:
     """Write ``fit.zarr``: the maps of each set, and the combined maps."""
     source = fitted[0].source
     ny, nx = source.shape
@@ -81,7 +81,7 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
     return Totals(sets, outputs, sum(square) / sum(freedom) if any(freedom) else None)
 
 
-def write_offsets(group: Local, fitted: list[FittedSet]) -> None:
+def write_offsets(group: Local, fitted: list[SetWithShape]) -> None:
     """Write only the offsets of each set, as `write_maps` does."""
     for f in fitted:
         swept = {name: ArrayReader(f.swept / name) for name in ("mask", "phase", "sigma")}
@@ -95,7 +95,7 @@ def write_offsets(group: Local, fitted: list[FittedSet]) -> None:
         writer.finish()
 
 
-def _map_writer(place: Local, fitted: FittedSet, batches: int = 0) -> ArrayWriter:
+def _map_writer(place: Local, fitted: SetWithShape, batches: int = 0) -> ArrayWriter:
     """A map (y, x) in pixels, or one for each batch."""
     source = fitted.source
     return cube.create_map(place, source.shape, source.map_chunks, units="pixel", number=batches)
@@ -109,7 +109,7 @@ _TileTotals = tuple[list[int], list[F32], float, int]
 
 
 def _write_strip(
-    fitted: list[FittedSet], writers: Writers, both: bool, strip: Sequence[Job]
+    fitted: list[SetWithShape], writers: Writers, both: bool, strip: Sequence[Job]
 ) -> list[_TileTotals]:
     (y0, y1), (x0, x1) = span(fitted[0].source.shape, [at for at, _ in strip])
     swept: list[Swept] = []
@@ -133,7 +133,7 @@ def _write_strip(
 
 
 def _maps_of_tile(
-    fitted: list[FittedSet], readers: list[Swept], both: bool, job: Job, made: Made
+    fitted: list[SetWithShape], readers: list[Swept], both: bool, job: Job, made: Made
 ) -> _TileTotals:
     """Fill the maps of a tile; return its share of the totals."""
     at, removed = job
@@ -176,7 +176,7 @@ class SetOffsets:
     scale: np.float32  # ratio of errors (px) to those of the sweep (rad)
 
 
-def offsets(fitted: FittedSet, swept: Swept, at: tuple[int, int], removed: F64) -> SetOffsets:
+def offsets(fitted: SetWithShape, swept: Swept, at: tuple[int, int], removed: F64) -> SetOffsets:
     """Offsets of a set in a tile, given the modes ``removed`` from its phases."""
     source = fitted.source
     y, x = source.ranges(at)
@@ -194,7 +194,7 @@ def offsets(fitted: FittedSet, swept: Swept, at: tuple[int, int], removed: F64) 
 
 
 def _maps_of_set(
-    fitted: FittedSet, swept: Swept, at: tuple[int, int], removed: F64, made: Made
+    fitted: SetWithShape, swept: Swept, at: tuple[int, int], removed: F64, made: Made
 ) -> SetOffsets:
     """Fill a set's own maps of a tile."""
     y, x = fitted.source.ranges(at)
@@ -216,7 +216,7 @@ def _maps_of_set(
     return tile
 
 
-def _create_set(folder: Path, fitted: FittedSet) -> Writers:
+def _create_set(folder: Path, fitted: SetWithShape) -> Writers:
     """Create the set's folder: link maps of the sweep, and return writers of the others."""
     cube.create_group(folder)
     for name in SAME_AS_SWEPT:

@@ -29,7 +29,7 @@ def convert_bytes(itemsize: int, width: int, frames: int = CHUNK[0]) -> int:
 
 
 @dataclass(frozen=True)
-class FringeSet:
+class RawFringeSet:
     """A raw fringe set."""
 
     name: str  # as in ``acquisition.yaml``
@@ -54,7 +54,7 @@ class FringeSet:
         return [dict(zip(names, of_column, strict=True)) for of_column in zip(*maps, strict=True)]
 
 
-def signal_range(fringes: FringeSet, strip: Strip) -> tuple[float, float]:
+def signal_range(fringes: RawFringeSet, strip: Strip) -> tuple[float, float]:
     """Least and largest sample (e-) of good pixels in columns of chunks."""
     every = fringes.maps(strip)
     lowest = [np.full(maps["bias"].shape, np.inf, np.float32) for maps in every]
@@ -67,7 +67,7 @@ def signal_range(fringes: FringeSet, strip: Strip) -> tuple[float, float]:
 
 
 def _range_e(
-    fringes: FringeSet, maps: dict[str, NDArray[Any]], low: F32, high: F32
+    fringes: RawFringeSet, maps: dict[str, NDArray[Any]], low: F32, high: F32
 ) -> tuple[float, float]:
     seconds = np.array([fringes.exptime.max(), fringes.exptime.min()], np.float32)
     dark = maps["dark_rate"] * seconds[:, None, None]
@@ -139,7 +139,7 @@ class _Column:
     """A column of chunks during conversion."""
 
     def __init__(
-        self, fringes: FringeSet, scale: Scale, index: Index, maps: dict[str, NDArray[Any]]
+        self, fringes: RawFringeSet, scale: Scale, index: Index, maps: dict[str, NDArray[Any]]
     ) -> None:
         self.fringes, self.scale, self.index, self.maps = fringes, scale, index, maps
         self.coefficients = coefficients(
@@ -184,7 +184,7 @@ class _Column:
 
 
 def convert(
-    fringes: FringeSet, scale: Scale, writers: Mapping[str, ArrayWriter], parts: Sequence[Strip]
+    fringes: RawFringeSet, scale: Scale, writers: Mapping[str, ArrayWriter], parts: Sequence[Strip]
 ) -> None:
     """Write columns of chunks in electrons, their maps, and their counts.
 

@@ -10,7 +10,7 @@ from pixcal.kernels.quantise import Scale, choose_scale
 from pixcal.model.arrays import I64
 from pixcal.stages.reduce import electrons
 from pixcal.stages.reduce.columns import run_noted, strip_width
-from pixcal.stages.reduce.electrons import FringeSet
+from pixcal.stages.reduce.electrons import RawFringeSet
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.tiles import indices, strips
 from pixcal.storage.artefact import Workspace
@@ -49,7 +49,7 @@ def write_set(
     ``name``: of the array, ``fringes/<set>``; ``gain``: e-/ADU; ``share``: largest share of the
     variance that rounding of stored samples may add.
     """
-    fringes = FringeSet(
+    fringes = RawFringeSet(
         name=name.partition("/")[2],
         raw=source.arrays[name],
         calibration=made.folder / "calibration.zarr",

@@ -189,7 +189,7 @@ def _write_description(bench: Bench, folder: Path) -> None:
         return (f"{name}/*{COMPRESSED if name in f.compress else '.fits'}",)
 
     known = {field.name: getattr(d, field.name) for field in fields(described.Detector)}
-    sets = (described.FringeSet(s.name, globs(s.name), s.baseline_mm) for s in f.fringes)
+    sets = (described.FringeScan(s.name, globs(s.name), s.baseline_mm) for s in f.fringes)
     contents = described.Acquisition(
         schema=described.SCHEMA,
         detector=described.Detector(**known | {"saturation_adu": float(d.top_adu)}),
