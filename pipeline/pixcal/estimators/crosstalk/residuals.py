@@ -7,15 +7,25 @@ Removing the first correlates residuals by minus the products of the modes, whic
 they were frames. Removing the second leaves less noise, and as much less information.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.distortions import FramesByPixels
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.estimators.fringe_fit.fringes import grid
-from pixcal.kernels.crosstalk import Coupling, filled, uncouple, uncouple_fringes
+from pixcal.kernels.crosstalk import (
+    STEPS,
+    Coupling,
+    filled,
+    largest_outflow,
+    uncouple,
+    uncouple_fringes,
+)
 from pixcal.kernels.frame_order import slow_trends
 from pixcal.kernels.line_means import without_line_means
 from pixcal.model.arrays import F32, Indices, Mask
@@ -28,7 +38,7 @@ MIN_FRAMES = 16  # fewest frames of a fringe set for residuals
 HARMONICS = 5  # of a pixel's fringe, as a nonlinear response causes
 # modes are kept at this interval of frames; they change little, and only their products count
 STRIDE = 16
-STEPS = 3  # of the inverse of couplings; each leaves of the error the share that leaves a pixel
+LEFT = 1e-3  # most of the coupled noise that the correction for couplings may leave
 MIN_NOISE_SHARE = 0.1  # least share of its noise that a usable sample retains
 
 
@@ -68,18 +78,25 @@ def _spread(frames: int, pixels: int) -> Indices:
 def _of_stack(stack: Stack, evidence: Evidence, known: Sequence[Coupling]) -> Residuals:
     """Bias, darks or flats; offset and level of each frame are free, and each pixel's drift."""
     at = _spread(len(stack.adu), evidence.good.size)
-    signal = uncouple(
-        (stack.adu[at] - evidence.bias) * evidence.gain, known, evidence.origin, STEPS
-    )
-    signal /= UNIT
+    signal = (stack.adu[at] - evidence.bias) * evidence.gain
+    signal = uncouple(signal, known, evidence.origin, _steps(known, signal)) / UNIT
     light = signal.mean(axis=0)
     good = evidence.good & (stack.adu.max(axis=0) < evidence.saturation_adu)
     noise = without_line_means(((signal - light) * UNIT**0.5).astype(np.float32), good)
     charge = np.maximum(light, 0).astype(np.float32)
-    common = np.stack([np.ones_like(charge), charge])[: 1 + (stack.kind == "flat")]
+    # Even light is nearly the offset; centred, the two are told apart in single precision.
+    contrast = charge - np.float32(charge.mean(dtype=float))
+    common = np.stack([np.ones_like(charge), contrast])[: 1 + (stack.kind == "flat")]
     read = np.full_like(charge, evidence.read_noise**2 / UNIT)
     trends = np.ascontiguousarray(slow_trends(stack.frame[at]).T)
     return _noise(noise, charge[None], read, trends, common, good)
+
+
+def _steps(known: Sequence[Coupling], signal: NDArray[Any]) -> int:
+    """Steps of the inverse of couplings: each leaves the share of a change that leaves a pixel."""
+    rise = max((c.per_ke for c in known), default=0.0)
+    share = largest_outflow(known) * (1 + 2e-3 * max(rise, 0) * float(np.max(signal)))
+    return math.ceil(math.log(LEFT) / math.log(share)) if 0 < share < 1 else STEPS
 
 
 def _of_fringes(fringes: FringeEvidence, known: Sequence[Coupling]) -> Residuals:
@@ -92,7 +109,7 @@ def _of_fringes(fringes: FringeEvidence, known: Sequence[Coupling]) -> Residuals
     if known:
         seen = np.isfinite(samples)
         samples = np.where(seen, samples, replace(fringes, theta=theta).model)
-        samples = uncouple(samples, known, fringes.origin, STEPS)
+        samples = uncouple(samples, known, fringes.origin, _steps(known, samples))
         samples[~seen] = np.nan
         theta = uncouple_fringes(theta, known, fringes.origin)
     model = replace(fringes, theta=theta).model
