@@ -77,21 +77,27 @@ def mark(run: Path, truth: dict[str, Any]) -> dict[str, Any]:
 
 
 def _diagnosis(file: Path, causes: list[list[str]] | None) -> dict[str, Any]:
-    """Causes named, and whether they match the expected ones; None: any is wrong."""
+    """Causes named, and whether they match the expected ones; None: any is wrong.
+
+    A cause also matches by an effect that it is said to be indistinguishable from.
+    """
     if not file.exists():
         return {"right": False}
     found = json.loads(file.read_text())
-    named = [cause["effect"] for cause in found["causes"]]
+    causes_named = found["causes"]
+    named = [cause["effect"] for cause in causes_named]
+    alike = {name for cause in causes_named for name in cause["not_told_apart_from"]}
     if causes is None:
         right = not named
     elif not causes:
         right = found["verdict"] == "no gap"
     else:
-        right = len(named) == len(causes) and all(set(named) & set(one) for one in causes)
+        right = len(named) == len(causes) and all({*named, *alike} & set(one) for one in causes)
     return {
         "right": right,
         "verdict": found["verdict"],
         "named": named,
+        "alike": sorted(alike),
         "p": [cause["p_value"] for cause in found["causes"]],
         "parameters": [[cause["parameters"], cause["uncertainty"]] for cause in found["causes"]],
         "where": [w["statistic"] for w in found["gap"].get("where", [])][:4],

@@ -213,6 +213,7 @@ def test_noise_alone_tells_it_when_it_is_large(acquired: Callable[..., Evidence]
     assert flats is not None
     assert isinstance(flats.effect, BrighterFatter)
     assert abs(flats.effect.shift_px_per_e - 1e-6) < 4 * flats.errors["shift_px_per_e"]
+    assert flats.alike == ("ipc",)  # shares that grow with the level
     assert BrighterFatter.estimate(replace(evidence, fringes={}, stacks=())) is None
 
 

@@ -107,7 +107,7 @@ class BrighterFatter(Effect):
         along_y = 1.0
         if not evidence.fringes:
             size, variance, along_y, significance = _by_axis(noise)
-            why += ", which crosstalk with a share that grows from zero would cause as well"
+            why += ", which crosstalk with a share that grows with the level would cause as well"
         else:
             shift, of_shift, _ = boundaries_beside(evidence, falloff)
             if _agree(noise, shift, of_shift):
@@ -128,7 +128,8 @@ class BrighterFatter(Effect):
                 )
                 why += "; no nonlinearity is needed in addition"
         effect = cls(float(np.clip(size, 0, _MAX_SHIFT)), falloff, along_y)
-        return Estimate(effect, errors, significance, why, tuple(together))
+        alike = () if evidence.fringes else ("ipc",)  # its shares may grow with the level
+        return Estimate(effect, errors, significance, why, tuple(together), alike=alike)
 
 
 def _by_axis(noise: SharedCharge) -> tuple[float, float, float, float]:

@@ -51,7 +51,7 @@ class Coupling:
     )
     column: int = quantity(0, low=0, high=1023, doc="the first of these columns")
     per_ke: float = quantity(
-        0.0, unit="1/ke-", low=-0.02, high=1.0,
+        0.0, unit="1/ke-", low=-0.2, high=50.0,
         doc="relative change of the share with the source's signal",
     )  # fmt: skip
 

@@ -64,6 +64,8 @@ class Estimate:
     size : mapping
         The size if the strengths do not give it: ``value``, ``error``, ``unit`` (empty for a
         ratio), and ``of``, the words that follow the number.
+    alike : tuple of str
+        Names of effects that these frames cannot tell from this one, whatever their significance.
     """
 
     effect: "Effect"
@@ -78,6 +80,7 @@ class Estimate:
     in_full: "Effect | None" = None
     refused: str = ""
     size: Mapping[str, Any] = field(default_factory=dict)
+    alike: tuple[str, ...] = ()
 
     @property
     def significant_part(self) -> "Effect":

@@ -20,12 +20,14 @@ from pixcal.estimators.crosstalk.links import (
     shares_of,
 )
 from pixcal.estimators.crosstalk.maps import Maps
+from pixcal.estimators.crosstalk.residuals import UNIT
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.boundaries import REACH, boundary_shifts, shared_noise
 from pixcal.kernels.crosstalk import Coupling
 from pixcal.model.arrays import F64
 
-CHANGES = np.arange(-0.02, 1.0, 1e-4)  # relative, of shares with the signal, 1/ke-
+CHANGES = np.arange(-1.0, 50.0, 2e-3)  # relative, of shares, up to the brightest light
+BRIGHT = 50.0  # the same without light: charge of hot pixels, ke-
 CERTAIN = 5.0  # sigmas beyond which such a change is accepted
 MORE = 10.0  # fall in chi-square that boundaries, as a further cause, must bring; as in a search
 FALLOFFS = (0.25, 0.5, 1.0)  # of boundary shifts with distance, px
@@ -93,7 +95,8 @@ class Sources:
                 by_boundaries += float((rise[seen] ** 2 / variance[seen]).sum())
         share, rise, used, covariance = (np.concatenate(a) for a in zip(*measured, strict=True))
         (own, mixed), (_, other) = np.moveaxis(covariance, 0, -1)
-        trial = np.append(CHANGES, 0.0)[:, None]
+        brightest = self.noise.brightest * UNIT / 1e3 if self.noise.lit else BRIGHT
+        trial = np.append(CHANGES / brightest, 0.0)[:, None]
         variance = other - 2 * trial * mixed + trial**2 * own
         left = (rise - trial * share) ** 2 / variance
         own_left = left[:, used].sum(axis=1)

@@ -131,7 +131,12 @@ class Description:
         alone, without = self._with(by_itself), self._with(search.without[name])
         gain = search.final.log_likelihood - search.without[name].log_likelihood
         by_law = self._with(search.by_law[name]) if name in search.by_law else alone
-        alike = search.alike.get(name, ())
+        known = {effect.name for effect in search.final.effects}
+        alike = tuple(
+            n
+            for n in dict.fromkeys((*search.alike.get(name, ()), *estimate.alike))
+            if n in search.candidates and n not in known
+        )
         kinds = [type(e.effect) for n in (name, *alike) if (e := search.candidates[n].estimate)]
         # Fisher's method combines two independent parts of the frames. A likelihood ratio of e^gain
         # has a chance of at most e^-gain (Markov's inequality).
