@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -307,6 +308,29 @@ def test_light_that_changes_is_no_drift_of_the_runs(
     found = BiasDrift._in_runs(acquired(None, {other: {}}))
     assert found is not None
     assert found.significance < 4
+
+
+@pytest.mark.long
+def test_power_and_contrast_that_change_together_are_no_drift(
+    acquired: Callable[..., Evidence],
+) -> None:
+    """As where a laser's mode hops: pixels of larger response change by more."""
+    hops = np.random.default_rng(5).random(60) < 0.1
+    mode = np.repeat(np.cumsum(hops) % 2, 2).astype(float)
+
+    def tracks(change: float) -> list[dict[str, Any]]:
+        return [
+            {
+                "set": s,
+                "time_s": np.linspace(0, 50, 120).tolist(),
+                "value": list(map(float, change * mode)),
+            }
+            for s in ("vertical", "horizontal")
+        ]
+
+    on = {"rms": 0.0, "tracks": tracks(0.03), "contrast_tracks": tracks(-0.05)}
+    found = BiasDrift.estimate(acquired(None, {"intensity_noise": on}))
+    assert found is None or found.significance < 4
 
 
 def test_tracks_are_replayed(make_effect_bench: Callable[..., Bench]) -> None:

@@ -401,6 +401,20 @@ def test_a_cause_is_judged_by_what_it_changes(
     assert left > 0.5
 
 
+@pytest.mark.parametrize("confirmed", [False, True])
+def test_a_law_that_maps_confirm_is_named_beside_an_unknown_cause(confirmed: bool) -> None:
+    """Though that changes the same statistics, and others imitate both better."""
+    effect = ToyOfMaps("right", 0.02)
+    object.__setattr__(effect, "name", "right")
+    one = Estimate(effect, {"size": 2e-4}, 50.0, "told", law_predicts=confirmed)
+    found, left = search(
+        {"right": 0.02, "single 3": 0.02, "single 4": 0.2},
+        [Candidate("right", one), candidate("unknown", 0.02), candidate("curve", 0.03)],
+    )
+    assert found.accepted == (("right",) if confirmed else ())
+    assert left > 0.5
+
+
 @pytest.mark.parametrize("more", [False, True])
 def test_its_own_significance_alone_supports_no_cause(more: bool) -> None:
     """Fitted and held-out frames agree in it, whatever the true cause."""

@@ -18,6 +18,7 @@ from pixcal.estimators.frame_series.offset import (
     unlit_stacks,
 )
 from pixcal.estimators.frame_series.profiled import Profiled, best_shape
+from pixcal.estimators.frame_series.series import TimedValues
 from pixcal.estimators.frame_series.variance_components import (
     MAX_STEPS,
     Components,
@@ -162,7 +163,7 @@ class BiasDrift(Effect):
     def _in_runs(cls, evidence: Evidence) -> Estimate | None:
         """A separate walk or ramp in each fringe set, from B and A of its frames."""
         light = light_of(evidence)
-        if light is None:
+        if light is None or _is_light(evidence, fringe_offset_series(light)[0]):
             return None
         at = LIGHT_PARTS.index("offset_walk")
         light = replace(light, dark=())
@@ -263,6 +264,27 @@ def _settling(every: Sequence[OffsetSeries], plain: Components) -> tuple[Profile
     # Neighbouring time constants are correlated: half their number counts as trials.
     chance = log_chance_of_any([log_chance(_rise(best.components, plain))] * (SETTLINGS // 2))
     return best if sigmas(chance) > SIGNIFICANT else None, chance
+
+
+def _is_light(evidence: Evidence, offsets: Sequence[TimedValues]) -> bool:
+    """Whether offsets inferred from B and A are light: larger in pixels of larger response."""
+    # The power and the contrast may change together, as where the laser's mode hops.
+    along = square = 0.0
+    for name, time, offset in offsets:
+        fringes = evidence.fringes[name]
+        series = fringe_offsets(fringes, evidence.flat)
+        if series is None:
+            continue
+        inferred = np.interp(fringes.time_s, time, offset)
+        inferred, found = (
+            inferred - inferred.mean(),
+            series.values[:, 0] - series.values[:, 0].mean(),
+        )
+        variance = max(float(series.noise[0]), float(np.var(found - inferred)))
+        along += float(inferred @ found) / variance
+        square += float(inferred @ inferred) / variance
+    # The offsets by response over those inferred: 1 for a bias, with an error of square ** -0.5.
+    return bool(square - along > SIGNIFICANT * np.sqrt(square))
 
 
 def _with_level(track: Track, evidence: Evidence) -> Track:

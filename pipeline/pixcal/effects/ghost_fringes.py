@@ -42,6 +42,8 @@ ALIKE, ALIKE_SIGMAS = 0.1, 5.0
 # and largest wave of the phase relative to it, as of crosstalk; distance, periods in the window, of
 # the waves that together describe a curved one
 PHASE_SHARE, CLOSE = 0.05, 1.5
+# largest misfit of the law of one ghost, over that of the next law, that no chance pattern has
+PREDICTED = 0.1
 
 
 @dataclass(frozen=True)
@@ -172,7 +174,7 @@ class GhostFringes(Effect):
         waves: list[GhostWave] = []
         errors: dict[str, float] = {}
         *single, both = (TiedWaves.of(law, ghosts.waves) for law in LAWS)
-        best = min(single, key=lambda tied: tied.misfit)
+        best, second, _ = sorted(single, key=lambda tied: tied.misfit)
         static = sum(abs(w.static) ** 2 / w.errors[0] ** 2 for w in ghosts.waves)
         # Two ghosts have more free numbers, and must explain much more than one. Crosstalk causes
         # no static fringes.
@@ -194,6 +196,8 @@ class GhostFringes(Effect):
             "fringes of a common vector in " + " and ".join(ghosts.seen_in),
             law=tied.law,
             by_law=cls(0.0, waves[0].beat_rad_px, in_flats=ghosts.in_flats, waves=by_law),
+            # The static fringes, in size and phase, are then those of one moving sideband.
+            law_predicts=not two and tied.moves and best.misfit < PREDICTED * second.misfit,
         )
 
 
@@ -225,6 +229,11 @@ class TiedWaves:
     misfit: float  # chi-square that the law leaves
     freedom: int  # its expectation from noise
 
+    @property
+    def moves(self) -> bool:
+        """Whether fringes of the ghost follow the modulator."""
+        return bool(np.any(np.array(LAWS[self.law])[:, 1:]))
+
     @classmethod
     def of(cls, law: str, measured: Sequence[WaveFit]) -> "TiedWaves":
         """Least squares of the measured amplitudes."""
@@ -255,8 +264,7 @@ def _of_a_beam(waves: Sequence[WaveFit], tied: TiedWaves, evidence: Evidence) ->
     """Whether waves are due to a reflection, by their law and the misfit that it leaves."""
     chi2 = sum(float((np.abs(w.amplitudes / w.errors[:3]) ** 2).sum()) for w in waves)
     untied = tied.misfit * 6 * len(waves) > UNTIED * tied.freedom * chi2
-    moving = np.any(np.array(LAWS[tied.law])[:, 1:])
-    return not untied and not (moving and _of_the_flat(waves, evidence))
+    return not untied and not (tied.moves and _of_the_flat(waves, evidence))
 
 
 def _of_the_flat(waves: Sequence[WaveFit], evidence: Evidence) -> bool:

@@ -1,8 +1,7 @@
 """An effect of the bench or the detector: a forward model with estimation and correction.
 
-An effect acts on the frames of a simulation (`pixcal.simulation.forward`). This suffices to
-estimate its parameters from an acquisition (`pixcal.simulation.score`). It may also define its
-action on the maps of a fit, and the inverse.
+It acts on simulated frames (`pixcal.simulation.forward`). This suffices to estimate its parameters
+(`pixcal.simulation.score`). It may also define its action on the maps of a fit, and the inverse.
 """
 
 import dataclasses
@@ -46,19 +45,19 @@ class Estimate:
     why : str
         One sentence: the frames and the statistic that show it.
     together : tuple of mapping
-        Joint 1-sigma steps of several parameters, independent of one another, if errors are
-        correlated; otherwise the errors of the parameters are independent.
+        Joint 1-sigma steps, independent of one another, of parameters with correlated errors.
     covariance : (n, n) float64, optional
         Of the parameters of `Effect.phase_slopes`, if measured together.
     law : str
         The best-fitting law of the mechanism, in words; empty if the effect is itself a law.
     by_law : Effect, optional
         The effect by that law.
+    law_predicts : bool
+        Whether static maps agree with the law where, without it, other values were possible.
     again : Again, optional
         A faster way to detect this effect in other frames.
     in_full : Effect, optional
-        The effect with all measured parameters, significant or not; None if that is the effect
-        itself.
+        The effect with all measured parameters, significant or not; None if it has them all.
     refused : str
         Why it cannot be a cause, however significant.
     size : mapping
@@ -76,6 +75,7 @@ class Estimate:
     covariance: F64 | None = None
     law: str = ""
     by_law: "Effect | None" = None
+    law_predicts: bool = False
     again: "Again | None" = None
     in_full: "Effect | None" = None
     refused: str = ""

@@ -59,6 +59,11 @@ class Candidate:
         return self.domains == ("space",)
 
     @property
+    def law_predicts(self) -> bool:
+        """Whether static maps confirm its law."""
+        return self.estimate is not None and self.estimate.law_predicts
+
+    @property
     def law(self) -> Effect | None:
         """The best-fitting law, if the estimate is a measured curve."""
         return None if self.estimate is None else self.estimate.by_law

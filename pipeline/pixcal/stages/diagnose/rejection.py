@@ -139,10 +139,12 @@ def settled(comparison: Comparison, fewer: Trial, trial: Trial, candidate: Candi
 
     ``fewer``, ``trial``: without and with it.
     """
-    # Held-out frames cannot refute static maps, or what was measured frame by frame on them.
+    # Held-out frames cannot refute static maps, or what was measured frame by frame on them. A law
+    # that predicts part of the maps is tested by them, whatever else an unknown cause does there.
     fitted_there = candidate.in_maps_alone or candidate.replay in trial.effects
-    return not (fitted_there or _imitated(candidate)) and comparison.settles(
-        _own(candidate), fewer, trial
+    return not _imitated(candidate) and (
+        candidate.law_predicts
+        or (not fitted_there and comparison.settles(_own(candidate), fewer, trial))
     )
 
 
@@ -241,7 +243,9 @@ def entangled(
 
     def steady(name: str) -> bool:
         estimate, replay = candidates[name].estimate, candidates[name].replay
-        return estimate is not None and replay == estimate.in_full
+        # What the maps confirm holds no other effect.
+        confirmed = candidates[name].law_predicts
+        return estimate is not None and replay == estimate.in_full and not confirmed
 
     pairs = []
     for out in filter(steady, causes):

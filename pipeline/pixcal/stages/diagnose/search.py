@@ -265,6 +265,8 @@ class Search:
 
     def _best(self, gains: dict[str, float]) -> str:
         """The candidate with the largest gain; among equals, one that is described by its law."""
+        # A cause that maps confirm comes before those that may imitate it, or an unknown one.
+        gains = {n: g for n, g in gains.items() if self._candidates[n].law_predicts} or gains
         # A curve measured at many levels can imitate another effect.
         most = max(gains.values())
         equals = {n: g for n, g in gains.items() if g >= (1 - TIE_MARGIN) * most}
