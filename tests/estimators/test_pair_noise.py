@@ -72,6 +72,19 @@ def test_subtracted_lines_leave_no_covariance_across_them(line: str) -> None:
     assert np.mean(more) == pytest.approx(0, abs=less / 3)
 
 
+def test_crosstalk_makes_no_bands() -> None:
+    """Its neighbours share noise, so that means of rows vary more; nothing but that is taken."""
+    rng = np.random.default_rng(7)
+    charge, share = 40_000.0, 0.08
+    light = rng.poisson(charge, (40, *SHAPE)).astype(np.float32)
+    steps = ((0, 1), (0, -1), (1, 0), (-1, 0))
+    near = np.sum([np.roll(light, step, (1, 2)) for step in steps], axis=0)
+    flats = light + np.float32(share) * (near - 4 * light)
+    whole, rest = flat_pair_sums(flats, flats.mean(axis=(1, 2)), 1.0, READ, 0.0, LineNoise())
+    assert without_bands(whole, rest) is whole
+    assert rest[:, 2].sum() == pytest.approx(whole[:, 2].sum(), rel=2e-3)
+
+
 def test_without_noise_of_lines_nothing_is_taken() -> None:
     rng = np.random.default_rng(4)
     dark = (READ * rng.standard_normal((20, *SHAPE))).astype(np.float32)

@@ -194,10 +194,11 @@ def _blocks(first: F32, second: F32, without: tuple[str, ...], **guess: float) -
     blocks = pair_statistics(first, second, **guess)
     for name, number in zip(without, others, strict=True):
         across = 0 if name == "row" else 1
-        # Of each variance, and of each covariance along the line.
-        taken = blocks[:, 2] / number
+        # Of each variance, and of each covariance along the line; neighbours share noise, too.
+        along = LAGS[:, across] == 0
+        taken = (blocks[:, 2] + 2 * blocks[:, 3:] @ along) / number
         blocks[:, 2] += taken
-        blocks[:, 3:] += np.outer(taken, LAGS[:, across] == 0)
+        blocks[:, 3:] += np.outer(taken, along)
         # A block's mean varies less without lines, and took less off each of them.
         blocks[:, 2:] -= taken[:, None] / min(BLOCK, first.shape[across])
     return blocks
