@@ -12,7 +12,10 @@ from astropy.io import fits
 from click.testing import CliRunner
 
 import pixcal
+from pixcal.estimators.detector.pair_noise import dark_pair_sums, shared_by_lines
+from pixcal.kernels.photon_transfer import BLOCK
 from pixcal.stages.reduce.detector_warnings import _declared_gain_warnings
+from pixcal.stages.reduce.read_noise import of_few_lines
 from pixcal_cli.main import cli
 
 SHAPE = (140, 150)
@@ -216,6 +219,21 @@ def test_what_frames_without_exposure_times_do_not_tell_is_said(tmp_path: Path) 
 def test_noise_of_rows_is_told_from_that_of_pixels(tmp_path: Path) -> None:
     noise = camera_run(tmp_path, {"bias": (0, 40, 1, 2.0), "flat": (30000, 8, 1, 2.0)})["row_noise"]
     assert abs(noise["value"] - 2.0) < 4 * noise["error"] < 0.4
+
+
+def test_error_of_read_noise_counts_that_lines_are_few() -> None:
+    """Noise of rows as strong as that of pixels scatters by its error from camera to camera."""
+    rng, shape = np.random.default_rng(9), (64, 96)
+    scaled = []
+    for _ in range(60):
+        dark = 4 * rng.standard_normal((20, *shape)) + 4 * rng.standard_normal((20, shape[0], 1))
+        sums = dark_pair_sums(dark.astype(np.float32), 4.0, 0.0)
+        dof, _, square = sums[:, :3].sum(axis=0)
+        lines = shared_by_lines(sums)["row"][0]
+        noise = np.sqrt(square / dof + lines / BLOCK)  # blocks of rows take that off
+        value, error = of_few_lines((noise, noise / np.sqrt(2 * dof)), sums, shape)
+        scaled.append((value - np.sqrt(32.0)) / error)
+    assert np.std(scaled) == pytest.approx(1, abs=0.35)
 
 
 def test_outputs_of_different_gain_are_told_and_leave_the_response(tmp_path: Path) -> None:

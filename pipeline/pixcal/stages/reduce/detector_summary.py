@@ -149,6 +149,9 @@ def summarise(job: Measuring, folder: Place, source: Ingested) -> Summary:
         noise, unrounded = read_noise.of_variance(gain.read_variance, job.quantum)
     elif gain is not None and gain.without_dark:
         noise, unrounded = (n and (n[0], max(n[1], _OFF_CURVE * n[0])) for n in (noise, unrounded))
+    noise, unrounded = (
+        n and read_noise.of_few_lines(n, dark, job.shape) for n in (noise, unrounded)
+    )
     known = math.nan if gain is None else gain.read_variance[0]
     straight = straightness(levels_with_light(source, levels, usable, rate), points, known)
     return Summary(

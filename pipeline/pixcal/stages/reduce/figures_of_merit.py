@@ -13,7 +13,6 @@ from pixcal.engine.run import Runtime
 from pixcal.estimators.detector import emva
 from pixcal.estimators.detector.amplifiers import Outputs, differing_outputs
 from pixcal.estimators.detector.emva import Measure, Nonuniformity
-from pixcal.estimators.detector.pair_noise import shared_by_lines
 from pixcal.kernels.rounding import UNDETERMINED_BELOW, level_before_rounding
 from pixcal.model.arrays import F64, Mask
 from pixcal.report.text import with_error
@@ -22,7 +21,7 @@ from pixcal.stages.reduce.detector_summary import Summary, pair_sums
 from pixcal.stages.reduce.halves import Halves, middle_of, read_halves
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduce.measuring import STATISTICS, Measuring
-from pixcal.stages.reduce.read_noise import Nearby
+from pixcal.stages.reduce.read_noise import Nearby, line_noise
 from pixcal.stages.tiles import Part
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube_reader import ArrayReader
@@ -125,12 +124,9 @@ def _line_noise(
     figures: Json, dark: F64, gain: float, shape: tuple[int, int], nearby: Nearby | None
 ) -> None:
     """Temporal noise common to the pixels of a row, or of a column."""
-    lengths = {"row": shape[1], "column": shape[0]}
-    for name, (shared, error) in shared_by_lines(dark).items():
+    for name, (shared, error) in line_noise(dark, shape).items():
         # What near pixels alone share is of a filter.
-        if shared and (nearby is None or nearby.lines[name] > shared / 2):
-            # Each line of each pair of frames is one sample of it.
-            error = math.hypot(error, shared * math.sqrt(2 * lengths[name] / dark[:, 0].sum()))
+        if nearby is None or nearby.lines[name] > shared / 2:
             noise = math.sqrt(shared)
             title, note = f"{name} noise", "part of the read noise"
             figures[f"{name}_noise"] = _figure(

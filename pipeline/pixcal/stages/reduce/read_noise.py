@@ -10,7 +10,12 @@ from pixcal.estimators.detector.calibration import usual_rate
 from pixcal.estimators.detector.code_histogram import step_of
 from pixcal.estimators.detector.emva import Measure
 from pixcal.estimators.detector.missing_codes import missing_codes, noise_before_missing_codes
-from pixcal.estimators.detector.pair_noise import LINES, along_lines, shared_by_blocks
+from pixcal.estimators.detector.pair_noise import (
+    LINES,
+    along_lines,
+    shared_by_blocks,
+    shared_by_lines,
+)
 from pixcal.estimators.detector.rounded_noise import BELOW, FRAMES, noise_of_codes
 from pixcal.kernels.photon_transfer import BLOCK
 from pixcal.kernels.rounding import SHEPPARD
@@ -120,6 +125,25 @@ def read_noise(
     if not job.quantum:
         return measured, measured, None
     return measured, *_before_rounding(variance, shot[0], job)
+
+
+def line_noise(dark: F64, shape: tuple[int, int]) -> dict[str, Measure]:
+    """Variance (ADU²) that pixels of a row, and of a column, share, where it is significant.
+
+    Each line of each pair of frames is one sample of it, which its error counts.
+    """
+    pixels = dict(zip(LINES, shape[::-1], strict=True))
+    return {
+        name: (shared, math.hypot(error, shared * math.sqrt(2 * pixels[name] / dark[:, 0].sum())))
+        for name, (shared, error) in shared_by_lines(dark).items()
+        if shared
+    }
+
+
+def of_few_lines(noise: Measure, dark: F64, shape: tuple[int, int]) -> Measure:
+    """Noise whose error allows for the few lines that show what their pixels share."""
+    errors = [error / (2 * noise[0]) for _, error in line_noise(dark, shape).values()]
+    return noise[0], math.hypot(noise[1], *errors)
 
 
 def is_cut_off(job: Measuring) -> bool:
