@@ -18,8 +18,8 @@ def with_error(value: float | None, error: float | None) -> str:
     """The value rounded to two digits of its error."""
     if value is None or not error:
         return number(value)
-    decimals = max(0, 1 - math.floor(math.log10(abs(error))))
-    return f"{value:.{decimals}f} ± {error:.{decimals}f}"
+    decimals = 1 - math.floor(math.log10(abs(error)))
+    return " ± ".join(f"{round(v, decimals):.{max(0, decimals)}f}" for v in (value, error))
 
 
 def show_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

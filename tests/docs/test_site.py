@@ -1,5 +1,6 @@
 """The site builds without a warning and shows what the pages say; where `make docs` was run."""
 
+import dataclasses
 import re
 import subprocess
 import sys
@@ -7,9 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
+from pixcal.kernels.beams import Light, LightMaps
+from pixcal.kernels.scene import DetectorMaps, FrameStates
+from pixcal.simulation.recording import Recording
+
 for library in ("mkdocs", "material", "mkdocstrings_handlers.python", "latex2mathml"):
     pytest.importorskip(library, reason="the group 'docs' is not installed")
 
+HOLD = (Evidence, FringeEvidence, Stack, Recording, DetectorMaps, FrameStates, Light, LightMaps)
 ROOT = Path(__file__).parents[2]
 
 
@@ -37,6 +44,15 @@ def test_the_reference_holds_the_docstrings(site: Path) -> None:
     text = (site / "reference/python.html").read_text(encoding="utf-8")
     for name in ("calibrate", "open_run", "delta_x", "baselines_mm", "sample_acquisition"):
         assert name in text
+
+
+def test_the_reference_says_what_evidence_frames_and_maps_hold(site: Path) -> None:
+    text = (site / "reference/python.html").read_text(encoding="utf-8")
+    for shown in HOLD:
+        for field in dataclasses.fields(shown):
+            name = f"{shown.__module__}.{shown.__name__}.{field.name}"
+            assert field.name.startswith("_") or f'id="{name}"' in text, name
+    assert "variance of a sample" in text
 
 
 def test_nothing_is_loaded_from_elsewhere(site: Path) -> None:

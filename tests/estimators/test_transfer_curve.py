@@ -16,7 +16,7 @@ from pixcal.estimators.crosstalk.links import links
 from pixcal.estimators.crosstalk.sources import sources_of, total
 from pixcal.estimators.detector.flat_noise import shot_share_of_flats
 from pixcal.estimators.detector.ladder_curve import ladder_curve
-from pixcal.estimators.detector.transfer_curve import transfer_curve
+from pixcal.estimators.detector.transfer_curve import shot_share, sums_of_stacks, transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.estimators.test_statistics.noise import read_noise
 from pixcal.kernels.boundaries import boundary_shifts
@@ -89,6 +89,12 @@ def test_dark_signal_of_the_order_of_the_read_noise_leaves_the_photon_transfer_r
     assert curve is not None
     assert abs(curve.share - 1) < 4 * curve.error < 0.04
     assert abs(curve.slope) < 4 * curve.slope_error
+
+
+def test_however_many_the_samples_the_noise_is_known_to_half_a_per_cent_at_best() -> None:
+    found = shot_share(1e8 * sums for sums in sums_of_stacks(evidence()))
+    assert found is not None
+    assert found[1] == pytest.approx(0.005, rel=0.01)
 
 
 @pytest.mark.parametrize("dark", [0.8, 1.3])

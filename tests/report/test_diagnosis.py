@@ -14,6 +14,7 @@ from PIL import Image
 from pixcal.estimators.test_statistics import DETECTOR, known_statistics
 from pixcal.estimators.test_statistics.fringe_set_data import STEPS
 from pixcal.estimators.test_statistics.noise import OUTLIERS
+from pixcal.report import diagnosis_figures as figures
 from pixcal.report import diagnosis_maps as maps
 from pixcal.report import diagnosis_words
 from pixcal.report import page as page_module
@@ -566,6 +567,12 @@ def test_names_of_places_are_those_of_the_battery() -> None:
     assert outliers == [f"{v:+.0f}".replace("-", "−") for v in limits]
     assert set(diagnosis_words._AXES) <= {s.x_label for s in known_statistics().values()}
     assert diagnosis_words.DETECTOR == DETECTOR
+
+
+def test_no_word_of_an_axis_is_cut_off_in_a_figure() -> None:
+    for axis in diagnosis_words._AXES.values():
+        assert len(axis.label) <= figures.LABEL
+        assert max(map(len, axis.names), default=0) <= figures.NAME
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from pixcal.report.drawing import TITLE, WIDE, Unit, axes_grid, finish, note, pl
 from pixcal.report.text import unit
 
 ROOM = 50  # letters that fit below a panel; longer tick labels are rotated
+LABEL, NAME = 34, 20  # most letters of an axis label, and of a tick label
 SPAN = 12.0  # ratio of values above which an axis is logarithmic
 QUIET = 5.0  # least half height of the axis of deviations, sigma
 ORDER = ("measured", "nominal simulation", "with the causes")
@@ -127,7 +128,7 @@ def curves_figure(curves: Sequence[Mapping[str, Any]], *, with_effects: bool = T
     named = [places(c) for c in curves if _is_named(c)]
     # space for the longest rotated label, inches
     label_height = max(
-        [0.075 * min(len(n), 12) for names in named if _rotated(names) for n in names] or [0]
+        [0.075 * min(len(n), NAME) for names in named if _rotated(names) for n in names] or [0]
     )
     lines = max(_title(c).count("\n") + 1 for c in curves)
     size = WIDE * (1 + len(curves)) / 4, 5.0 + label_height
@@ -222,12 +223,12 @@ def _sigma_axis(axes: Axes, sigmas: Sequence[F64]) -> None:
 
 
 def _place_axis(axes: Axes, curve: Mapping[str, Any], x: F64, named: bool) -> None:
-    axes.set_xlabel(_plain(axis_label(curve), 34))
+    axes.set_xlabel(_plain(axis_label(curve), LABEL))
     if named:
         names = places(curve)
         step = -(-len(names) // 16)
         rotation = 90 if _rotated(names[::step]) else 0
-        axes.set_xticks(x[::step], [_plain(n, 12) for n in names[::step]], rotation=rotation)
+        axes.set_xticks(x[::step], [_plain(n, NAME) for n in names[::step]], rotation=rotation)
         axes.set_xlim(-0.6, len(x) - 0.4)
         axes.tick_params(axis="x", labelsize=9)
         return

@@ -153,7 +153,7 @@ _AXES = {
     "sigma, low then high": _Axis("beyond so many σ", "beyond {} σ", _SIGMAS),
     "quantile": _Axis("quantile of the pixels", "{} quantile"),
     "bin of level": _Axis("level, dark to bright", "level bin {} (0: darkest)"),
-    "flat": _Axis("level of flats (0: shortest exposure)", "flats of level {}"),
+    "flat": _Axis("flat levels (0: shortest, dimmest)", "flats of level {}"),
     "period, rows": _Axis("period, rows", "every {} rows"),
     "period, columns": _Axis("period, columns", "every {} columns"),
     "frames before": _Axis("other frame", "frame {}"),

@@ -95,8 +95,9 @@ def with_error(value: float | None, error: float | None) -> str:
         return exact(value)
     exponent = math.floor(math.log10(error))
     if -6 <= exponent < 4:
-        decimals = max(0, 1 - exponent)
-        return f"{value:.{decimals}f} ± {error:.{decimals}f}".replace("-", "−")
+        decimals = 1 - exponent
+        rounded = (f"{round(v, decimals):,.{max(0, decimals)}f}" for v in (value, error))
+        return _grouped(" ± ".join(rounded))
     power = math.floor(math.log10(max(abs(value), error)))
     decimals = max(0, power - exponent + 1)
     scale = 10.0**power
