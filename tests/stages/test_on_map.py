@@ -78,6 +78,12 @@ def test_the_size_of_an_effect_is_told_in_its_units():
     own = glow | {"units": {"rate": "e-/s", "reach_px": "px"}, "strengths": ["rate"]}
     assert size_of(own) == "rate 118.0 ± 2.0 e⁻/s"
     assert size_of({"parameters": {"share": 0.0}, **size("share")}) == "-"
+    units = {"coarse_adu": "ADU", "dnl_rms": "codes"}
+    both = {"units": units, "strengths": list(units), "uncertainty": {"dnl_rms": 0.0047}}
+    steps = both | {"parameters": {"coarse_adu": 3.0, "dnl_rms": 0.006}}
+    assert size_of(steps) == "coarse 3.00 ADU"
+    alone = both | {"parameters": {"coarse_adu": 0.0, "dnl_rms": 0.006}}
+    assert size_of(alone) == "dnl rms 0.0060 ± 0.0047 codes"
     moved = {"parameters": {"tracks": [{"value": [59, 61]}, {"value": [-1, 1]}]}}
     drift = moved | {"strengths": ["tracks"], "units": {"tracks": "e-"}}
     assert size_of(drift) == "1.00 e⁻ rms, frame by frame, about a mean of 60.0 e⁻"

@@ -43,7 +43,8 @@ class Quantisation(Effect):
     left_because = "rounding adds noise of a few hundredths of the Cramér-Rao bound"
     frames_needed = ("ladder",)
     remedy = (
-        "fix on the bench: raise the analogue gain until the noise exceeds a step between codes"
+        "none where the noise exceeds a step between codes: it averages uneven codes; else raise "
+        "the analogue gain"
     )
     sources = (
         "IEEE Std 1241-2010: code widths from histograms; round-off of step/sqrt(12) rms",

@@ -21,8 +21,7 @@ Json = Mapping[str, Any]
 NOTHING: Json = {"outputs": (), "sets": {}, "effects": (), "causes": (), "verdict": None}
 NEGLIGIBLE = 1e-3  # change of the offsets over their errors below which it is not given
 WITH_GAP = ("unexplained", "partly explained")  # verdicts that leave part of the gap open
-# share of SIGMA from which an error that SIGMA does not hold limits a map
-MIN_BIAS_OVER_SIGMA = 0.3
+MIN_BIAS_OVER_SIGMA = 0.3  # share of SIGMA from which an error outside it limits a map
 
 
 @dataclass(frozen=True)
@@ -237,12 +236,19 @@ _LEVEL = 1.0
 
 
 def size_of(cause: Json) -> str:
-    """The strengths of an effect with errors and units, or its size where these do not say it."""
+    """The significant strengths with errors and units, or the size where these do not say it."""
     if size := cause.get("size"):
         measured = _measured(size["value"], size["error"], size["unit"])
         return f"{measured} {size['of'].replace('e-', 'e⁻')}"
-    sizes = (_strength(cause, name, cause["units"][name]) for name in cause["strengths"])
-    return "; ".join(filter(None, sizes)) or "-"
+    sizes = {n: s for n in cause["strengths"] if (s := _strength(cause, n, cause["units"][n]))}
+    significant = [text for name, text in sizes.items() if not _within_errors(cause, name)]
+    return "; ".join(significant or sizes.values()) or "-"
+
+
+def _within_errors(cause: Json, name: str) -> bool:
+    """Whether a strength is less than two of its errors."""
+    value, error = cause["parameters"].get(name), cause.get("uncertainty", {}).get(name)
+    return isinstance(value, int | float) and error is not None and abs(value) < 2 * error
 
 
 def _strength(cause: Json, name: str, unit: str) -> str:

@@ -164,7 +164,7 @@ class Description:
                 _closed(v) for v in reversed(gap_interval(self.data, alone, by_itself))
             ],
             "gap_closed_by_law": _closed(by_law.gap.total),
-            "gain_over_rest": rounded(without.gap.total - self.final.gap.total),
+            "gain_over_rest": rounded(max(without.gap.total - self.final.gap.total, 0.0)),
             "p_value": float(np.clip(chance, MIN_P_VALUE, 1.0)),
             "sigmas": rounded(estimate.significance),
             "why": estimate.why,
