@@ -73,16 +73,16 @@ class Run:
 
     reduction = JsonFile(
         "reduce",
-        "JsonFile of ``reduce.json``: gain, read noise, linearity, counts of flags, warnings.",
+        "Contents of ``reduce.json``: gain, read noise, linearity, counts of flags, warnings.",
     )
-    fit = JsonFile("fit", "JsonFile of ``fit.json``.")
-    allan = JsonFile("allan", "JsonFile of ``allan.json``.")
+    fit = JsonFile("fit", "Contents of ``fit.json``.")
+    allan = JsonFile("allan", "Contents of ``allan.json``.")
     diagnosis = JsonFile(
-        "diagnose", "JsonFile of ``diagnosis.json``: verdict, causes, residual gap.", "diagnosis"
+        "diagnose", "Contents of ``diagnosis.json``: verdict, causes, residual gap.", "diagnosis"
     )
     correction = JsonFile(
         "corrected",
-        "JsonFile of ``correction.json``: how each identified effect was treated.",
+        "Contents of ``correction.json``: how each identified effect was treated.",
         "correction",
     )
 

@@ -276,10 +276,8 @@ def _is_light(evidence: Evidence, offsets: Sequence[TimedValues]) -> bool:
         if series is None:
             continue
         inferred = np.interp(fringes.time_s, time, offset)
-        inferred, found = (
-            inferred - inferred.mean(),
-            series.values[:, 0] - series.values[:, 0].mean(),
-        )
+        inferred -= inferred.mean()
+        found = series.values[:, 0] - series.values[:, 0].mean()
         variance = max(float(series.noise[0]), float(np.var(found - inferred)))
         along += float(inferred @ found) / variance
         square += float(inferred @ inferred) / variance

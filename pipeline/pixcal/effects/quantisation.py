@@ -43,8 +43,8 @@ class Quantisation(Effect):
     left_because = "rounding adds noise of a few hundredths of the Cramér-Rao bound"
     frames_needed = ("ladder",)
     remedy = (
-        "none where the noise exceeds a step between codes: it averages uneven codes; else raise "
-        "the analogue gain"
+        "no action if the noise exceeds one code step, as it averages uneven codes; otherwise "
+        "raise the analogue gain"
     )
     sources = (
         "IEEE Std 1241-2010: code widths from histograms; round-off of step/sqrt(12) rms",
