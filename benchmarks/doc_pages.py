@@ -28,6 +28,7 @@ from documentation.layers import picture
 from documentation.stub import STUB, stub
 from pixcal.effects import effects
 from pixcal.model import acquisition, bench
+from pixcal.model.config import meanings
 from pixcal.report.detector_figures import nonuniformity, photon_transfer
 from pixcal.report.drawing import png
 from pixcal.simulation.forward import Stage
@@ -89,9 +90,10 @@ def key_table(name: str) -> str:
     kind = effects().get(name) or vars(bench).get(name) or vars(acquisition)[name]
     what = "parameter" if name in effects() else "key"
     lines = [f"| {what} | unit | default | meaning |", "|---|---|---|---|"]
+    words = meanings(kind)
     for key in dataclasses.fields(kind):
         # Sections have tables of their own.
-        if doc := key.metadata.get("doc"):
+        if doc := words[key.name]:
             unit = key.metadata.get("unit") or "–"
             if name in effects():
                 doc += _parts(typing.get_type_hints(kind)[key.name])

@@ -174,7 +174,6 @@ LONG_MODULES = {
     "pixcal.estimators.fringe_fit.scout": "one class: the steps to the frames of a set",
     "pixcal.estimators.detector.code_density": "widths of codes and the weights that explain them",
     "pixcal.effects.lag": "several kinds of traps, each with its parameters",
-    "pixcal.effects.quantisation": "several kinds of converters, each with its parameters",
 }
 """Modules of more than `MOST_MODULE_LINES`, and why."""
 

@@ -16,7 +16,7 @@ from doc_pages import effect_table
 from pixcal.effects import effects, known_effects, parse_effects
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
-from pixcal.model.config import parse, to_plain
+from pixcal.model.config import meanings, parse, to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps, Stage
 from pixcal.simulation.exposure import Camera, states_of
@@ -79,8 +79,9 @@ def test_it_says_what_it_is(cls: type[Effect]) -> None:
     names = {f.name for f in dataclasses.fields(cls)}
     assert set(cls.strengths) <= names
     assert cls.strengths
+    words = meanings(cls)
     for field in dataclasses.fields(cls):
-        assert field.metadata.get("doc") or dataclasses.is_dataclass(field.type), field.name
+        assert words[field.name] or dataclasses.is_dataclass(field.type), field.name
 
 
 def test_which_of_one_stage_acts_first_is_said_and_not_left_to_names() -> None:

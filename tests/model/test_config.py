@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pixcal.model.config import parse, quantity, to_plain
+from pixcal.model.config import meanings, parse, quantity, to_plain
 from pixcal.model.errors import InputError
 from pixcal.model.yaml_file import MAX_CONFIG_BYTES, read_yaml, to_yaml
 
@@ -20,6 +20,8 @@ from pixcal.model.yaml_file import MAX_CONFIG_BYTES, read_yaml, to_yaml
 class Part:
     name: str = quantity(doc="free text")
     weight_kg: float = quantity(1.5, unit="kg", above=0, high=1e6)
+    """with its
+    packaging"""
 
 
 @dataclass(frozen=True)
@@ -265,3 +267,13 @@ def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="cannot be read") as caught:
             read_yaml(file)
         assert str(caught.value).startswith(f"{file}: ")
+
+
+def test_what_a_field_means_stands_in_doc_or_below_it_and_is_inherited() -> None:
+    @dataclass(frozen=True)
+    class Heavy(Part):
+        colour: str = quantity("red")
+        number: int = quantity(0, doc="of the batch")
+
+    words = {"name": "free text", "weight_kg": "with its packaging", "number": "of the batch"}
+    assert meanings(Heavy) == {**words, "colour": ""}

@@ -25,21 +25,16 @@ class LevelChange(Effect):
     frames_needed = ()
     quick = False
 
-    rms: float = quantity(0.02, low=0, high=0.5, doc="relative rms")
-    correlation_s: float = quantity(
-        0.0, unit="s", low=0, high=1e6, doc="correlation time; 0: white"
-    )
-    line: float = quantity(0.0, low=0, high=0.5, doc="relative amplitude of a periodic variation")
-    line_hz: float = quantity(
-        100.0,
-        unit="Hz",
-        low=0,
-        high=1e4,
-        doc="frequency of the periodic variation, which averages out in exposures of whole periods",
-    )
-    tracks: tuple[Track, ...] = quantity(
-        (), doc="measured relative change of each frame, by fringe set"
-    )
+    rms: float = quantity(0.02, low=0, high=0.5)
+    """relative rms"""
+    correlation_s: float = quantity(0.0, unit="s", low=0, high=1e6)
+    """correlation time; 0: white"""
+    line: float = quantity(0.0, low=0, high=0.5)
+    """relative amplitude of a periodic variation"""
+    line_hz: float = quantity(100.0, unit="Hz", low=0, high=1e4)
+    """frequency of the periodic variation, which averages out in exposures of whole periods"""
+    tracks: tuple[Track, ...] = quantity(())
+    """measured relative change of each frame, by fringe set"""
 
     def changes(self, recording: Recording) -> F64:
         """Relative change (t,) of the signal."""

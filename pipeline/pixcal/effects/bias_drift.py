@@ -73,30 +73,22 @@ class BiasDrift(Effect):
         "Nordic Optical Telescope, CCD7 pre-commissioning report: 1 ADU in two hours",
     )
 
-    jitter_rms: float = quantity(
-        2.0, unit="e-", low=0, high=1e5, doc="white noise from frame to frame, rms"
-    )
-    ramp_e_h: float = quantity(1.5, unit="e-/h", low=-1e6, high=1e6, doc="linear drift")
-    walk_e_h: float = quantity(
-        1.0, unit="e-/h^0.5", low=0, high=1e6, doc="random walk, rms after an hour"
-    )
-    settle_e: float = quantity(
-        5.0,
-        unit="e-",
-        low=-1e5,
-        high=1e5,
-        doc="amplitude of an exponential decay from the first frame on",
-    )
-    settle_s: float = quantity(600.0, unit="s", above=0, high=1e7, doc="time constant of the decay")
-    run_walk_e_h: float = quantity(
-        0.0, unit="e-/h^0.5", low=0, high=1e6, doc="random walk that restarts with each fringe set"
-    )
-    run_ramp_e_h: float = quantity(
-        0.0, unit="e-/h", low=-1e6, high=1e6, doc="linear drift that restarts with each fringe set"
-    )
-    tracks: tuple[Track, ...] = quantity(
-        (), unit="e-", doc="measured bias of each frame, by fringe set, or of bias or dark frames"
-    )
+    jitter_rms: float = quantity(2.0, unit="e-", low=0, high=1e5)
+    """white noise from frame to frame, rms"""
+    ramp_e_h: float = quantity(1.5, unit="e-/h", low=-1e6, high=1e6)
+    """linear drift"""
+    walk_e_h: float = quantity(1.0, unit="e-/h^0.5", low=0, high=1e6)
+    """random walk, rms after an hour"""
+    settle_e: float = quantity(5.0, unit="e-", low=-1e5, high=1e5)
+    """amplitude of an exponential decay from the first frame on"""
+    settle_s: float = quantity(600.0, unit="s", above=0, high=1e7)
+    """time constant of the decay"""
+    run_walk_e_h: float = quantity(0.0, unit="e-/h^0.5", low=0, high=1e6)
+    """random walk that restarts with each fringe set"""
+    run_ramp_e_h: float = quantity(0.0, unit="e-/h", low=-1e6, high=1e6)
+    """linear drift that restarts with each fringe set"""
+    tracks: tuple[Track, ...] = quantity((), unit="e-")
+    """measured bias of each frame, by fringe set, or of bias or dark frames"""
 
     def trend(self, time_s: F64) -> F64:
         """Deterministic offset (t,), e-, at times of an acquisition."""

@@ -51,19 +51,12 @@ class BrighterFatter(Effect):
         "Plazas et al. 2018, PASP 130, 065004: the same in a CMOS-read H2RG",
     )
 
-    shift_px_per_e: float = quantity(
-        2.0e-7,
-        unit="px/e-",
-        low=0,
-        high=_MAX_SHIFT,
-        doc="shift of a pixel's boundaries by each electron in it",
-    )
-    falloff_px: float = quantity(
-        0.5, unit="px", above=0, high=10, doc="distance over which the shift falls by a factor e"
-    )
-    along_y: float = quantity(
-        1.0, low=0, high=_MAX_ALONG_Y, doc="ratio of the shift along y to that along x"
-    )
+    shift_px_per_e: float = quantity(2.0e-7, unit="px/e-", low=0, high=_MAX_SHIFT)
+    """shift of a pixel's boundaries by each electron in it"""
+    falloff_px: float = quantity(0.5, unit="px", above=0, high=10)
+    """distance over which the shift falls by a factor e"""
+    along_y: float = quantity(1.0, low=0, high=_MAX_ALONG_Y)
+    """ratio of the shift along y to that along x"""
 
     @property
     def halo(self) -> int:

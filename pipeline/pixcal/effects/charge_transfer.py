@@ -35,34 +35,22 @@ class ChargeTransfer(Effect):
         "Short et al. 2013, MNRAS 430, 3078: charge-transfer inefficiency of CCDs, 1e-6 to 1e-4",
     )
 
-    rows: float = quantity(
-        3e-5,
-        low=0,
-        high=0.01,
-        doc="share of the charge level_e that each transfer from row to row leaves behind",
-    )
-    columns: float = quantity(0.0, low=0, high=0.01, doc="the same from column to column")
-    row_release_px: float = quantity(
-        2.0,
-        unit="px",
-        low=0.1,
-        high=100,
-        doc="length over which the trail along a column falls by a factor e",
-    )
-    column_release_px: float = quantity(
-        2.0, unit="px", low=0.1, high=100, doc="the same along a row"
-    )
-    output_row: int = quantity(0, unit="px", doc="row next to the output, on the chip")
-    output_column: int = quantity(0, unit="px", doc="column next to the output, on the chip")
-    power: float = quantity(
-        0.6,
-        low=0,
-        high=1.5,
-        doc="exponent: the charge left behind is proportional to this power of the charge",
-    )
-    level_e: float = quantity(
-        10_000.0, unit="e-", above=0, high=1e7, doc="charge to which `rows` and `columns` apply"
-    )
+    rows: float = quantity(3e-5, low=0, high=0.01)
+    """share of the charge level_e that each transfer from row to row leaves behind"""
+    columns: float = quantity(0.0, low=0, high=0.01)
+    """the same from column to column"""
+    row_release_px: float = quantity(2.0, unit="px", low=0.1, high=100)
+    """length over which the trail along a column falls by a factor e"""
+    column_release_px: float = quantity(2.0, unit="px", low=0.1, high=100)
+    """the same along a row"""
+    output_row: int = quantity(0, unit="px")
+    """row next to the output, on the chip"""
+    output_column: int = quantity(0, unit="px")
+    """column next to the output, on the chip"""
+    power: float = quantity(0.6, low=0, high=1.5)
+    """exponent: the charge left behind is proportional to this power of the charge"""
+    level_e: float = quantity(10_000.0, unit="e-", above=0, high=1e7)
+    """charge to which `rows` and `columns` apply"""
 
     @property
     def halo(self) -> int:

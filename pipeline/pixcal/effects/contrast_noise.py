@@ -36,18 +36,14 @@ class ContrastNoise(Effect):
         "keep it follows temperature and handling, down to complete fading",
     )
 
-    vibration_rad: float = quantity(
-        0.2, unit="rad", low=0, high=2, doc="rms phase of a vibration within an exposure"
-    )
-    polarisation: float = quantity(
-        0.005, low=0, high=0.5, doc="relative rms of a slow variation, such as of the polarisation"
-    )
-    polarisation_s: float = quantity(
-        600.0, unit="s", low=0, high=1e6, doc="correlation time of the slow variation; 0: white"
-    )
-    tracks: tuple[Track, ...] = quantity(
-        (), doc="measured relative change of each frame, by fringe set"
-    )
+    vibration_rad: float = quantity(0.2, unit="rad", low=0, high=2)
+    """rms phase of a vibration within an exposure"""
+    polarisation: float = quantity(0.005, low=0, high=0.5)
+    """relative rms of a slow variation, such as of the polarisation"""
+    polarisation_s: float = quantity(600.0, unit="s", low=0, high=1e6)
+    """correlation time of the slow variation; 0: white"""
+    tracks: tuple[Track, ...] = quantity(())
+    """measured relative change of each frame, by fringe set"""
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         energy = recording.rng(self.name).standard_exponential(recording.count)

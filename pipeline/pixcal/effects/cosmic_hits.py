@@ -66,32 +66,18 @@ class CosmicHits(Effect):
         "Moyal 1955, Phil. Mag. 46, 263: closed form of the distribution of the energy loss",
     )
 
-    rate_cm2_s: float = quantity(
-        0.03, unit="/(cm² s)", low=0, high=1e7, doc="flux of particles through the detector"
-    )
-    readout_cm2: float = quantity(
-        0.0,
-        unit="/cm²",
-        low=0,
-        high=1e7,
-        doc="hits in each frame during the readout, in addition to those of the exposure",
-    )
-    electrons_per_um: float = quantity(
-        70.0, unit="e-/um", above=0, high=1e4, doc="most probable charge per length of track"
-    )
-    thickness_um: float = quantity(
-        8.0, unit="um", above=0, high=1e3, doc="thickness of the sensitive layer"
-    )
-    diffusion_um: float = quantity(
-        1.5, unit="um", above=0, high=100, doc="rms width of the charge cloud at collection"
-    )
-    spread: float = quantity(
-        0.0,
-        low=0,
-        high=3,
-        doc="standard deviation of the logarithm of the charge per length, "
-        "from particle to particle",
-    )
+    rate_cm2_s: float = quantity(0.03, unit="/(cm² s)", low=0, high=1e7)
+    """flux of particles through the detector"""
+    readout_cm2: float = quantity(0.0, unit="/cm²", low=0, high=1e7)
+    """hits in each frame during the readout, in addition to those of the exposure"""
+    electrons_per_um: float = quantity(70.0, unit="e-/um", above=0, high=1e4)
+    """most probable charge per length of track"""
+    thickness_um: float = quantity(8.0, unit="um", above=0, high=1e3)
+    """thickness of the sensitive layer"""
+    diffusion_um: float = quantity(1.5, unit="um", above=0, high=100)
+    """rms width of the charge cloud at collection"""
+    spread: float = quantity(0.0, low=0, high=3)
+    """standard deviation of the logarithm of the charge per length, from particle to particle"""
 
     def charge(self, charge: F32, shot: Shot) -> F32:
         detector = shot.bench.detector

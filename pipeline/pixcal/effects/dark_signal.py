@@ -39,13 +39,8 @@ class DarkSignal(Effect):
         "pixels by 10 % and more of its mean",
     )
 
-    scatter: float = quantity(
-        20.0,
-        unit="e-/s",
-        low=0,
-        high=1e7,
-        doc="rms of the dark current from pixel to pixel, half its mean",
-    )
+    scatter: float = quantity(20.0, unit="e-/s", low=0, high=1e7)
+    """rms of the dark current from pixel to pixel, half its mean"""
 
     def detector(self, maps: DetectorMaps, bench: Bench, rows: Rows) -> DetectorMaps:
         # Never negative: its mean is twice its scatter.

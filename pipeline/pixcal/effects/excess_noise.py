@@ -35,9 +35,8 @@ class ExcessNoise(Effect):
         "multiplication G in many stages",
     )
 
-    excess: float = quantity(
-        1.0, low=0, high=10, doc="F² - 1: variance added to a signal, over its shot noise"
-    )
+    excess: float = quantity(1.0, low=0, high=10)
+    """F² - 1: variance added to a signal, over its shot noise"""
 
     def signal(self, signal: F32, shot: Shot) -> F32:
         if not (self.excess and shot.bench.shot_noise):

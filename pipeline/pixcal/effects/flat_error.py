@@ -66,21 +66,20 @@ class FlatError(Effect):
         "a per cent is common",
     )
 
-    pixel_rms: float = quantity(0.002, low=0, high=0.5, doc="relative rms from pixel to pixel")
-    smooth_rms: float = quantity(0.005, low=0, high=0.5, doc="relative rms of the smooth part")
-    scale_px: float = quantity(
-        8.0, unit="px", above=1, high=1e5, doc="length scale of the smooth part: wavelength / 2 pi"
-    )
-    wave_x_rad_px: tuple[float, ...] = quantity(
-        (), unit="rad/px", low=-7, high=7, doc="wave vectors of a measured pattern, along x"
-    )
-    wave_y_rad_px: tuple[float, ...] = quantity(
-        (), unit="rad/px", low=-7, high=7, doc="wave vectors of a measured pattern, along y"
-    )
-    wave_cos: tuple[float, ...] = quantity(
-        (), low=-0.5, high=0.5, doc="cosine amplitudes of these waves, from the chip's first pixel"
-    )
-    wave_sin: tuple[float, ...] = quantity((), low=-0.5, high=0.5, doc="sine amplitudes")
+    pixel_rms: float = quantity(0.002, low=0, high=0.5)
+    """relative rms from pixel to pixel"""
+    smooth_rms: float = quantity(0.005, low=0, high=0.5)
+    """relative rms of the smooth part"""
+    scale_px: float = quantity(8.0, unit="px", above=1, high=1e5)
+    """length scale of the smooth part: wavelength / 2 pi"""
+    wave_x_rad_px: tuple[float, ...] = quantity((), unit="rad/px", low=-7, high=7)
+    """wave vectors of a measured pattern, along x"""
+    wave_y_rad_px: tuple[float, ...] = quantity((), unit="rad/px", low=-7, high=7)
+    """wave vectors of a measured pattern, along y"""
+    wave_cos: tuple[float, ...] = quantity((), low=-0.5, high=0.5)
+    """cosine amplitudes of these waves, from the chip's first pixel"""
+    wave_sin: tuple[float, ...] = quantity((), low=-0.5, high=0.5)
+    """sine amplitudes"""
 
     def __post_init__(self) -> None:
         if len({len(getattr(self, name)) for name in _WAVES}) > 1:

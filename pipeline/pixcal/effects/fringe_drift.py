@@ -37,26 +37,18 @@ class FringeDrift(Effect):
         "rad/px",
     )
 
-    ramp: tuple[float, float] = quantity(
-        (2.5e-5, 2.5e-5), unit="rad/px/h", low=-10, high=10, doc="linear drift along x and y"
-    )
-    settle: tuple[float, float] = quantity(
-        (2.5e-5, 2.5e-5),
-        unit="rad/px",
-        low=-1,
-        high=1,
-        doc="amplitude of an exponential decay from the first frame on",
-    )
-    settle_s: float = quantity(600.0, unit="s", above=0, high=1e6, doc="time constant of the decay")
-    walk: tuple[float, float] = quantity(
-        (1e-5, 1e-5),
-        unit="rad/px/h^0.5",
-        low=0,
-        high=10,
-        doc="random walk along x and y, rms after an hour",
-    )
-    along_x: tuple[Track, ...] = quantity((), unit="rad/px", doc="measured slow change of kx")
-    along_y: tuple[Track, ...] = quantity((), unit="rad/px", doc="measured slow change of ky")
+    ramp: tuple[float, float] = quantity((2.5e-5, 2.5e-5), unit="rad/px/h", low=-10, high=10)
+    """linear drift along x and y"""
+    settle: tuple[float, float] = quantity((2.5e-5, 2.5e-5), unit="rad/px", low=-1, high=1)
+    """amplitude of an exponential decay from the first frame on"""
+    settle_s: float = quantity(600.0, unit="s", above=0, high=1e6)
+    """time constant of the decay"""
+    walk: tuple[float, float] = quantity((1e-5, 1e-5), unit="rad/px/h^0.5", low=0, high=10)
+    """random walk along x and y, rms after an hour"""
+    along_x: tuple[Track, ...] = quantity((), unit="rad/px")
+    """measured slow change of kx"""
+    along_y: tuple[Track, ...] = quantity((), unit="rad/px")
+    """measured slow change of ky"""
 
     def vector_change(self, time_s: F64) -> F64:
         """Deterministic change (t, 2) of the fringe vector since the first frame, rad/px."""

@@ -33,21 +33,16 @@ class FringeJitter(Effect):
         "VC-C to VC-A), which at 30 Hz is 0.07 to 0.27 um",
     )
 
-    rms: tuple[float, float] = quantity(
-        (2.5e-5, 2.5e-5), unit="rad/px", low=0, high=0.1, doc="white noise along x and y, rms"
-    )
-    vibration: tuple[float, float] = quantity(
-        (0.0, 0.0), unit="rad/px", low=0, high=0.1, doc="amplitude of the vibration along x and y"
-    )
-    vibration_hz: float = quantity(
-        20.3,
-        unit="Hz",
-        low=0,
-        high=1e4,
-        doc="frequency of the vibration; aliased below half the frame rate",
-    )
-    along_x: tuple[Track, ...] = quantity((), unit="rad/px", doc="measured fast change of kx")
-    along_y: tuple[Track, ...] = quantity((), unit="rad/px", doc="measured fast change of ky")
+    rms: tuple[float, float] = quantity((2.5e-5, 2.5e-5), unit="rad/px", low=0, high=0.1)
+    """white noise along x and y, rms"""
+    vibration: tuple[float, float] = quantity((0.0, 0.0), unit="rad/px", low=0, high=0.1)
+    """amplitude of the vibration along x and y"""
+    vibration_hz: float = quantity(20.3, unit="Hz", low=0, high=1e4)
+    """frequency of the vibration; aliased below half the frame rate"""
+    along_x: tuple[Track, ...] = quantity((), unit="rad/px")
+    """measured fast change of kx"""
+    along_y: tuple[Track, ...] = quantity((), unit="rad/px")
+    """measured fast change of ky"""
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         drawn = recording.rng(self.name).standard_normal((recording.count, 2))

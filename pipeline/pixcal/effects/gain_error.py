@@ -48,13 +48,9 @@ class GainError(Effect):
         "of the camera's operating point and temperature",
     )
 
-    relative: float = quantity(
-        0.03,
-        low=-0.9999,
-        high=9999.0,
-        doc="true gain over the gain used, minus 1; the variance of "
-        "shot noise in ADU is smaller by as much",
-    )
+    relative: float = quantity(0.03, low=-0.9999, high=9999.0)
+    """true gain over the gain used, minus 1; the variance of shot noise in ADU is smaller by as
+    much"""
 
     def detector(self, maps: DetectorMaps, bench: Bench, rows: Rows) -> DetectorMaps:
         return replace(maps, dark_rate=maps.dark_rate * np.float32(1 + self.relative))

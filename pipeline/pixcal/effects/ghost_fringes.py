@@ -52,19 +52,16 @@ class GhostWave(Scalable):
 
     strengths = ("static", "forward", "backward")
 
-    beat_rad_px: tuple[float, float] = quantity(
-        unit="rad/px", low=-np.pi, high=np.pi, doc="beat vector along x and y"
-    )
-    set: str = quantity("", doc="name of the fringe set; default: all")
-    static: tuple[float, float] = quantity(
-        (0.0, 0.0), low=-0.9, high=0.9, doc="cosine and sine of the pattern of the mean light"
-    )
-    forward: tuple[float, float] = quantity(
-        (0.0, 0.0), low=-0.9, high=0.9, doc="the same for fringes at fringe vector plus beat"
-    )
-    backward: tuple[float, float] = quantity(
-        (0.0, 0.0), low=-0.9, high=0.9, doc="the same for fringes at fringe vector minus beat"
-    )
+    beat_rad_px: tuple[float, float] = quantity(unit="rad/px", low=-np.pi, high=np.pi)
+    """beat vector along x and y"""
+    set: str = quantity("")
+    """name of the fringe set; default: all"""
+    static: tuple[float, float] = quantity((0.0, 0.0), low=-0.9, high=0.9)
+    """cosine and sine of the pattern of the mean light"""
+    forward: tuple[float, float] = quantity((0.0, 0.0), low=-0.9, high=0.9)
+    """the same for fringes at fringe vector plus beat"""
+    backward: tuple[float, float] = quantity((0.0, 0.0), low=-0.9, high=0.9)
+    """the same for fringes at fringe vector minus beat"""
 
     @property
     def of_beams(self) -> tuple[complex, ...]:
@@ -91,22 +88,18 @@ class GhostFringes(Effect):
         "wedge of angle w makes fringes of lambda / (2 n w)",
     )
 
-    share: float = quantity(
-        0.005, low=0, high=0.9, doc="amplitude of the ghost over that of its parent beam"
-    )
-    beat_rad_px: tuple[float, float] = quantity(
-        (0.35, 0.2), unit="rad/px", low=-np.pi, high=np.pi, doc="beat vector along x and y"
-    )
-    phase_rad: float = quantity(
-        0.0,
-        unit="rad",
-        low=-1e3,
-        high=1e3,
-        doc="phase of the beat in the first pixel of the window",
-    )
-    parent: str = quantity("modulated", choices=tuple(PARENTS), doc="reflected fibre")
-    in_flats: bool = quantity(False, doc="whether the flats contain the static pattern too")
-    waves: tuple[GhostWave, ...] = quantity((), doc="measured ghosts, in addition to the one above")
+    share: float = quantity(0.005, low=0, high=0.9)
+    """amplitude of the ghost over that of its parent beam"""
+    beat_rad_px: tuple[float, float] = quantity((0.35, 0.2), unit="rad/px", low=-np.pi, high=np.pi)
+    """beat vector along x and y"""
+    phase_rad: float = quantity(0.0, unit="rad", low=-1e3, high=1e3)
+    """phase of the beat in the first pixel of the window"""
+    parent: str = quantity("modulated", choices=tuple(PARENTS))
+    """reflected fibre"""
+    in_flats: bool = quantity(False)
+    """whether the flats contain the static pattern too"""
+    waves: tuple[GhostWave, ...] = quantity(())
+    """measured ghosts, in addition to the one above"""
 
     def _ghosts(self, of: str) -> list[tuple[Beat, complex, Parent]]:
         """Beat, amplitude relative to the parent beam, and parent of all ghosts in a set."""

@@ -20,13 +20,12 @@ from pixcal.simulation.recording import Recording
 class FibrePair:
     """Position of the fibre pair of one fringe set."""
 
-    set: str = quantity(doc="name of the fringe set")
-    foot_mm: tuple[float, float] = quantity(
-        unit="mm", low=-1e4, high=1e4, doc="position of the fibre pair relative to the chip centre"
-    )
-    height_mm: float = quantity(
-        0.0, unit="mm", low=-100, high=100, doc="fibre B further from the detector than A"
-    )
+    set: str = quantity()
+    """name of the fringe set"""
+    foot_mm: tuple[float, float] = quantity(unit="mm", low=-1e4, high=1e4)
+    """position of the fibre pair relative to the chip centre"""
+    height_mm: float = quantity(0.0, unit="mm", low=-100, high=100)
+    """fibre B further from the detector than A"""
 
 
 @dataclass(frozen=True)
@@ -48,24 +47,14 @@ class HyperbolicFringes(Effect):
         "Born & Wolf, Principles of Optics, section 7.3: fringes of two point sources",
     )
 
-    foot_mm: tuple[float, float] | None = quantity(
-        (18.0, 18.0),
-        unit="mm",
-        low=-1e4,
-        high=1e4,
-        doc="position of the fibre pair relative to the chip centre; null: that of the bench",
-    )
-    distance_mm: float | None = quantity(
-        None,
-        unit="mm",
-        above=0,
-        high=1e7,
-        doc="distance from the fibres to the detector; default: that of the bench",
-    )
-    share: float = quantity(
-        1.0, low=-100, high=100, doc="share of the exact curvature: 1 exact, 0 straight"
-    )
-    pairs: tuple[FibrePair, ...] = quantity((), doc="position of the fibre pair of each set")
+    foot_mm: tuple[float, float] | None = quantity((18.0, 18.0), unit="mm", low=-1e4, high=1e4)
+    """position of the fibre pair relative to the chip centre; null: that of the bench"""
+    distance_mm: float | None = quantity(None, unit="mm", above=0, high=1e7)
+    """distance from the fibres to the detector; default: that of the bench"""
+    share: float = quantity(1.0, low=-100, high=100)
+    """share of the exact curvature: 1 exact, 0 straight"""
+    pairs: tuple[FibrePair, ...] = quantity(())
+    """position of the fibre pair of each set"""
 
     def light(self, light: Light, recording: Recording, rows: Rows, maps: DetectorMaps) -> Light:
         if recording.kind != "fringes":

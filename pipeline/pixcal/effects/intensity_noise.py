@@ -39,18 +39,12 @@ class IntensityNoise(LevelChange):
         "change the power at below 1 Hz to some kHz, the mains at 50 and 100 Hz",
     )
 
-    ambient: tuple[float, ...] = quantity(
-        (), low=0, high=0.9, doc="share of the light of each set that does not follow the laser"
-    )
-    separate: float = quantity(
-        0.0,
-        low=0,
-        high=0.1,
-        doc="relative rms of the contrast, white, if the powers of the two fibres vary separately",
-    )
-    contrast_tracks: tuple[Track, ...] = quantity(
-        (), doc="measured relative change of the contrast, if the fibres vary separately"
-    )
+    ambient: tuple[float, ...] = quantity((), low=0, high=0.9)
+    """share of the light of each set that does not follow the laser"""
+    separate: float = quantity(0.0, low=0, high=0.1)
+    """relative rms of the contrast, white, if the powers of the two fibres vary separately"""
+    contrast_tracks: tuple[Track, ...] = quantity(())
+    """measured relative change of the contrast, if the fibres vary separately"""
 
     def scaled(self, factor: float) -> Self:
         along = tuple(track.scaled(factor) for track in self.contrast_tracks)

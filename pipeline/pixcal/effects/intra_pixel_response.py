@@ -52,15 +52,12 @@ class IntraPixelResponse(Effect):
         "nearly a box, blurred by diffusion",
     )
 
-    width_px: tuple[float, float] = quantity(
-        (0.95, 0.95), unit="px", low=0, high=3, doc="mean width of the response along x and y"
-    )
-    width_rms_px: float = quantity(
-        0.005, unit="px", low=0, high=0.5, doc="rms of the width from pixel to pixel, each axis"
-    )
-    alike: float = quantity(
-        0.0, low=0, high=1, doc="share of that variance which is common to both axes of a pixel"
-    )
+    width_px: tuple[float, float] = quantity((0.95, 0.95), unit="px", low=0, high=3)
+    """mean width of the response along x and y"""
+    width_rms_px: float = quantity(0.005, unit="px", low=0, high=0.5)
+    """rms of the width from pixel to pixel, each axis"""
+    alike: float = quantity(0.0, low=0, high=1)
+    """share of that variance which is common to both axes of a pixel"""
 
     def pixels(
         self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps

@@ -69,11 +69,9 @@ class Ipc(Effect):
         "Le Graët et al., Proc. SPIE 12191 (2022): the kernel changes over the array",
     )
 
-    couplings: tuple[Coupling, ...] = quantity(
-        FOUR_ROWS,
-        doc="list of couplings: dy, dx (px, from source to receiver), share, per_ke (change of "
-        "the share with the signal, 1/ke-); every_rows, row, every_columns, column (sources)",
-    )
+    couplings: tuple[Coupling, ...] = quantity(FOUR_ROWS)
+    """list of couplings: dy, dx (px, from source to receiver), share, per_ke (change of the share
+    with the signal, 1/ke-); every_rows, row, every_columns, column (sources)"""
 
     def __post_init__(self) -> None:
         most = largest_outflow(self.couplings)

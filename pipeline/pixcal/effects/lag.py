@@ -74,73 +74,36 @@ class Lag(Effect):
         "photodiode; lag of a few per mille and below",
     )
 
-    share: float = quantity(
-        0.002, low=0, high=0.5, doc="share of the charge of a frame that appears in later frames"
-    )
-    decay_frames: float = quantity(
-        0.0,
-        unit="frames",
-        low=0,
-        high=LONGEST,
-        doc="frames in which the release falls by a factor e; 0: all in the next frame",
-    )
-    spread: float = quantity(
-        0.1, low=0, high=1, doc="relative rms of the share from pixel to pixel"
-    )
+    share: float = quantity(0.002, low=0, high=0.5)
+    """share of the charge of a frame that appears in later frames"""
+    decay_frames: float = quantity(0.0, unit="frames", low=0, high=LONGEST)
+    """frames in which the release falls by a factor e; 0: all in the next frame"""
+    spread: float = quantity(0.1, low=0, high=1)
+    """relative rms of the share from pixel to pixel"""
 
-    bands: tuple[float, ...] = quantity(
-        (),
-        low=0,
-        high=100,
-        doc="factors of the share at signals from 0, 1/8, 1/4 and 1/2 of "
-        "level_e on; empty: the same share at all signals",
-    )
-    level_e: float = quantity(
-        50_000.0, unit="e-", above=0, high=1e7, doc="signal that bands refers to"
-    )
-    later: tuple[float, ...] = quantity(
-        (),
-        low=0,
-        high=1,
-        doc="parts of the lagging charge that appear 1, 2, ... frames later; "
-        "empty: an exponential decay over decay_frames",
-    )
-    quiet: float = quantity(
-        0.0, low=0, high=1, doc="part of the released charge without shot noise of its own"
-    )
-    capacity_e: float = quantity(
-        0.0,
-        unit="e-",
-        low=0,
-        high=1e7,
-        doc="largest charge that a pixel holds back, released over decay_frames; 0: no limit",
-    )
+    bands: tuple[float, ...] = quantity((), low=0, high=100)
+    """factors of the share at signals from 0, 1/8, 1/4 and 1/2 of level_e on; empty: the same share
+    at all signals"""
+    level_e: float = quantity(50_000.0, unit="e-", above=0, high=1e7)
+    """signal that bands refers to"""
+    later: tuple[float, ...] = quantity((), low=0, high=1)
+    """parts of the lagging charge that appear 1, 2, ... frames later; empty: an exponential decay
+    over decay_frames"""
+    quiet: float = quantity(0.0, low=0, high=1)
+    """part of the released charge without shot noise of its own"""
+    capacity_e: float = quantity(0.0, unit="e-", low=0, high=1e7)
+    """largest charge that a pixel holds back, released over decay_frames; 0: no limit"""
 
-    carried: float = quantity(
-        0.0,
-        low=0,
-        high=1,
-        doc="part of the charge left by the last frame before a recording that "
-        "is still there when it begins; 0: the detector is cleared",
-    )
-    decay_s: float = quantity(
-        0.0,
-        unit="s",
-        low=0,
-        high=1e6,
-        doc="time in which the release falls by a factor e, in place of decay_frames and later; "
-        "0: the release follows the number of frames",
-    )
-    slow_part: float = quantity(
-        0.0, low=0, high=1, doc="part of the share that is released over slow_s, not decay_s"
-    )
-    slow_s: float = quantity(
-        0.0,
-        unit="s",
-        low=0,
-        high=1e6,
-        doc="time in which the release of slow_part falls by a factor e",
-    )
+    carried: float = quantity(0.0, low=0, high=1)
+    """part of the charge left by the last frame before a recording that is still there when it
+    begins; 0: the detector is cleared"""
+    decay_s: float = quantity(0.0, unit="s", low=0, high=1e6)
+    """time in which the release falls by a factor e, in place of decay_frames and later; 0: the
+    release follows the number of frames"""
+    slow_part: float = quantity(0.0, low=0, high=1)
+    """part of the share that is released over slow_s, not decay_s"""
+    slow_s: float = quantity(0.0, unit="s", low=0, high=1e6)
+    """time in which the release of slow_part falls by a factor e"""
 
     @property
     def releases(self) -> F64:

@@ -63,28 +63,14 @@ class Nonlinearity(Effect):
         "more of the sense node, whose capacitance grows with the charge (V/e-)",
     )
 
-    quadratic: float = quantity(
-        -0.015,
-        low=-0.3,
-        high=0.3,
-        doc="relative deviation at level_e, of the term proportional to the signal",
-    )
-    cubic: float = quantity(
-        -0.005,
-        low=-0.3,
-        high=0.3,
-        doc="relative deviation at level_e, of the term proportional to its square",
-    )
-    level_e: float = quantity(
-        50_000.0,
-        unit="e-",
-        above=0,
-        high=1e7,
-        doc="signal at which the deviations are given: the full well",
-    )
-    bends: tuple[CurvePoint, ...] = quantity(
-        (), doc="measured points of the response curve, in rising order"
-    )
+    quadratic: float = quantity(-0.015, low=-0.3, high=0.3)
+    """relative deviation at level_e, of the term proportional to the signal"""
+    cubic: float = quantity(-0.005, low=-0.3, high=0.3)
+    """relative deviation at level_e, of the term proportional to its square"""
+    level_e: float = quantity(50_000.0, unit="e-", above=0, high=1e7)
+    """signal at which the deviations are given: the full well"""
+    bends: tuple[CurvePoint, ...] = quantity(())
+    """measured points of the response curve, in rising order"""
 
     @property
     def turns_at(self) -> float:

@@ -50,22 +50,14 @@ class OutputJitter(Effect):
         "addition to common noise",
     )
 
-    output_rms: float = quantity(
-        2.0, unit="e-", low=0, high=1e5, doc="white noise of an output's level, rms"
-    )
-    walk_e_h: float = quantity(
-        0.0,
-        unit="e-/h^0.5",
-        low=0,
-        high=1e6,
-        doc="random walk of an output's level, rms after an hour",
-    )
-    row_edges: tuple[int, ...] = quantity(
-        (), unit="px", low=0, doc="first row of each output but the first, on the chip"
-    )
-    column_edges: tuple[int, ...] = quantity(
-        (32,), unit="px", low=0, doc="first column of each output but the first, on the chip"
-    )
+    output_rms: float = quantity(2.0, unit="e-", low=0, high=1e5)
+    """white noise of an output's level, rms"""
+    walk_e_h: float = quantity(0.0, unit="e-/h^0.5", low=0, high=1e6)
+    """random walk of an output's level, rms after an hour"""
+    row_edges: tuple[int, ...] = quantity((), unit="px", low=0)
+    """first row of each output but the first, on the chip"""
+    column_edges: tuple[int, ...] = quantity((32,), unit="px", low=0)
+    """first column of each output but the first, on the chip"""
 
     def read_variance(self, detector: SimulatedDetector) -> float:
         numbers = self._numbers(detector, (0, detector.shape[0]))

@@ -58,15 +58,12 @@ class Pickup(Effect):
         "together, in a read noise of 10 e-",
     )
 
-    rms: tuple[float, ...] = quantity(
-        (3.0, 1.0), unit="e-", low=0, high=1e5, doc="of each tone, rms"
-    )
-    columns: tuple[float, ...] = quantity(
-        (0.297, 0.242), unit="1/px", low=0, high=0.5, doc="its cycles per column"
-    )
-    rows: tuple[float, ...] = quantity(
-        (0.125, -0.31), unit="1/px", low=-0.5, high=0.5, doc="its cycles per row"
-    )
+    rms: tuple[float, ...] = quantity((3.0, 1.0), unit="e-", low=0, high=1e5)
+    """of each tone, rms"""
+    columns: tuple[float, ...] = quantity((0.297, 0.242), unit="1/px", low=0, high=0.5)
+    """its cycles per column"""
+    rows: tuple[float, ...] = quantity((0.125, -0.31), unit="1/px", low=-0.5, high=0.5)
+    """its cycles per row"""
 
     def __post_init__(self) -> None:
         if not len(self.rms) == len(self.columns) == len(self.rows):

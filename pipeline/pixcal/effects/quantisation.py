@@ -54,56 +54,27 @@ class Quantisation(Effect):
         "nonlinearity of 0.3 to 0.5 codes is typical of data sheets",
     )
 
-    coarse_adu: float = quantity(
-        3.0, unit="ADU", low=0, high=4095, doc="step of the converter minus 1 ADU"
-    )
-    dnl_rms: float = quantity(
-        0.3,
-        unit="codes",
-        low=0,
-        high=1,
-        doc="scatter of the code widths (differential nonlinearity)",
-    )
-    ripple: float = quantity(
-        0.1,
-        unit="codes",
-        low=0,
-        high=0.9,
-        doc="amplitude of a periodic variation of the code widths",
-    )
-    ripple_codes: float = quantity(
-        2.0, unit="codes", low=2, high=16, doc="period of that variation; 2: even and odd codes"
-    )
-    ripple_phase_rad: float = quantity(
-        0.0, unit="rad", low=-7, high=7, doc="phase of that variation at code zero"
-    )
-    bits: tuple[float, ...] = quantity(
-        (),
-        unit="codes",
-        low=-1000,
-        high=1000,
-        doc="error of the weight of each bit, lowest bit first",
-    )
-    below: float = quantity(
-        0.0,
-        low=0,
-        high=1,
-        doc="how a bit is decided; 0: it is kept if its level does not exceed the signal; 0.5: "
-        "the nearest level is chosen",
-    )
-    any_code: bool = quantity(
-        False,
-        doc="whether any code may be chosen where wrong bits make levels overlap; otherwise only "
-        "a neighbouring code",
-    )
-    widths: tuple[float, ...] = quantity(
-        (),
-        unit="codes",
-        low=-1,
-        high=100,
-        doc="width of each code minus 1 code, from code 0 on, beside wrong bits; the scatter and "
-        "ripple then only describe them",
-    )
+    coarse_adu: float = quantity(3.0, unit="ADU", low=0, high=4095)
+    """step of the converter minus 1 ADU"""
+    dnl_rms: float = quantity(0.3, unit="codes", low=0, high=1)
+    """scatter of the code widths (differential nonlinearity)"""
+    ripple: float = quantity(0.1, unit="codes", low=0, high=0.9)
+    """amplitude of a periodic variation of the code widths"""
+    ripple_codes: float = quantity(2.0, unit="codes", low=2, high=16)
+    """period of that variation; 2: even and odd codes"""
+    ripple_phase_rad: float = quantity(0.0, unit="rad", low=-7, high=7)
+    """phase of that variation at code zero"""
+    bits: tuple[float, ...] = quantity((), unit="codes", low=-1000, high=1000)
+    """error of the weight of each bit, lowest bit first"""
+    below: float = quantity(0.0, low=0, high=1)
+    """how a bit is decided; 0: it is kept if its level does not exceed the signal; 0.5: the nearest
+    level is chosen"""
+    any_code: bool = quantity(False)
+    """whether any code may be chosen where wrong bits make levels overlap; otherwise only a
+    neighbouring code"""
+    widths: tuple[float, ...] = quantity((), unit="codes", low=-1, high=100)
+    """width of each code minus 1 code, from code 0 on, beside wrong bits; the scatter and ripple
+    then only describe them"""
 
     def __hash__(self) -> int:
         """Fast hash without the individual widths, as it is needed in each frame."""

@@ -49,38 +49,19 @@ class RollingShutter(Effect):
         "sensor are reset and read one after the other",
     )
 
-    line_time_us: float = quantity(
-        1.2, unit="us", low=0, high=1e5, doc="delay from one row to the next"
-    )
-    delay_us: float = quantity(
-        0.0,
-        unit="us",
-        low=0,
-        high=1e10,
-        doc="time from the end of the exposure of the first row to the phase step",
-    )
+    line_time_us: float = quantity(1.2, unit="us", low=0, high=1e5)
+    """delay from one row to the next"""
+    delay_us: float = quantity(0.0, unit="us", low=0, high=1e10)
+    """time from the end of the exposure of the first row to the phase step"""
 
-    settling: tuple[float, ...] = quantity(
-        (),
-        low=-1,
-        high=1,
-        doc="phase error as a share of the phase step, at equally spaced "
-        "rows from the first to the last of the window (none, or at least four)",
-    )
-    of_step: str = quantity(
-        "last",
-        choices=("last", "next"),
-        doc="phase step that settling refers to: from the previous frame (last), or to the next "
-        "one (next)",
-    )
-    origin_rad: float | None = quantity(
-        None,
-        unit="rad",
-        low=-10,
-        high=10,
-        doc="start of the modulator's range of 2 pi; default: the modulator moves by the shorter "
-        "path",
-    )
+    settling: tuple[float, ...] = quantity((), low=-1, high=1)
+    """phase error as a share of the phase step, at equally spaced rows from the first to the last
+    of the window (none, or at least four)"""
+    of_step: str = quantity("last", choices=("last", "next"))
+    """phase step that settling refers to: from the previous frame (last), or to the next one
+    (next)"""
+    origin_rad: float | None = quantity(None, unit="rad", low=-10, high=10)
+    """start of the modulator's range of 2 pi; default: the modulator moves by the shorter path"""
 
     def check(self, bench: Bench) -> None:
         if 0 < len(self.settling) < FEWEST:

@@ -68,9 +68,8 @@ class RowNoise(Effect):
         doc="noise from row to row, rms; half of its variance is shared with the row after next",
     )
     group_rms: float = _rms(0.0, doc="white noise that rows read together share, rms")
-    group_rows: int = quantity(
-        2, low=2, high=64, doc="rows read together, counted from the first of the window"
-    )
+    group_rows: int = quantity(2, low=2, high=64)
+    """rows read together, counted from the first of the window"""
     odd_column_rms: float = _rms(0.0, doc="as `interlace_rms`, of even and odd columns")
 
     def read_variance(self, detector: SimulatedDetector) -> float:

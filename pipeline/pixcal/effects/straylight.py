@@ -73,27 +73,18 @@ class Straylight(Effect):
         "that misses the detector",
     )
 
-    share: float = quantity(
-        0.02,
-        low=0,
-        high=10,
-        doc="ratio to the light of the fibres in the first pixel of the window",
-    )
-    slope_per_px: tuple[float, float] = quantity(
-        (4e-5, -2e-5), unit="1/px", low=-1, high=1, doc="gradient of the share along x and y"
-    )
-    bump: float = quantity(0.0, low=0, high=10, doc="peak share of a round spot")
-    bump_centre_px: tuple[float, float] = quantity(
-        (0.0, 0.0),
-        unit="px",
-        low=-1e5,
-        high=1e5,
-        doc="centre of the spot, column and row of the window",
-    )
-    bump_radius_px: float = quantity(
-        30.0, unit="px", above=0, high=1e5, doc="standard deviation of the spot"
-    )
-    patterns: tuple[StrayPattern, ...] = quantity((), doc="measured pattern of each set")
+    share: float = quantity(0.02, low=0, high=10)
+    """ratio to the light of the fibres in the first pixel of the window"""
+    slope_per_px: tuple[float, float] = quantity((4e-5, -2e-5), unit="1/px", low=-1, high=1)
+    """gradient of the share along x and y"""
+    bump: float = quantity(0.0, low=0, high=10)
+    """peak share of a round spot"""
+    bump_centre_px: tuple[float, float] = quantity((0.0, 0.0), unit="px", low=-1e5, high=1e5)
+    """centre of the spot, column and row of the window"""
+    bump_radius_px: float = quantity(30.0, unit="px", above=0, high=1e5)
+    """standard deviation of the spot"""
+    patterns: tuple[StrayPattern, ...] = quantity(())
+    """measured pattern of each set"""
 
     def pattern(self, rows: Rows, columns: Rows, of: str = "") -> F64:
         """Share (y, x) in a set on rows and columns of the window (first, one after the last)."""

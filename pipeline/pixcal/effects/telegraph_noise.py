@@ -73,29 +73,21 @@ class TelegraphNoise(Effect):
         "pixels; the distribution of amplitudes has an exponential tail",
     )
 
-    share: float = quantity(0.02, low=0, high=1, doc="share of the pixels with telegraph noise")
-    amplitude_e: float = quantity(
-        30.0, unit="e-", low=0, high=1e6, doc="mean difference of the two levels"
-    )
-    switching_s: float = quantity(
-        0.5, unit="s", low=0, high=1e6, doc="mean time in a level; 0: independent in each frame"
-    )
-    amplitude_shape: float = quantity(
-        1.0,
-        low=0.01,
-        high=100,
-        doc="shape of the gamma distribution of amplitudes; 1: "
-        "exponential, large: equal amplitudes",
-    )
-    switching_decades: float = quantity(
-        0.0,
-        low=0,
-        high=6,
-        doc="range of the mean times over pixels, uniform in the logarithm; "
-        "switching_s is the geometric mean",
-    )
-    upper: float = quantity(0.5, above=0, below=1, doc="share of the time in the upper level")
-    measured: tuple[MeasuredPixels, ...] = quantity((), doc="pixels with levels of their own")
+    share: float = quantity(0.02, low=0, high=1)
+    """share of the pixels with telegraph noise"""
+    amplitude_e: float = quantity(30.0, unit="e-", low=0, high=1e6)
+    """mean difference of the two levels"""
+    switching_s: float = quantity(0.5, unit="s", low=0, high=1e6)
+    """mean time in a level; 0: independent in each frame"""
+    amplitude_shape: float = quantity(1.0, low=0.01, high=100)
+    """shape of the gamma distribution of amplitudes; 1: exponential, large: equal amplitudes"""
+    switching_decades: float = quantity(0.0, low=0, high=6)
+    """range of the mean times over pixels, uniform in the logarithm; switching_s is the geometric
+    mean"""
+    upper: float = quantity(0.5, above=0, below=1)
+    """share of the time in the upper level"""
+    measured: tuple[MeasuredPixels, ...] = quantity(())
+    """pixels with levels of their own"""
 
     def noisy_pixels(self, detector: SimulatedDetector) -> Mask:
         noisy = np.zeros(detector.shape, bool)

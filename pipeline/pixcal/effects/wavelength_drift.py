@@ -46,20 +46,14 @@ class WavelengthDrift(Effect):
         "air that is 1 K warmer has an index lower by 1e-6 (Edlen's equation)",
     )
 
-    ramp: float = quantity(1e-6, unit="1/h", low=-1, high=1, doc="relative change per hour")
-    walk: float = quantity(
-        5e-7, unit="h^-0.5", low=0, high=1, doc="relative random walk, rms after an hour"
-    )
-    hop: float = quantity(
-        1.1e-6, low=-0.1, high=0.1, doc="relative difference between the two modes"
-    )
-    hops_per_h: float = quantity(
-        12.0,
-        unit="1/h",
-        low=0,
-        high=1e6,
-        doc="rate of mode hops in either direction, at random times",
-    )
+    ramp: float = quantity(1e-6, unit="1/h", low=-1, high=1)
+    """relative change per hour"""
+    walk: float = quantity(5e-7, unit="h^-0.5", low=0, high=1)
+    """relative random walk, rms after an hour"""
+    hop: float = quantity(1.1e-6, low=-0.1, high=0.1)
+    """relative difference between the two modes"""
+    hops_per_h: float = quantity(12.0, unit="1/h", low=0, high=1e6)
+    """rate of mode hops in either direction, at random times"""
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         bench, count = recording.bench, recording.count

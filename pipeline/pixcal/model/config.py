@@ -5,12 +5,17 @@ them with `quantity`. Its class variable ``moved`` gives the replacement of keys
 `to_plain` is the inverse of `parse`.
 """
 
+import ast
+import contextlib
 import dataclasses
 import difflib
+import inspect
 import math
 import re
+import textwrap
 import types
 import typing
+from itertools import pairwise
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
@@ -40,13 +45,28 @@ def quantity(
     low, high : inclusive limits of a number (of each number of a tuple)
     above : exclusive lower limit
     choices : the allowed words
-    doc : one line on the meaning
+    doc : one line on the meaning; if long, write it as a string below the field, see `meanings`
     **more : further metadata of options, see `pixcal.model.options`
     """
     meta = dict(more, unit=unit, low=low, high=high, above=above, choices=choices, doc=doc)
     if isinstance(default, (list, dict)):
         raise TypeError("defaults of configuration fields are immutable: use tuples")
     return dataclasses.field(default=default, metadata=meta)
+
+
+def meanings(kind: type) -> dict[str, str]:
+    """What each field means: its ``doc``, or else the string below it in the source."""
+    words: dict[str, str] = {}
+    for parent in filter(dataclasses.is_dataclass, reversed(kind.__mro__)):
+        with contextlib.suppress(OSError, TypeError):  # without source
+            declared: Any = ast.parse(textwrap.dedent(inspect.getsource(parent))).body[0]
+            for pair in pairwise(declared.body):
+                match pair:
+                    case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                        words[name] = " ".join(text.split())
+    return {
+        f.name: f.metadata.get("doc") or words.get(f.name, "") for f in dataclasses.fields(kind)
+    }
 
 
 def as_in(kind: type, name: str, **changes: Any) -> Any:

@@ -20,7 +20,7 @@ from pixcal.estimators.test_statistics.gap import (
     sigmas_of,
 )
 from pixcal.model.arrays import F64
-from pixcal.model.config import to_plain
+from pixcal.model.config import meanings, to_plain
 from pixcal.report.diagnosis_words import place
 from pixcal.simulation.effect import DOMAINS
 from pixcal.stages.diagnose.by_domain import not_compared, rounded
@@ -155,7 +155,7 @@ class Description:
             "parameters": to_plain(effect),
             "uncertainty": {k: float(v) for k, v in estimate.errors.items()},
             "units": {f.name: f.metadata.get("unit", "") for f in fields(effect)},
-            "meanings": {f.name: f.metadata.get("doc", "") for f in fields(effect)},
+            "meanings": meanings(type(effect)),
             "strengths": list(effect.strengths),
             "size": dict(estimate.size),
             "law": estimate.law,
