@@ -18,7 +18,7 @@ import zarr
 from numpy.typing import NDArray
 
 from pixcal.model.errors import DamagedError, InputError, RemoteError
-from pixcal.storage import folder, read_ahead
+from pixcal.storage import cube_reader, folder
 from pixcal.storage.cube import INDEX, create_array, create_group, remove_arrays, write_array
 from pixcal.storage.cube_reader import ArrayReader, CachedReader
 from pixcal.storage.place import Place, UrlPath, parse_place
@@ -232,7 +232,7 @@ def test_what_follows_is_on_its_way_before_it_is_asked_for(
     for waiting in reader._ahead.expected().values():
         assert waiting is not None
         waiting.result()
-    assert fetched == {f"{n}/0/0": 1 for n in range(3, 5 + read_ahead.AHEAD)}
+    assert fetched == {f"{n}/0/0": 1 for n in range(3, 5 + cube_reader.AHEAD)}
 
 
 def test_chunks_here_and_there_are_not_read_ahead(
@@ -253,7 +253,7 @@ def test_what_nobody_asks_for_is_let_go(long_cube: tuple[ArrayReader, NDArray[An
             for n in (first, first + 1, first + 2):
                 chunk = reader.read_chunk((n, 0, j))
                 np.testing.assert_array_equal(chunk, data[2 * n : 2 * n + 2, :, 3 * j : 3 * j + 3])
-                assert len(reader._ahead.expected()) <= 2 * read_ahead.AHEAD
+                assert len(reader._ahead.expected()) <= 2 * cube_reader.AHEAD
     other = pickle.loads(pickle.dumps(reader))  # noqa: S301 (just made)
     assert not other._ahead.expected()
     np.testing.assert_array_equal(other.read(), data)

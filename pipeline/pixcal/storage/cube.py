@@ -21,22 +21,10 @@ from numcodecs import Blosc
 from numpy.typing import NDArray
 
 from pixcal.model.errors import DamagedError
+from pixcal.storage import zarr_format
 from pixcal.storage.folder import INDEX, File, copy_files, link_files, open_folder
 from pixcal.storage.memory import MemoryArray, MemoryPath
 from pixcal.storage.place import Place
-from pixcal.storage.zarr_format import (
-    CRC_RESIDUE,
-    INDEX_DTYPE,
-    LOST_ERRORS,
-    array_metadata,
-    chunk_name,
-    chunk_names,
-    grid_of,
-    group_metadata,
-    seal,
-    shapes_of,
-    write_metadata,
-)
 
 CHUNK = (64, 128, 128)  # samples of a chunk along (time, y, x): 2 MiB of uint16
 
@@ -62,8 +50,8 @@ def create_array(
         path.keep(MemoryArray(np.full(shape, fill_value, dtype), chunks, fill_value, attrs or {}))
         return ArrayWriter(path, shape, chunks, dtype, fill_value, b"")
     text = json.dumps(attrs or {})
-    metadata = array_metadata(shape, chunks, dtype.str, fill_value, tuple(dims), text)
-    write_metadata(path, metadata)
+    metadata = zarr_format.array_metadata(shape, chunks, dtype.str, fill_value, tuple(dims), text)
+    zarr_format.write_metadata(path, metadata)
     return ArrayWriter(path, shape, chunks, dtype, fill_value, metadata)
 
 
@@ -88,7 +76,7 @@ def create_group(path: Place, attrs: dict[str, Any] | None = None) -> None:
     """Create a Zarr group (a folder that xarray opens as a dataset) if it does not exist."""
     if isinstance(path, MemoryPath):
         return
-    write_metadata(path, group_metadata(json.dumps(attrs or {})))
+    zarr_format.write_metadata(path, zarr_format.group_metadata(json.dumps(attrs or {})))
 
 
 def write_array(path: Place, data: NDArray[Any], **options: Any) -> None:
@@ -130,7 +118,7 @@ class ArrayWriter:
     def _encode(self, first: Sequence[int], data: NDArray[Any]) -> Iterator[File]:
         """Name and content of the chunks of a block."""
         codec = Blosc("lz4", 1, Blosc.BITSHUFFLE)
-        for offset in product(*map(range, grid_of(data.shape, self.chunks))):
+        for offset in product(*map(range, zarr_format.grid_of(data.shape, self.chunks))):
             part = data[
                 tuple(slice(o * c, (o + 1) * c) for o, c in zip(offset, self.chunks, strict=True))
             ]
@@ -141,7 +129,7 @@ class ArrayWriter:
                 block[tuple(map(slice, part.shape))] = part
             body = bytes(codec.encode(block))
             crc: int = google_crc32c.value(body)
-            name = chunk_name([f + o for f, o in zip(first, offset, strict=True)])
+            name = zarr_format.chunk_name([f + o for f, o in zip(first, offset, strict=True)])
             yield name, (body, crc.to_bytes(4, "little"))
 
     def take(self, source: Place) -> None:
@@ -149,7 +137,7 @@ class ArrayWriter:
         if isinstance(source, Path) and isinstance(self.path, Path):
             link_files(source / "c", self.path / "c")
             return
-        for names in chunk_names(grid_of(self.shape, self.chunks)):
+        for names in zarr_format.chunk_names(zarr_format.grid_of(self.shape, self.chunks)):
             copy_files(source, self.path, names)
 
     def finish(self) -> NDArray[Any]:
@@ -157,12 +145,12 @@ class ArrayWriter:
 
         Raises DamagedError naming the first chunk that is missing or cut.
         """
-        grid = grid_of(self.shape, self.chunks)
-        index = np.zeros(grid, INDEX_DTYPE)
+        grid = zarr_format.grid_of(self.shape, self.chunks)
+        index = np.zeros(grid, zarr_format.INDEX_DTYPE)
         if isinstance(self.path, MemoryPath):
             return index
         folder = open_folder(self.path)
-        for first, names in enumerate(chunk_names(grid)):
+        for first, names in enumerate(zarr_format.chunk_names(grid)):
             rows = []
             try:
                 for name, (size, tail) in zip(names, folder.ends(names), strict=True):
@@ -170,14 +158,14 @@ class ArrayWriter:
                         raise DamagedError(self.path / name, "truncated chunk")
                     rows.append((size, int.from_bytes(tail, "little")))
             except OSError as error:
-                if error.errno not in LOST_ERRORS:
+                if error.errno not in zarr_format.LOST_ERRORS:
                     raise
                 raise DamagedError(error.filename, f"chunk missing ({error.strerror})") from error
-            index[first] = np.array(rows, INDEX_DTYPE).reshape(grid[1:])
+            index[first] = np.array(rows, zarr_format.INDEX_DTYPE).reshape(grid[1:])
         body = BytesIO()
         np.save(body, index)
         content = body.getvalue()
-        folder.write([(INDEX, (content, seal(self.metadata, content)))])
+        folder.write([(INDEX, (content, zarr_format.seal(self.metadata, content)))])
         return index
 
 
@@ -187,7 +175,9 @@ def chunks_whole(folder: Path) -> bool:
         if "zarr.json" in names and "c" in folders:
             folders.clear()
             chunks = (f for f in Path(at, "c").rglob("*") if f.name.isdigit() and f.is_file())
-            if any(google_crc32c.value(file.read_bytes()) != CRC_RESIDUE for file in chunks):
+            if any(
+                google_crc32c.value(file.read_bytes()) != zarr_format.CRC_RESIDUE for file in chunks
+            ):
                 return False
     return True
 
@@ -204,7 +194,7 @@ def remove_arrays(path: Place) -> None:
         if meta["node_type"] == "group":
             remove_arrays(path / child)
         else:
-            for names in chunk_names(grid_of(*shapes_of(meta))):
+            for names in zarr_format.chunk_names(zarr_format.grid_of(*zarr_format.shapes_of(meta))):
                 node.remove(names)
         # Last, so that an interrupted removal can be repeated.
         node.remove([INDEX, "zarr.json"])

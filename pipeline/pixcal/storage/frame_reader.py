@@ -7,7 +7,7 @@ times of change, and the checksum of every band of rows.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,17 +40,12 @@ def describe(files: Sequence[FrameFile]) -> dict[str, list[Any]]:
     }
 
 
-@dataclass(frozen=True)
-class _Ingested(SourceFile):
-    """A file as ingested."""
-
-    CHANGED: ClassVar[str] = "changed since it was ingested; run 'pixcal ingest' again"
-
-
 def described(columns: Columns, number: int, folder: Path, frame: Sequence[int]) -> FrameFile:
     """One of the files of `describe`, with its frame size (y, x)."""
     row = {name: column[number] for name, column in columns.items()}
-    source = _Ingested(folder / row["file"], row["file"], row["size"], row["mtime_ns"])
+    place, known = folder / row["file"], (row["file"], row["size"], row["mtime_ns"])
+    changed = "changed since it was ingested; run 'pixcal ingest' again"
+    source = SourceFile(place, *known, changed=changed)
     coding = SampleFormat(row["bitpix"], row["bscale"], row["bzero"], row["blank"])
     shape = (row["planes"], frame[0], frame[1])
     return FrameFile(source, "plain", -1, row["offset"], shape, coding)

@@ -15,7 +15,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
-from typing import ClassVar
 
 from pixcal.model.acquisition import Frames
 from pixcal.model.errors import InputError, reason_of
@@ -85,15 +84,15 @@ def _cards(place: str, row: dict[str, str | None]) -> Iterable[tuple[str, str | 
 class SourceFile:
     """A file as found."""
 
-    CHANGED: ClassVar[str] = (
-        "changed while it was being read; wait until the acquisition is complete and run again"
-    )
-
     path: Path  # where it is
     name: str  # relative to the acquisition's folder, with `/`
     size: int  # bytes
     mtime_ns: int  # time of the last change (ns since 1970)
     header: Header = ()  # its entry in `headers.csv`
+    # what is wrong, and what to do, if it is not as found
+    changed: str = (
+        "changed while it was being read; wait until the acquisition is complete and run again"
+    )
 
     def open(self) -> io.FileIO:
         """Open the file for unbuffered reading; InputError if it has changed."""
@@ -117,7 +116,7 @@ class SourceFile:
 
     def _compare(self, now: os.stat_result) -> None:
         if (now.st_size, now.st_mtime_ns) != (self.size, self.mtime_ns):
-            raise InputError(f"{self.path}: {self.CHANGED}")
+            raise InputError(f"{self.path}: {self.changed}")
 
 
 @contextmanager
