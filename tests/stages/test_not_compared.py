@@ -4,7 +4,7 @@ import numpy as np
 
 from pixcal.estimators.test_statistics import DETECTOR, Curve
 from pixcal.estimators.test_statistics.expectation import Reference
-from pixcal.stages.diagnose.by_domain import not_compared
+from pixcal.stages.diagnose.comparison import not_compared
 
 
 def test_statistics_without_an_equal_in_the_simulations_are_named() -> None:

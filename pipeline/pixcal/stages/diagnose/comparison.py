@@ -5,12 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.estimators.test_statistics import Key
+from pixcal.estimators.test_statistics import DETECTOR, Curve, Key, known_statistics
 from pixcal.estimators.test_statistics.expectation import (
     Expectation,
     Reference,
     expect_nominal,
     expect_with,
+    statistic_named,
 )
 from pixcal.estimators.test_statistics.gap import (
     FALSE_ALARM_RATE,
@@ -24,9 +25,11 @@ from pixcal.estimators.test_statistics.gap import (
     likelier,
     log_likelihood,
     remaining,
+    sigmas_among,
     sigmas_of,
 )
 from pixcal.model.arrays import F64
+from pixcal.simulation.effect import DOMAINS
 from pixcal.stages.diagnose.thresholds import LAW_ERROR, MAX_RESIDUAL_GAP, MIN_LOGLIK_GAIN
 from pixcal.stages.diagnose.trial import Curves, Effects
 
@@ -202,3 +205,36 @@ class Comparison:
 
     def _trial(self, effects: Effects, expected: Expectation) -> Trial:
         return Trial(effects, expected, log_likelihood(self.data, expected))
+
+
+# In the words and numbers of the results
+
+
+def by_domain(
+    before: Mapping[Key, Difference], after: Mapping[Key, Difference]
+) -> dict[str, list[float]]:
+    """Largest deviation (sigma, at least 0) in each domain, before and after."""
+    largest = {}
+    for domain in DOMAINS:
+        keys = [k for k in before if statistic_named(k[0]).domain == domain]
+        largest[domain] = [
+            rounded(sigmas_among(min(one[k].log_chance for k in keys), len(keys))) if keys else 0.0
+            for one in (before, after)
+        ]
+    return largest
+
+
+def not_compared(measured: Mapping[Key, Curve], data: Mapping[Key, F64]) -> list[str]:
+    """Titles of measured statistics that simulations lack, or have in another form."""
+    # Estimates used as statistics are left out: simulations compute some of them only when needed.
+    known = known_statistics()
+    return [
+        statistic_named(name).title + ("" if of == DETECTOR else f" of {of}")
+        for name, of in sorted(set(measured) - set(data))
+        if name in known
+    ]
+
+
+def rounded(value: float) -> float:
+    """To four digits."""
+    return float(f"{value:.4g}")

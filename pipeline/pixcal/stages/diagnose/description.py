@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,18 +10,33 @@ import numpy as np
 from pixcal.estimators.detector.flat_ladder import light_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.arrays import F64, Indices
+from pixcal.model.arrays import F32, F64, Indices
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import TOP_ADU, plain_bench
 from pixcal.stages.diagnose.parts import FrameSubset, Table
-from pixcal.stages.diagnose.set_truth import SetTruth
 from pixcal.stages.evidence import frame_days, groups
 from pixcal.storage.header_values import DAY_S
 
 _LATE = 0.05  # fraction of a period above which a frame counts as late
 _LIFTED = 8.0  # level without light after the pedestal, in units of the read noise
+
+
+@dataclass(frozen=True)
+class SetTruth:
+    """One fringe set of the nominal bench."""
+
+    light: F32  # (y, x) mean, for unit response, e-
+    contrast: F32  # (y, x) fringe amplitude over the mean, a smooth surface
+    psi: F64  # (y, x) phase of the pixels if they had no offsets, rad
+    k: tuple[float, float]  # fringe vector, rad/px
+    step: float  # of a ramp of the phase, rad; zero: no ramp
+    phi: F64  # (t,) measured phase of every frame, rad; NaN for frames that were not fitted
+
+    def phase(self, delta_x: F32, delta_y: F32) -> F64:
+        """Phase (y, x) of the pixels at their offsets (px), rad."""
+        return np.asarray(self.psi + self.k[0] * delta_x + self.k[1] * delta_y)
 
 
 def bench_of(

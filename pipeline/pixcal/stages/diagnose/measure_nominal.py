@@ -19,13 +19,12 @@ from pixcal.kernels.rounding import level_before_rounding
 from pixcal.kernels.scene import DetectorMaps
 from pixcal.model.arrays import F32, F64, Indices, Mask
 from pixcal.simulation.fringe_maps import FittedFrames
-from pixcal.stages.diagnose.description import bench_of, pedestal_of, recordings_of
+from pixcal.stages.diagnose.description import SetTruth, bench_of, pedestal_of, recordings_of
 from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.flats import FlatLight, MeasuredGain
 from pixcal.stages.diagnose.hot_pixels import uncoupled
 from pixcal.stages.diagnose.nominal import Measured, NominalBench
 from pixcal.stages.diagnose.parts import FrameSubset, RunFrames
-from pixcal.stages.diagnose.set_truth import SetTruth
 from pixcal.stages.reduce.calibration import FLAT_FLOOR
 
 MAX_GAIN_CHI2 = 10.0  # reduced chi-square of the photon transfer above which its gain is not used

@@ -24,11 +24,11 @@ from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import SEEDS_APART, Recording
 from pixcal.simulation.replica import TOP_ADU, OfAcquisition
 from pixcal.simulation.shot import Shot
+from pixcal.stages.diagnose.description import SetTruth
 from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.flats import FlatLight, MeasuredGain, photon_transfer_change
 from pixcal.stages.diagnose.hot_pixels import uncoupled
 from pixcal.stages.diagnose.parts import FrameSubset, RawFrames, RunFrames
-from pixcal.stages.diagnose.set_truth import SetTruth
 
 _GAIN, _NOISE, _DARK = 101, 102, 103  # keys of random numbers
 _WHITE = 1e-3  # least share of the variance of the read noise that effects leave

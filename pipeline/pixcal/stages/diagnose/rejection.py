@@ -13,17 +13,9 @@ from pixcal.estimators.test_statistics import Key
 from pixcal.estimators.test_statistics.expectation import signature_key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.simulation.effect import Effect, Estimate
+from pixcal.stages.diagnose import thresholds
 from pixcal.stages.diagnose.candidates import Candidate
 from pixcal.stages.diagnose.comparison import Comparison, Trial
-from pixcal.stages.diagnose.thresholds import (
-    LAW_ERROR,
-    MAX_RESIDUAL_GAP,
-    MIN_GAP_CLOSED,
-    MIN_JOINT_GAP_CLOSED,
-    MIN_LOGLIK_GAIN,
-    MIN_LOGLIK_GAIN_WEAK,
-    MIN_SHARE_OF_RESIDUAL,
-)
 
 UNTRIED = ("not decided", "not tested", "cannot be simulated")  # how such reasons begin
 
@@ -43,20 +35,24 @@ def explained_by_other_law(name: str) -> str:
 
 def needed_gain(candidate: Candidate) -> float:
     """Required gain in log-likelihood of the held-out frames for a candidate."""
-    return MIN_LOGLIK_GAIN if candidate.significance >= SIGNIFICANT else MIN_LOGLIK_GAIN_WEAK
+    return (
+        thresholds.MIN_LOGLIK_GAIN
+        if candidate.significance >= SIGNIFICANT
+        else thresholds.MIN_LOGLIK_GAIN_WEAK
+    )
 
 
 def gain_too_small(gain: float, candidate: Candidate) -> str:
     """Why a candidate that was tried is rejected."""
-    if candidate.in_maps_alone and gain < MIN_LOGLIK_GAIN:
+    if candidate.in_maps_alone and gain < thresholds.MIN_LOGLIK_GAIN:
         return (
             "its pattern in the held-out maps is no stronger than chance patterns of true offsets"
         )
-    if gain < MIN_LOGLIK_GAIN:
+    if gain < thresholds.MIN_LOGLIK_GAIN:
         return "does not improve the fit of the held-out frames"
     return (
         f"the log-likelihood of the held-out frames rises by only {gain:.1f}; an effect of weak "
-        f"significance needs {MIN_LOGLIK_GAIN_WEAK:g}"
+        f"significance needs {thresholds.MIN_LOGLIK_GAIN_WEAK:g}"
     )
 
 
@@ -66,7 +62,7 @@ def redundant(
     """Why a cause is rejected without which the held-out frames are about as likely."""
     gains = {name: comparison.gain_over(trial, current) for name, trial in without.items()}
     least = min(gains, key=lambda name: gains[name], default=None)
-    if least is None or gains[least] >= MIN_LOGLIK_GAIN:
+    if least is None or gains[least] >= thresholds.MIN_LOGLIK_GAIN:
         return None
     return least, "the other causes explain the data as well without it"
 
@@ -100,8 +96,8 @@ def all_close_little(
     closed: dict[str, float] = {}
     for name, trial in trials:
         closed[name] = max(1 - comparison.residual(trial, where), closed.get(name, 0.0))
-    little = max(closed.values(), default=0.0) < MIN_JOINT_GAP_CLOSED / 4
-    return closed if little and sum(closed.values()) < MIN_JOINT_GAP_CLOSED else {}
+    little = max(closed.values(), default=0.0) < thresholds.MIN_JOINT_GAP_CLOSED / 4
+    return closed if little and sum(closed.values()) < thresholds.MIN_JOINT_GAP_CLOSED else {}
 
 
 def unhelpful(
@@ -115,7 +111,7 @@ def unhelpful(
     where = comparison.gap_of(current)
     left = comparison.residual_size(current, where)
     gains = {n: comparison.residual_size(trial, where) - left for n, trial in without.items()}
-    if left > MAX_RESIDUAL_GAP and min(gains.values(), default=0.0) > 0:
+    if left > thresholds.MAX_RESIDUAL_GAP and min(gains.values(), default=0.0) > 0:
         alone = {n: trial for n in gains if (trial := candidates[n].alone) is not None}
         gains = {n: 1 - comparison.residual_size(trial, where) for n, trial in alone.items()}
     least = min(gains, key=lambda n: gains[n], default=None)
@@ -126,7 +122,7 @@ def unhelpful(
 
 def _imitated(candidate: Candidate) -> bool:
     """Whether the causes produce much of its significance, or it has none."""
-    return candidate.share < 1 - LAW_ERROR or candidate.significance < SIGNIFICANT
+    return candidate.share < 1 - thresholds.LAW_ERROR or candidate.significance < SIGNIFICANT
 
 
 def _own(candidate: Candidate) -> Key:
@@ -162,7 +158,7 @@ def doubtful(
     untried = any(one.reason.startswith(UNTRIED) for one in strong)
     where = comparison.gap_of(current)
     open_still = comparison.residual(current, where)
-    unknown = open_still > MAX_RESIDUAL_GAP
+    unknown = open_still > thresholds.MAX_RESIDUAL_GAP
     imitated = {name for name in without if _imitated(candidates[name])}
     closed, left, needed = {}, {}, {}
     for name, trial in without.items():
@@ -172,13 +168,14 @@ def doubtful(
         apart = {_own(candidates[name])} if unknown else set()
         left[name] = comparison.residual(current, where, apart)
         closed[name] = comparison.residual(trial, where, apart) - left[name]
-        share = 1 if unknown and not untried else MIN_SHARE_OF_RESIDUAL
-        needed[name] = max(share * left[name], MIN_GAP_CLOSED * (name in imitated))
+        share = 1 if unknown and not untried else thresholds.MIN_SHARE_OF_RESIDUAL
+        needed[name] = max(share * left[name], thresholds.MIN_GAP_CLOSED * (name in imitated))
     among = [name for name in closed if closed[name] < needed[name]]
     alone = [candidates[name].alone for name in closed]
     # Causes that only compensate each other.
     if unknown and all(
-        one is not None and comparison.residual(one, where) > 1 - MIN_GAP_CLOSED for one in alone
+        one is not None and comparison.residual(one, where) > 1 - thresholds.MIN_GAP_CLOSED
+        for one in alone
     ):
         among = list(closed)
     least = min(among, key=lambda name: closed[name], default=None)

@@ -23,14 +23,16 @@ from pixcal.model.arrays import F64
 from pixcal.model.config import meanings, to_plain
 from pixcal.report.diagnosis_words import place
 from pixcal.simulation.effect import DOMAINS
-from pixcal.stages.diagnose.by_domain import not_compared, rounded
+from pixcal.stages.diagnose import frames
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
-from pixcal.stages.diagnose.comparison import Shrinkage, Trial, differing, gap_interval, shrinkage
-from pixcal.stages.diagnose.frames import (
-    FRINGES,
-    FramesUsed,
-    recommend_closer_look,
-    recommend_frames,
+from pixcal.stages.diagnose.comparison import (
+    Shrinkage,
+    Trial,
+    differing,
+    gap_interval,
+    not_compared,
+    rounded,
+    shrinkage,
 )
 from pixcal.stages.diagnose.thresholds import EXPLAINED, MAX_RESIDUAL_SHARE, MAX_RESIDUAL_SIGMA
 
@@ -53,7 +55,7 @@ class Description:
     data: Mapping[Key, F64]  # held-out curves on the reference's scales
     measured: Mapping[Key, Curve]  # the same in their own units
     reference: Reference
-    facts: FramesUsed
+    facts: frames.FramesUsed
 
     @cached_property
     def where(self) -> set[Key]:
@@ -79,7 +81,7 @@ class Description:
         where = [self._entry(key, before[key], after[key]) for key in keys]
         not_tested: Json = {}  # effects that these frames cannot show, by the frames that could
         for candidate in search.candidates.values():
-            if candidate.needs and candidate.needs != (FRINGES,):
+            if candidate.needs and candidate.needs != (frames.FRINGES,):
                 not_tested.setdefault(" or ".join(candidate.needs), []).append(candidate.name)
         return {
             "schema": SCHEMA,
@@ -171,7 +173,9 @@ class Description:
             "remedy": effect.remedy or "find and fix it on the bench",
             "given_away_by": self._strongest_evidence(search.without[name]),
             "not_told_apart_from": list(alike),
-            "would_decide": recommend_frames(self.facts.missing_frames, kinds) if alike else [],
+            "would_decide": frames.recommend_frames(self.facts.missing_frames, kinds)
+            if alike
+            else [],
         }
 
     def _more_would_tell(self, where: Sequence[Json], verdict: str) -> list[str]:
@@ -179,9 +183,9 @@ class Description:
         if verdict not in ("unexplained", "partly explained"):
             return []
         if not where:
-            return recommend_frames(self.facts.missing_frames)
+            return frames.recommend_frames(self.facts.missing_frames)
         largest = max(where, key=lambda entry: abs(entry["z_after"]))
-        return recommend_closer_look(self.facts.missing_frames, largest["domain"])
+        return frames.recommend_closer_look(self.facts.missing_frames, largest["domain"])
 
     def _strongest_evidence(self, without: Trial) -> list[dict[str, str]]:
         """Statistics whose likelihood an effect raises most, best first."""

@@ -15,7 +15,7 @@ from pixcal.estimators.test_statistics.expectation import Reference, signature_k
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 from pixcal.simulation.effect import Effect, Estimate
-from pixcal.stages.diagnose import rejection
+from pixcal.stages.diagnose import rejection, thresholds
 from pixcal.stages.diagnose.benches import (
     CONFIRM_SIMULATIONS,
     SCREEN_SIMULATIONS,
@@ -32,14 +32,6 @@ from pixcal.stages.diagnose.candidates import (
 )
 from pixcal.stages.diagnose.comparison import Comparison
 from pixcal.stages.diagnose.pruning import Pruning
-from pixcal.stages.diagnose.thresholds import (
-    MIN_JOINT_GAP_CLOSED,
-    MIN_LOGLIK_GAIN,
-    MIN_LOGLIK_GAIN_WEAK,
-    MIN_SIGMA_IN_GAP,
-    MIN_SIGMA_WEAK,
-    SIMILAR,
-)
 from pixcal.stages.diagnose.trial import Effects
 
 # share of the best gain above which a candidate is simulated more than once; the larger share if
@@ -128,7 +120,7 @@ class Search:
         self._effects[best] = effect
         candidates[best].share = self._shares[best]
         candidates[best].reason = ""
-        enough = max(gains[best] - MIN_LOGLIK_GAIN, MIN_LOGLIK_GAIN)
+        enough = max(gains[best] - thresholds.MIN_LOGLIK_GAIN, thresholds.MIN_LOGLIK_GAIN)
         self._alike[best] = tuple(n for n, g in gains.items() if n != best and g > enough)
         self._leave_explained(best)
         return True
@@ -163,12 +155,12 @@ class Search:
             return False
         trial = self.comparison.trial(effects, curves)
         left = self.comparison.residual(trial, self.comparison.gap_of(trial))
-        return left < 1 - MIN_JOINT_GAP_CLOSED
+        return left < 1 - thresholds.MIN_JOINT_GAP_CLOSED
 
     def _leave_explained(self, cause: str) -> None:
         """Leave out candidates whose significance comes mostly from the causes."""
         shares = self._shares = self._unexplained()
-        for name in [n for n, share in shares.items() if share < 1 - SIMILAR]:
+        for name in [n for n, share in shares.items() if share < 1 - thresholds.SIMILAR]:
             self._candidates[name].reason = rejection.similar_to(cause)
             del self._remaining[name], shares[name]
 
@@ -185,7 +177,7 @@ class Search:
             return False
         benches = [tuple(one.effects.values()) for one in options]
         # Choose by one simulation of each, then by a few, before the choice is confirmed.
-        for seeds, needed in ((1, 0.0), (SCREEN_SIMULATIONS, MIN_LOGLIK_GAIN_WEAK)):
+        for seeds, needed in ((1, 0.0), (SCREEN_SIMULATIONS, thresholds.MIN_LOGLIK_GAIN_WEAK)):
             tried = self._benches.simulate([self._bench, *benches], seeds, "exchanged", ())
             likely = [
                 -np.inf if isinstance(c, str) else self.comparison.trial(b, c).log_likelihood
@@ -198,7 +190,7 @@ class Search:
         (best,) = options
         trial = self._benches.confirmed(tuple(best.effects.values()))
         if isinstance(trial, str) or trial.log_likelihood < (
-            self._current.log_likelihood + MIN_LOGLIK_GAIN_WEAK
+            self._current.log_likelihood + thresholds.MIN_LOGLIK_GAIN_WEAK
         ):
             return False
         self._current, self._effects = trial, dict(best.effects)
@@ -245,7 +237,9 @@ class Search:
         enough = {n: g for n, g in gains.items() if g >= rejection.needed_gain(candidates[n])}
         if gains and not enough:
             # No law of any effect suffices, but an effect may have acted by another law.
-            enough = {n: r.gain for n, r in replays.items() if r.gain >= MIN_LOGLIK_GAIN_WEAK}
+            enough = {
+                n: r.gain for n, r in replays.items() if r.gain >= thresholds.MIN_LOGLIK_GAIN_WEAK
+            }
             gains |= enough
             laws |= {name: replays[name] for name in enough}
         # Where a replay seemed enough, candidates without promise were simulated once only.
@@ -282,7 +276,7 @@ class Search:
         least = SIGNIFICANT
         if self.comparison.differs(self._current):
             strong = max(sizes.values(), default=0.0) >= SIGNIFICANT
-            least = MIN_SIGMA_IN_GAP if strong else MIN_SIGMA_WEAK
+            least = thresholds.MIN_SIGMA_IN_GAP if strong else thresholds.MIN_SIGMA_WEAK
         names = " and ".join(self._effects)
         verb = "are" if len(self._effects) > 1 else "is"
         beside = f" once {names} {verb} included" if names else ""

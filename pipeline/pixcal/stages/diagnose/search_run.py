@@ -15,8 +15,8 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Estimate
 from pixcal.stages.diagnose.benches import CONFIRM_SIMULATIONS, SCREEN_SIMULATIONS, affordable
-from pixcal.stages.diagnose.by_domain import by_domain
 from pixcal.stages.diagnose.candidates import SearchResult
+from pixcal.stages.diagnose.comparison import by_domain
 from pixcal.stages.diagnose.diagnosis_input import DiagnosisInput
 from pixcal.stages.diagnose.parts import evidence_of
 from pixcal.stages.diagnose.result import Description

@@ -23,8 +23,8 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError, naming
 from pixcal.model.options import Diagnose as Config
 from pixcal.simulation.effect import Effect
-from pixcal.stages.diagnose.by_domain import rounded
 from pixcal.stages.diagnose.candidates import Considered
+from pixcal.stages.diagnose.comparison import rounded
 from pixcal.stages.diagnose.diagnosis_input import prepare_input
 from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.search_run import run_search
