@@ -6,14 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pixcal.model.acquisition import (
-    Detector,
-    FringeScan,
-    Optics,
-    check_names,
-    check_printable,
-    check_set,
-)
+from pixcal.model import acquisition
 from pixcal.model.config import as_in, parse, quantity
 from pixcal.model.errors import InputError
 from pixcal.model.yaml_file import read_yaml
@@ -43,12 +36,12 @@ class SimulatedDetector:
     """The chip, the window of it that is read, and its truth maps, which ``seed`` and chip fix."""
 
     shape: tuple[int, int] = _px(doc="window that is read out: [rows, columns]")
-    pitch_um: float = as_in(Detector, "pitch_um")
+    pitch_um: float = as_in(acquisition.Detector, "pitch_um")
     gain_e_per_adu: float = as_in(
-        Detector, "gain_e_per_adu", default=MISSING, doc="conversion gain"
+        acquisition.Detector, "gain_e_per_adu", default=MISSING, doc="conversion gain"
     )
-    read_noise_e: float = as_in(Detector, "read_noise_e")
-    name: str = as_in(Detector, "name")
+    read_noise_e: float = as_in(acquisition.Detector, "read_noise_e")
+    name: str = as_in(acquisition.Detector, "name")
     seed: int = _seed(doc="random seed of the detector: its fixed patterns")
     chip: tuple[int, int] | None = _px(None, doc="whole chip: [rows, columns]; default: the window")
     origin_px: tuple[int, int] | None = _px(
@@ -83,7 +76,7 @@ class SimulatedDetector:
     temperature_c: float = quantity(35.0, unit="C", low=-273.15, high=200, doc="for the headers")
 
     def __post_init__(self) -> None:
-        check_printable(self.name)
+        acquisition.check_printable(self.name)
         for axis, name in enumerate(("rows", "columns")):
             first, size, whole = self.origin[axis], self.shape[axis], self.chip_shape[axis]
             if first < 0 or first + size > whole:
@@ -137,7 +130,7 @@ class SimulatedDetector:
 class SimulatedOptics:
     """Laser, fibres and their light; lengths on the detector are from the chip's centre."""
 
-    wavelength_nm: float = as_in(Optics, "wavelength_nm")
+    wavelength_nm: float = as_in(acquisition.Optics, "wavelength_nm")
     distance_mm: float = _length(doc="fibres to detector, true")
     beam_radius_mm: float = quantity(
         unit="mm", low=1e-3, high=1e7, doc="1/e² radius of each fibre's light on the detector"
@@ -168,8 +161,8 @@ def _of_pair(name: str, doc: str) -> Any:
 class SimulatedSet:
     """One scan of the fringes of a pair of fibres."""
 
-    name: str = as_in(FringeScan, "name")
-    baseline_mm: tuple[float, float] = as_in(FringeScan, "baseline_mm")
+    name: str = as_in(acquisition.FringeScan, "name")
+    baseline_mm: tuple[float, float] = as_in(acquisition.FringeScan, "baseline_mm")
     count: int = _count(low=1)
     peak_e: float = quantity(
         unit="e-",
@@ -202,7 +195,7 @@ class SimulatedSet:
     }
 
     def __post_init__(self) -> None:
-        check_set(self.name, self.baseline_mm)
+        acquisition.check_set(self.name, self.baseline_mm)
         if self.name in CALIBRATIONS:
             raise InputError(
                 f"name: {self.name!r} is the folder of calibration frames; choose another"
@@ -245,7 +238,7 @@ class SimulatedFrames:
 
     def __post_init__(self) -> None:
         names = [*CALIBRATIONS, *(s.name for s in self.fringes)]
-        check_names("fringes", names)
+        acquisition.check_names("fringes", names)
         for name in self.compress:
             if name not in names:
                 raise InputError(f"compress: {name!r} is not one of {', '.join(names)}")

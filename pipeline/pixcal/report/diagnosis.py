@@ -4,17 +4,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from pixcal.report import diagnosis_words as words
 from pixcal.report.contents import DiagnosisContents
-from pixcal.report.diagnosis_words import (
-    DETECTOR,
-    considered,
-    effect_title,
-    listed,
-    percent,
-    place,
-    with_interval,
-    worst,
-)
 from pixcal.report.tables import Table, is_table
 from pixcal.report.text import (
     chance,
@@ -42,10 +33,10 @@ def causes(result: DiagnosisContents) -> Table:
     """What each cause closes."""
     rows = []
     for rank, cause in enumerate(result.facts["causes"], 1):
-        title = f"{rank}. {effect_title(result, cause['effect'])}"
-        alone = with_interval(cause["gap_closed"], cause["gap_closed_interval"])
-        alike = listed(cause["not_told_apart_from"] or ["–"], "or")
-        unique = percent(cause["gain_over_rest"])
+        title = f"{rank}. {words.effect_title(result, cause['effect'])}"
+        alone = words.with_interval(cause["gap_closed"], cause["gap_closed_interval"])
+        alike = words.listed(cause["not_told_apart_from"] or ["–"], "or")
+        unique = words.percent(cause["gain_over_rest"])
         rows.append([title, alone, unique, chance(cause["p_value"]), alike])
     header = ["cause", "gap closed", "unique share", "p-value", "indistinguishable from"]
     return Table("Causes", header, rows)
@@ -61,13 +52,13 @@ def about_cause(cause: Facts) -> str:
     if law := cause.get("law"):
         sentences.append(f"Law: {law}.")
     if (by_law := share_by_law(cause)) is not None:
-        sentences.append(f"The law alone closes {percent(by_law)} of the gap.")
+        sentences.append(f"The law alone closes {words.percent(by_law)} of the gap.")
     return " ".join(filter(None, sentences))
 
 
 def titles(result: DiagnosisContents, names: Sequence[str]) -> list[str]:
     """Titles of effects."""
-    return [effect_title(result, name) for name in names]
+    return [words.effect_title(result, name) for name in names]
 
 
 def evidence(result: DiagnosisContents, cause: Facts) -> list[Facts]:
@@ -192,16 +183,16 @@ def statistics(title: str, curves: Sequence[Facts], causes: Any) -> Table:
 
 
 def _row(curve: Facts, causes: bool) -> list[str]:
-    at = worst(curve)
+    at = words.worst(curve)
     measured, nominal = curve["measured"][at], curve["nominal"]["value"][at]
-    of = "" if curve["set"] == DETECTOR else f"set {curve['set']}: "
+    of = "" if curve["set"] == words.DETECTOR else f"set {curve['set']}: "
     digits = digits_apart(measured, nominal)
     value = f"{number(measured, digits)} {unit(curve['unit'])}".strip()
     title = curve["title"] if curve["unit"] else f"{curve['title']} ({curve['quantity']})"
-    row = [curve["domain"], title, of + place(curve, at), value]
+    row = [curve["domain"], title, of + words.place(curve, at), value]
     row += [number(nominal, digits), times(curve["size"]), f"{curve['significance']:.1f}"]
     if causes:
-        left = percent(curve["left"]) if curve["in_gap"] else "new"
+        left = words.percent(curve["left"]) if curve["in_gap"] else "new"
         after = number(curve["with_effects"]["value"][at], digits)
         row += [after, f"{curve['significance_after']:.1f}", left]
     return row
@@ -233,8 +224,8 @@ def absolute(facts: Facts) -> Table:
 def by_domain(gap: Facts) -> str:
     """', 2 % in space and 1 % in noise': the residual gap by domain."""
     left = sorted(gap.get("domains", {}).items(), key=lambda d: -d[1][1])
-    parts = [f"{percent(after)} in {domain}" for domain, (_, after) in left if after >= 5e-4]
-    return f", {listed(parts)}" if parts else ""
+    parts = [f"{words.percent(after)} in {domain}" for domain, (_, after) in left if after >= 5e-4]
+    return f", {words.listed(parts)}" if parts else ""
 
 
 # Candidates and frames
@@ -243,12 +234,12 @@ def by_domain(gap: Facts) -> str:
 def rejected(result: DiagnosisContents) -> Table:
     """Rejected candidates, the most likely first."""
     causes = {c["effect"] for c in result.facts["causes"]}
-    tried = [c for c in considered(result.facts) if c["effect"] not in causes]
+    tried = [c for c in words.considered(result.facts) if c["effect"] not in causes]
     rows = []
     for c in sorted(tried, key=lambda c: (-c["gap_closed"], -(c.get("sigmas") or 0.0))):
         size = _sigma(c["sigmas"]) if "sigmas" in c else "–"
-        closed = percent(c["gap_closed"]) if c.get("tried_on_unseen_frames") else "–"
-        rows.append([effect_title(result, c["effect"]), size, closed, c["rejected_because"]])
+        closed = words.percent(c["gap_closed"]) if c.get("tried_on_unseen_frames") else "–"
+        rows.append([words.effect_title(result, c["effect"]), size, closed, c["rejected_because"]])
     return Table("Rejected effects", ["effect", "significance (σ)", "gap closed", "reason"], rows)
 
 

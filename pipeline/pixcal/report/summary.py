@@ -5,18 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pixcal.report import findings
 from pixcal.report.contents import Contents, DiagnosisContents, SetContents
 from pixcal.report.diagnosis_words import level, residual_gap
-from pixcal.report.findings import (
-    BAD,
-    CHECK,
-    GOOD,
-    SEVERITY,
-    bound_level,
-    over_bound,
-    severity,
-    slope_is_white,
-)
 from pixcal.report.text import NAMES, NO_OFFSETS, number, share, unit, with_error
 
 _OFF = 0.05  # relative difference of a measured value from the declared one that is shown at once
@@ -84,7 +75,7 @@ def cards(contents: Contents) -> Iterator[Card]:
             f"median σ of {NAMES[offset.name]}, as fitted",
             f"{number(sigma, 3)} px",
             f"{number(sigma * contents.pitch_um * 1e3, 3)} nm; rms of the offsets: {spread} px",
-            GOOD if np.isfinite(sigma) else BAD,
+            findings.GOOD if np.isfinite(sigma) else findings.BAD,
         )
     if contents.sets:
         yield _bound_card(contents.sets)
@@ -113,7 +104,7 @@ def _detector_cards(facts: dict[str, Any]) -> Iterator[Card]:
         if key in figures:
             f = figures[key]
             value = f"{with_error(f['value'], f['error'])} {unit(f['unit'])}"
-            yield Card(f["title"], value, unit(f["note"]), GOOD)
+            yield Card(f["title"], value, unit(f["note"]), findings.GOOD)
 
 
 def _diagnosis_card(diagnosis: DiagnosisContents) -> Card:
@@ -129,31 +120,33 @@ def _diagnosis_card(diagnosis: DiagnosisContents) -> Card:
 
 
 def _bound_card(sets: Sequence[SetContents]) -> Card:
-    ratios = [over_bound(s.facts) for s in sets]
+    ratios = [findings.over_bound(s.facts) for s in sets]
     return Card(
         "σ / Cramér–Rao bound",
         ", ".join(number(value, 4) for value in ratios),
         f"{', '.join(s.name for s in sets)}; 1 is the limit for any unbiased estimate",
-        max(map(bound_level, ratios), key=SEVERITY.index),
+        max(map(findings.bound_level, ratios), key=findings.SEVERITY.index),
     )
 
 
 def _allan_card(slopes: Mapping[str, Mapping[str, Any]]) -> Card:
     knees = {name: s["knee_frames"] for name, s in slopes.items() if s.get("knee_frames")}
     at = ", ".join(f"knee of {name} at {number(round(k))} frames" for name, k in knees.items())
-    white = all(slope_is_white(s) for s in slopes.values())
+    white = all(findings.slope_is_white(s) for s in slopes.values())
     return Card(
         "Allan slope",
         ", ".join(with_error(s["slope"], s.get("slope_err")) for s in slopes.values()),
         f"{', '.join(slopes)}; white noise: −0.5; {at or 'no knee'}",
-        GOOD if white and not knees else CHECK,
+        findings.GOOD if white and not knees else findings.CHECK,
     )
 
 
 def _mask_card(contents: Contents) -> Card:
     flags = contents.flags or contents.detector.flags
     if flags is None:
-        return Card("masked pixels", "–", "not measured", CHECK)
+        return Card("masked pixels", "–", "not measured", findings.CHECK)
     whole = flags.shape[0] * flags.shape[1]
     shown, part = f"{number(flags.masked)} of {number(whole)}", flags.masked / whole
-    return Card("masked pixels", share(flags.masked, whole), shown, severity(part, 0.01, 0.1))
+    return Card(
+        "masked pixels", share(flags.masked, whole), shown, findings.severity(part, 0.01, 0.1)
+    )

@@ -11,12 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.estimators.fringe_fit.combine import (
-    axes_span_plane,
-    combine_parallel,
-    combine_sets,
-    weighted_mean,
-)
+from pixcal.estimators.fringe_fit import combine
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.estimators.fringe_fit.shapes import FringeShape
 from pixcal.model.arrays import F64
@@ -59,7 +54,7 @@ class ComparedSet:
         delta, sigma = (
             r.read((0, r.shape[0]), *tile)[list(self.batches)].astype(float) for r in readers
         )
-        return weighted_mean(delta, sigma)[:2]
+        return combine.weighted_mean(delta, sigma)[:2]
 
     def modes(self, tile: Tile) -> F64:
         """Modes that the fit removed from the set's map, (mode, y, x), px up to a factor."""
@@ -96,7 +91,7 @@ class Side:
     @property
     def both(self) -> bool:
         """Whether it measures both components."""
-        return axes_span_plane(self.axes)
+        return combine.axes_span_plane(self.axes)
 
     def sets_along(self, direction: Vector) -> list[ComparedSet]:
         """The sets whose modes contribute along a direction."""
@@ -124,11 +119,11 @@ class Side:
             unit = np.zeros_like(sigma)
             unit[n] = 1.0
             if self.both:
-                shares[n] = np.tensordot(direction, combine_sets(axes, unit, sigma)[0], 1)
+                shares[n] = np.tensordot(direction, combine.combine_sets(axes, unit, sigma)[0], 1)
             else:
                 # The mean of parallel sets has the sign of the first.
                 sign = np.sign(np.dot(axes[0], direction))
-                shares[n] = sign * combine_parallel(axes, unit, sigma)[0]
+                shares[n] = sign * combine.combine_parallel(axes, unit, sigma)[0]
         return shares
 
 

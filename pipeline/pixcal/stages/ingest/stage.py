@@ -19,13 +19,8 @@ from pixcal.model.acquisition import Acquisition, load_acquisition
 from pixcal.model.config import to_plain
 from pixcal.model.errors import DamagedError, InputError, RemoteError
 from pixcal.model.options import Ingest as Config
+from pixcal.stages.ingest import frames_to_leave_out
 from pixcal.stages.ingest.arrays import find_kept, take_over
-from pixcal.stages.ingest.frames_to_leave_out import (
-    cut_from,
-    cut_warning,
-    repeat_warning,
-    repeats_of,
-)
 from pixcal.stages.ingest.headers import check_headers
 from pixcal.stages.ingest.reading import files_of, read_frames, writers_of
 from pixcal.storage import frame_decoding
@@ -158,10 +153,10 @@ def _close(
     for array, frames in tables.items():
         bands = frame_decoding.by_fact(ArrayReader(made.folder / "catalogue.zarr" / array).read())
         largest = np.fmax.reduce(bands["largest"], axis=1)
-        cut = cut_from(array, bands, frames[0].file.shape[1])
-        repeats = repeats_of(bands)
-        warnings += cut_warning(array, frames, cut, bands)
-        warnings += repeat_warning(array, frames, repeats)
+        cut = frames_to_leave_out.cut_from(array, bands, frames[0].file.shape[1])
+        repeats = frames_to_leave_out.repeats_of(bands)
+        warnings += frames_to_leave_out.cut_warning(array, frames, cut, bands)
+        warnings += frames_to_leave_out.repeat_warning(array, frames, repeats)
         listed[array] = columns(frames) | {
             "largest_adu": [float(v) if np.isfinite(v) else None for v in largest],
             "cut_from_row": cut,
