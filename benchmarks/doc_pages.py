@@ -44,6 +44,7 @@ SEE = {
     "pixcal run": "Tutorial: [From FITS to maps](../tutorials/first-maps.md).",
     "pixcal ingest": "How to: [Your own camera](../how-to/own-camera.md). Keys of "
     "`acquisition.yaml`: [Input files](files.md).",
+    "pixcal electrons": "How to: [A detector without fringes](../how-to/detector.md).",
     "pixcal fit": "What it computes: [Mathematics](../explanation/mathematics.md).",
     "pixcal diagnose": "How to: [Diagnose a bench](../how-to/diagnose.md).",
     "pixcal astrometry": "How to: [Star centroids](../how-to/astrometry.md).",

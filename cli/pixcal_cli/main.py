@@ -46,6 +46,7 @@ class InOrder(click.Group):
         steps.astrometry,
         steps.centroids,
         steps.wcs,
+        steps.electrons,
         steps.report,
         compare,
         steps.simulate,

@@ -167,6 +167,28 @@ def wcs(run: Path, config: options.Wcs) -> None:
     click.echo(f"{config.out}: written")
 
 
+@command(
+    options.Electrons,
+    "pixcal electrons demo night/*.fits --out reduced",
+    arguments=(
+        run_argument,
+        click.argument("files", metavar="FILES...", nargs=-1, required=True, type=PATH),
+    ),
+    tasks=False,
+)
+def electrons(run: Path, files: tuple[Path, ...], config: options.Electrons) -> None:
+    """The frames of FILES."""
+    from pixcal.stages import electrons as stage  # here: for a fast `pixcal --help`
+
+    written = stage.run(run, files, config)
+    count = len(written.files)
+    click.echo(f"{config.out}: {count} frame{'s' * (count > 1)} in electrons")
+    if written.removed:
+        click.echo(f"  removed: {', '.join(written.removed)}")
+    if written.left:
+        click.echo(f"  note: single frames cannot be corrected for {', '.join(written.left)}")
+
+
 report = step(options.Report, "pixcal report demo")
 
 

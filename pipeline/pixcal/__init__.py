@@ -19,6 +19,7 @@ _HOMES = {
         *("run", "ingest", "reduce", "fit", "allan", "crests", "diagnose", "astrometry"),
         *("write_report", "compare", "simulate", "budget"),
     ),
+    "api.electrons": ("to_electrons",),
     "api.offset_map": ("OffsetMap", "Picture"),
     "api.opened": ("FringeSet", "Run", "open_run"),
     "api.sample": ("sample_acquisition",),

@@ -10,6 +10,7 @@ import pixcal.engine.run
 from pixcal.api.arrays import calibrate as calibrate
 from pixcal.api.centroids import correct_centroids as correct_centroids
 from pixcal.api.centroids import distortion_wcs as distortion_wcs
+from pixcal.api.electrons import to_electrons as to_electrons
 from pixcal.api.offset_map import OffsetMap as OffsetMap
 from pixcal.api.offset_map import Picture as Picture
 from pixcal.api.opened import FringeSet as FringeSet
@@ -48,6 +49,7 @@ __all__ = [
     "run",
     "sample_acquisition",
     "simulate",
+    "to_electrons",
     "write_report",
 ]
 

@@ -108,6 +108,7 @@ def test_every_command_is_a_function() -> None:
     stages = {name for name, one in cli.commands.items() if not isinstance(one, click.Group)}
     # A noun is no name for a function.
     names = {"report": "write_report", "centroids": "correct_centroids", "wcs": "distortion_wcs"}
+    names |= {"electrons": "to_electrons"}
     assert {names.get(stage, stage) for stage in stages} <= set(PUBLIC)
 
 

@@ -42,6 +42,7 @@ COMMANDS = [
     "astrometry",
     "centroids",
     "wcs",
+    "electrons",
     "report",
     "compare",
     "simulate",

@@ -55,7 +55,7 @@ class Nonlinearity(Effect):
     domains = ("intensity",)
     strengths = ("quadratic", "cubic", "bends")
     frames_needed = ("ladder",)
-    remedy = "the signal can be linearised with this curve (parameters in diagnosis.json)"
+    remedy = "'pixcal electrons' straightens the response of other frames with this curve"
     quick = False
     sources = (
         "Rousset et al., table 1: 2 % linearity error of the GIGAPYX-4600",

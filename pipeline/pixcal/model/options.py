@@ -321,6 +321,24 @@ class Wcs:
 
 
 @dataclass(frozen=True)
+class Electrons:
+    """Convert other frames to electrons with the detector of RUN.
+
+    Bias, dark signal and flat are removed from each frame of FILES, and with them the effects of
+    the diagnosis that change single samples, such as a nonlinear response. FILES are FITS, TIFF or
+    PNG of the same window. Each frame is written as FITS with its errors and mask, which CCDData of
+    astropy reads.
+    """
+
+    out: Path = quantity(metavar="DIR", doc="Directory of the written frames.")
+    exptime_s: float | None = quantity(
+        None, unit="s", low=0, metavar="S", shown="EXPTIME of each file", doc="Exposure time, s."
+    )
+    own: tuple[Path, ...] = as_in(Fit, "own")
+    overwrite: bool = quantity(False, doc="Replace files of DIR.")
+
+
+@dataclass(frozen=True)
 class Compare:
     """Compare maps of the same pixels, scale by scale.
 

@@ -11,6 +11,7 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.storage.manifest import MANIFEST, read_json
+from pixcal.storage.stage import require
 
 # the shape of fringes (`pixcal.estimators.fringe_fit.shapes`) beside straight ones
 HYPERBOLIC = "hyperbolic"
@@ -118,6 +119,21 @@ def treatments(
             Treatment(effect, origin, errors, *treatment_of_kind(type(effect), model, models))
         )
     return Treatments(tuple(effects))
+
+
+def treatments_of(
+    run_dir: Path, model: str, models: Mapping[str, str], own: Sequence[Path]
+) -> Treatments:
+    """`treatments` of the diagnosis of a run; InputError if its frames were reduced anew since."""
+    diagnosed = require(run_dir, "diagnose")
+    if diagnosed.inputs["reduce"] != require(run_dir, "reduce").key:
+        raise InputError(
+            f"{run_dir / 'diagnose'}: made from frames that were reduced differently; run "
+            f"'pixcal diagnose {run_dir}' again"
+        )
+    causes = read_json(run_dir / "diagnose" / "diagnosis.json")["causes"]
+    nominal = diagnosed.config["nominal"]
+    return treatments(causes, nominal, model, models, own, run_dir / "diagnose")
 
 
 def fitted_shapes(run_dir: Path) -> tuple[str, Mapping[str, str]]:

@@ -13,7 +13,6 @@ import numpy as np
 from pixcal.estimators.detector.straightness import LAMP, RATES
 from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack, cached_on_evidence
-from pixcal.kernels.medians import robust_sigma
 from pixcal.kernels.sample_sums import frame_means
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
@@ -24,10 +23,11 @@ OFF = 8.0  # typical distances from the curve beyond which a level has another l
 DISAGREE = 4.0  # errors between the curvature of levels and of their noise
 
 # least degrees of freedom of the flicker for first frames to measure lag: six pairs
-FLICKER_KNOWN = 2.0
+FLICKER_KNOWN = 5.0
 
-# efficiency of a median absolute deviation relative to a standard deviation
-_OF_MEDIAN = 0.37
+# of Student's distribution whose scale is fitted to changes of the light; the rms of normal values
+# over that scale, and the efficiency relative to a standard deviation (of 7 to 40 values)
+_STUDENT, _OVER_SCALE, _EFFICIENCY = 4.0, 1.202, 0.86
 _WITH_BEFORE = 4  # pairs above which the effect of the frames before them is fitted
 _WITH_OFFSET, _WITH_CUBIC = 5, 6  # fewest levels for these terms
 _TURNS = 30
@@ -129,10 +129,19 @@ def flicker(evidence: Evidence) -> tuple[float, float]:
     every = np.concatenate([steps, pairs if len(pairs) > 2 else []])
     if not len(every):
         return 0.0, 1.0
-    # The median absolute deviation of few values is biased low (Croux and Rousseeuw 1992).
-    few = len(every) / max(len(every) - 0.8, 0.7)
-    spread = few * robust_sigma(every) / float(np.sqrt(2))
-    return spread, max(_OF_MEDIAN * len(every), 1.0)
+    return _rms(every) / float(np.sqrt(2)), max(_EFFICIENCY * len(every), 1.0)
+
+
+def _rms(values: F64) -> float:
+    """Rms without outliers: the most likely scale of Student's distribution."""
+    # A median absolute deviation would have half the degrees of freedom: of seven values it is
+    # wrong by a factor of three in one case of a hundred.
+    square = float(np.mean(values**2))
+    for _ in range(_TURNS):
+        if square > 0:
+            weights = (_STUDENT + 1) / (_STUDENT + values**2 / square)
+            square = float(np.mean(weights * values**2))
+    return _OVER_SCALE * float(np.sqrt(square / (1 + 0.6 / len(values))))
 
 
 def straight_line(times: F64, levels: F64, at: F64) -> F64:

@@ -42,7 +42,7 @@ from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.tiles import Part
-from pixcal.stages.treatment import HYPERBOLIC, SUFFIX, Treatment, Treatments, treatments
+from pixcal.stages.treatment import HYPERBOLIC, SUFFIX, Treatment, Treatments, treatments_of
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import create_group
 from pixcal.storage.formats import STAGES
@@ -57,20 +57,9 @@ SAMPLES = 5_000_000  # samples of each fringe set in memory at a time
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Fit a run, and again with the effects of its diagnosis corrected: ``RUN/corrected``."""
     diagnosed = require(run_dir, "diagnose")
-    if diagnosed.inputs["reduce"] != require(run_dir, "reduce").key:
-        raise InputError(
-            f"{run_dir / 'diagnose'}: made from frames that were reduced differently; run "
-            f"'pixcal diagnose {run_dir}' again"
-        )
     fitted = fit.run(run_dir, config, runtime)
-    plan = treatments(
-        read_json(run_dir / "diagnose" / "diagnosis.json")["causes"],
-        diagnosed.config["nominal"],
-        config.model,
-        {name: facts["model"] for name, facts in fitted.summary["sets"].items()},
-        config.own,
-        run_dir / "diagnose",
-    )
+    models = {name: facts["model"] for name, facts in fitted.summary["sets"].items()}
+    plan = treatments_of(run_dir, config.model, models, config.own)
     plain: Json = {
         "own": [hashlib.sha256(path.read_bytes()).hexdigest() for path in config.own],
         "effects": [t.plain for t in plan.every],

@@ -5,7 +5,7 @@ The same stages reduce and fit the data and every simulation.
 """
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -95,12 +95,14 @@ def _kinds(config: Config, known: Mapping[str, type[Effect]]) -> dict[str, type[
 
 
 def on_map(
-    effect: Effect, fits: Iterable[FittedSet], shapes: tuple[str, Mapping[str, str]]
+    effect: Effect, fits: Sequence[FittedSet], shapes: tuple[str, Mapping[str, str]]
 ) -> dict[str, Any]:
     """Rms and maximum (px) change of the offsets by undoing an effect, and the treatment."""
     # On maps of every set and window, modes removed; zero if free parameters absorb it.
     treated = treatment_of_kind(type(effect), *shapes)
     action = Treatment(effect, "diagnosis", {}, *treated).action
+    if not fits and action == "corrected":
+        action = "unaffected"  # without fringes there are no maps
     square, count, most = 0.0, 0, 0.0
     for fit in fits if action != "unaffected" else ():
         change = _change(effect, fit)

@@ -7,6 +7,7 @@ from pixcal.stages.tiles import Part
 
 SIDE = 128  # side (pixels) of a window on a large detector: the width of a chunk of the cube
 LARGEST = 288  # most rows or columns of a detector used whole; beyond, windows do not overlap
+WHOLE = 2  # times the samples of a window that a detector without fringes is used whole
 APART = 4  # least size of a detector, in window sides, for windows aligned to chunks
 
 
@@ -17,7 +18,7 @@ def chosen_windows(shape: tuple[int, int], frames: int = 0) -> tuple[Part, tuple
     four other places (two if one side is short). Without fringes, ``frames``, the number in each
     half, sets the size: the fewer frames, the more pixels.
     """
-    if max(shape) <= LARGEST or 0 < frames * math.prod(shape) <= SAMPLES:
+    if max(shape) <= LARGEST or 0 < frames * math.prod(shape) <= WHOLE * SAMPLES:
         return whole_of(shape), (whole_of(shape),)
     widest = math.isqrt(SAMPLES // frames) if frames else SIDE
     on_chunks = widest <= SIDE
