@@ -10,6 +10,7 @@ import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from inspect import signature
 from typing import Any, Self
 
 import numpy as np
@@ -66,18 +67,19 @@ def statistic(
     unit: str = "",
     x: str = "",
     power: bool = False,
-    sets: bool = True,
-    together: bool = False,
     floor: float = 0.0,
 ) -> Callable[[Callable[[Any], Curve | None]], Statistic]:
-    """Mark a function as a statistic; its name becomes that of the statistic."""
+    """Mark a function of `FringeSetData`, those of all sets, or `Evidence` as a statistic."""
 
     def mark(measure: Callable[[Any], Curve | None]) -> Statistic:
-        kind = "power" if power else "linear"
-        of_set = sets and not together
-        name = getattr(measure, "__name__", "")
+        *_, data = signature(measure).parameters.values()
+        of_set, of_all = (
+            data.annotation is FringeSetData,
+            data.annotation == Sequence[FringeSetData],
+        )
+        name, kind = getattr(measure, "__name__", ""), "power" if power else "linear"
         return Statistic(
-            name, title, domain, quantity, unit, x, kind, of_set, together, floor, measure
+            name, title, domain, quantity, unit, x, kind, of_set, of_all, floor, measure
         )
 
     return mark

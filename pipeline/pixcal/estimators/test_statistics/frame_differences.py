@@ -93,9 +93,7 @@ def _repeats(rest: F32, good: Mask, axis: int) -> F64:
     return np.array([float((means[:, n:] * means[:, :-n]).mean()) for n in REPEATS])
 
 
-@of_noise(
-    "correlation of neighbours in flats, bright minus dim", "correlation", x="neighbour", sets=False
-)
+@of_noise("correlation of neighbours in flats, bright minus dim", "correlation", x="neighbour")
 def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
     """Correlation in the brighter half of the levels minus that in the other half."""
     stacks = repeated(evidence, "flat")
@@ -116,7 +114,6 @@ def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
     "noise / expected noise",
     x="band, then two rows, two columns",
     power=True,
-    sets=False,
 )
 def bias_change(evidence: Evidence) -> Curve | None:
     """Power of the change from the first to the second half of the frames, over that of noise."""
@@ -146,7 +143,6 @@ NEIGHBOURS = tuple((f"{kind}_{own[0]}", kind, *own) for own in RANGES for (kind,
 
 @family(
     "{0}", NEIGHBOURS, "noise", "correlation of {3} in {1} frames", "correlation", x="{4}",
-    sets=False,
 )  # fmt: skip
 def neighbours(of: str, evidence: Evidence) -> Curve | None:
     """Correlation in the differences of two frames of a kind."""
@@ -162,7 +158,6 @@ def neighbours(of: str, evidence: Evidence) -> Curve | None:
     "correlated row and column noise in {0} frames",
     "correlation",
     x="distance: rows, then columns",
-    sets=False,
 )
 def line_repeats(kind: str, evidence: Evidence) -> Curve | None:
     """Correlation of the means of lines some lines apart."""

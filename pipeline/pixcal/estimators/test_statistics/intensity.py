@@ -46,10 +46,7 @@ def residual_by_level(data: FringeSetData) -> Curve:
 
 
 @of_intensity_power(
-    "photon transfer: variance of flats against signal",
-    "noise / expected noise",
-    x="flat",
-    sets=False,
+    "photon transfer: variance of flats against signal", "noise / expected noise", x="flat"
 )
 def photon_transfer(evidence: Evidence) -> Curve:
     """Variance of differences of flats over that of shot and read noise, for each level."""
@@ -76,7 +73,6 @@ def _noise_of_flats(evidence: Evidence) -> F64:
     "photon transfer: shape of variance against signal",
     "noise / expected noise, over its mean",
     x="flat",
-    sets=False,
 )
 def photon_transfer_shape(evidence: Evidence) -> Curve | None:
     """The same over its mean: the curvature of the noise is known better than the gain."""
@@ -90,7 +86,6 @@ def photon_transfer_shape(evidence: Evidence) -> Curve | None:
     "linearity: deviation of the flats from a line over exposure time",
     "relative deviation",
     x="exposure time of flats",
-    sets=False,
 )
 def flat_ladder(evidence: Evidence) -> Curve | None:
     """Departure of each level of one lamp from the line over exposure time."""

@@ -152,7 +152,6 @@ def outliers(data: FringeSetData) -> Curve:
     "outliers",
     x="sigma, low then high",
     unit="(2 √count)",
-    sets=False,
     floor=1.0,
 )
 def dark_outliers(evidence: Evidence) -> Curve | None:
@@ -184,10 +183,7 @@ def pixel_peakedness(data: FringeSetData) -> Curve:
 
 
 @of_noise_power(
-    "read noise distribution of the pixels (bias frames)",
-    "noise / expected noise",
-    x="quantile",
-    sets=False,
+    "read noise distribution of the pixels (bias frames)", "noise / expected noise", x="quantile"
 )
 def read_noise(evidence: Evidence) -> Curve | None:
     """Quantiles over the pixels of variance over squared read noise, without particle hits."""
@@ -234,10 +230,7 @@ def ranges_about(values: F64, quantiles: Sequence[float]) -> F64:
 
 
 @of_noise(
-    "neighbours of hot pixels",
-    "dark current / that of hot pixel",
-    x="left, right, above, below",
-    sets=False,
+    "neighbours of hot pixels", "dark current / that of hot pixel", x="left, right, above, below"
 )
 def hot_neighbours(evidence: Evidence) -> Curve | None:
     """Dark current beside hot pixels over theirs."""
@@ -266,7 +259,6 @@ def hot_neighbours(evidence: Evidence) -> Curve | None:
     "noise / white noise",
     x=LINES,
     power=True,
-    sets=False,
 )
 def lines_of_stacks(kind: str, evidence: Evidence) -> Curve | None:
     """Of frames without light."""

@@ -76,7 +76,6 @@ def tone(data: FringeSetData) -> Curve:
     unit="σ",
     x="cycles a pixel",
     floor=FLOOR,
-    sets=False,
 )
 def tones(kind: str, evidence: Evidence) -> Curve | None:
     """Of the differences of two frames."""
@@ -97,7 +96,6 @@ def smooth_patterns(data: FringeSetData) -> Curve:
     "time",
     "smooth patterns that vary over {0} frames",
     "strongest / noise of one frame",
-    sets=False,
 )
 def smooth_patterns_of(kind: str, evidence: Evidence) -> Curve | None:
     """The same of the differences of two frames."""

@@ -25,12 +25,7 @@ of_space = partial(statistic, "space")
 of_space_power = partial(statistic, "space", power=True)
 
 
-@of_space(
-    "correlation of maps between sets",
-    "correlation",
-    x="contrast, light of each pair",
-    together=True,
-)
+@of_space("correlation of maps between sets", "correlation", x="contrast, light of each pair")
 def alike(sets: Sequence[FringeSetData]) -> Curve:
     """Correlation of the maps of each pair of sets."""
     values = [
@@ -46,9 +41,7 @@ def _correlation(one: F64, other: F64) -> float:
     return float(np.corrcoef(one[good], other[good])[0, 1])
 
 
-@of_space_power(
-    "difference of offsets between sets", "rms difference", unit="px", x="pair", together=True
-)
+@of_space_power("difference of offsets between sets", "rms difference", unit="px", x="pair")
 def apart(sets: Sequence[FringeSetData]) -> Curve:
     """Mean square of the difference of the offsets along one axis, by two baselines."""
     values = []

@@ -129,11 +129,7 @@ def allan_of_batches(data: FringeSetData) -> Curve | None:
     return Curve(np.array([1.0, 2.0, 4.0]), np.array(out))
 
 
-@of_time(
-    "first flat of each exposure time relative to the following ones",
-    "relative intensity",
-    sets=False,
-)
+@of_time("first flat of each exposure time relative to the following ones", "relative intensity")
 def first_flats(evidence: Evidence) -> Curve | None:
     """Relative change: mean over the levels, and slope against the rise from the frame before."""
     # Lamp flicker changes each level independently. Lag changes the first frame by a share of the
@@ -172,7 +168,6 @@ def series_of_frames(name: str, data: FringeSetData) -> Curve:
     unit="{2}",
     x="bin of frequency",
     power=True,
-    sets=False,
 )
 def means_of_frames(kind: str, evidence: Evidence) -> Curve | None:
     """Mean squares of the means of calibration frames; of flats, over their light."""
@@ -195,7 +190,6 @@ def means_of_frames(kind: str, evidence: Evidence) -> Curve | None:
     "change of level",
     unit="e-",
     x="exposure time without light",
-    sets=False,
 )
 def bias_trend(evidence: Evidence) -> Curve:
     """Slope of the mean of bias and dark frames over their run, last less first."""
