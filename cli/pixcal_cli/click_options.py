@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import click
 
+from pixcal.model.config import meanings
 from pixcal.model.options import Region, Running
 
 Command = Callable[..., Any]
@@ -86,6 +87,7 @@ class Finite(click.FloatRange):
 def config_options(kind: type, name: str = "config") -> Callable[[Command], Command]:
     """Add the options of a dataclass; the command receives an instance of it."""
     hints = get_type_hints(kind)
+    words = meanings(kind)
     offered = [f for f in fields(kind) if not f.metadata.get("python_only")]
 
     def decorate(command: Command) -> Command:
@@ -96,13 +98,13 @@ def config_options(kind: type, name: str = "config") -> Callable[[Command], Comm
 
         wrapped: Command = with_config
         for field in reversed(offered):
-            wrapped = _option(field, hints[field.name])(wrapped)
+            wrapped = _option(field, hints[field.name], words[field.name])(wrapped)
         return wrapped
 
     return decorate
 
 
-def _option(field: Field[Any], hint: Any) -> Callable[[Command], Command]:
+def _option(field: Field[Any], hint: Any, meaning: str) -> Callable[[Command], Command]:
     meta, default = field.metadata, field.default
     flag = meta.get("flag")
     unit = meta["unit"].rstrip("-")
@@ -127,7 +129,7 @@ def _option(field: Field[Any], hint: Any) -> Callable[[Command], Command]:
         default=None if default is MISSING or multiple else default,
         show_default=shown or shows_default,
         metavar=meta.get("metavar", number),
-        help=meta["doc"],
+        help=meaning,
     )
 
 

@@ -269,11 +269,12 @@ def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
         assert str(caught.value).startswith(f"{file}: ")
 
 
-def test_what_a_field_means_stands_in_doc_or_below_it_and_is_inherited() -> None:
-    @dataclass(frozen=True)
-    class Heavy(Part):
-        colour: str = quantity("red")
-        number: int = quantity(0, doc="of the batch")
+@dataclass(frozen=True)
+class Heavy(Part):
+    colour: str = quantity("red")
+    number: int = quantity(0, doc="of the batch")
 
+
+def test_what_a_field_means_stands_in_doc_or_below_it_and_is_inherited() -> None:
     words = {"name": "free text", "weight_kg": "with its packaging", "number": "of the batch"}
     assert meanings(Heavy) == {**words, "colour": ""}

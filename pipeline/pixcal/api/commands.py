@@ -21,7 +21,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 from pixcal.api.opened import Run, open_run
 from pixcal.engine.run import Runtime
 from pixcal.model import options as of
-from pixcal.model.config import StrPath, parse
+from pixcal.model.config import StrPath, meanings, parse
 from pixcal.storage.manifest import read_json
 
 Json = dict[str, Any]
@@ -101,6 +101,7 @@ def function_of(
     name = name or kind.__name__.lower()
     declared, hints = inspect.signature(body), get_type_hints(kind)
     options, names = {f.name: f for f in fields(kind)}, list(declared.parameters)
+    meaning = meanings(kind)
     before, after = names[: names.index("options")], names[names.index("options") + 1 :]
 
     def keyword(name: str, hint: Any, default: Any = None) -> Parameter:
@@ -121,7 +122,7 @@ def function_of(
 
     lines = [inspect.getdoc(kind) or "", "", "Parameters", "----------"]
     for n, parameter in signature.parameters.items():
-        described = f"{_words(parameter)}\n    {options[n].metadata['doc']}" if n in options else ""
+        described = f"{_words(parameter)}\n    {meaning[n]}" if n in options else ""
         lines.append(f"{n} : {described or _ARGUMENTS[n][1]}")
     lines += ["", "Returns", "-------", returns] if returns else []
     lines += ["", "Raises", "------", "InputError", f"    If {fails}."]

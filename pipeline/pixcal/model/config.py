@@ -6,13 +6,12 @@ them with `quantity`. Its class variable ``moved`` gives the replacement of keys
 """
 
 import ast
-import contextlib
 import dataclasses
 import difflib
-import inspect
+import functools
 import math
 import re
-import textwrap
+import sys
 import types
 import typing
 from itertools import pairwise
@@ -57,22 +56,31 @@ def quantity(
 def meanings(kind: type) -> dict[str, str]:
     """What each field means: its ``doc``, or else the string below it in the source."""
     words: dict[str, str] = {}
-    for parent in filter(dataclasses.is_dataclass, reversed(kind.__mro__)):
-        with contextlib.suppress(OSError, TypeError):  # without source
-            declared: Any = ast.parse(textwrap.dedent(inspect.getsource(parent))).body[0]
-            for pair in pairwise(declared.body):
-                match pair:
-                    case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
-                        words[name] = " ".join(text.split())
-    return {
-        f.name: f.metadata.get("doc") or words.get(f.name, "") for f in dataclasses.fields(kind)
-    }
+    for parent in reversed(kind.__mro__):
+        file = getattr(sys.modules.get(parent.__module__), "__file__", None)
+        words |= _strings_below(file).get(parent.__qualname__, {}) if file else {}
+    fields = dataclasses.fields(kind)
+    return {f.name: f.metadata.get("doc") or words.get(f.name, "") for f in fields}
+
+
+@functools.cache
+def _strings_below(file: str) -> dict[str, dict[str, str]]:
+    """The string below each field, by class and field, of a source file."""
+    words: dict[str, dict[str, str]] = {}
+    statements = ast.parse(Path(file).read_bytes()).body
+    for declared in (one for one in statements if isinstance(one, ast.ClassDef)):
+        for pair in pairwise(declared.body):
+            match pair:
+                case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                    words.setdefault(declared.name, {})[name] = " ".join(text.split())
+    return words
 
 
 def as_in(kind: type, name: str, **changes: Any) -> Any:
     """Declare a field as in another class, with changes of the arguments of `quantity`."""
     (field,) = (f for f in dataclasses.fields(kind) if f.name == name)
-    return quantity(**{"default": field.default, **field.metadata, **changes})
+    meaning = {"doc": meanings(kind)[name]}
+    return quantity(**{"default": field.default, **field.metadata, **meaning, **changes})
 
 
 @dataclasses.dataclass(frozen=True)

@@ -41,22 +41,14 @@ def _own(doc: str, *, in_key: bool = True) -> Any:
 class Running:
     """How a command runs; no result depends on it."""
 
-    cluster: str = quantity(
-        "threads",
-        metavar="threads|processes|sync|tcp://…",
-        doc="Run tasks here, or on the Dask cluster at this address.",
-    )
-    workers: int = quantity(
-        0, low=0, high=4096, shown="all cores", doc="Parallel tasks; 0 is one per core."
-    )
-    memory: int = quantity(
-        2 << 30,
-        unit="bytes",
-        metavar="SIZE",
-        shown="2GiB",
-        doc="Memory limit; work that needs more is refused.",
-    )
-    quiet: bool = python_only_option(True, doc="No progress on stderr.")
+    cluster: str = quantity("threads", metavar="threads|processes|sync|tcp://…")
+    """Run tasks here, or on the Dask cluster at this address."""
+    workers: int = quantity(0, low=0, high=4096, shown="all cores")
+    """Parallel tasks; 0 is one per core."""
+    memory: int = quantity(2 << 30, unit="bytes", metavar="SIZE", shown="2GiB")
+    """Memory limit; work that needs more is refused."""
+    quiet: bool = python_only_option(True)
+    """No progress on stderr."""
 
 
 @dataclass(frozen=True)
@@ -67,19 +59,13 @@ class Ingest:
     files where they are; only compressed ones are copied into cubes.
     """
 
-    overwrite: bool = quantity(
-        False, in_key=False, doc="Replace the ingested frames of another acquisition."
-    )
-    copy: bool = quantity(
-        False, in_key=False, doc="Copy all samples into RUN, so that later steps do not need ACQ."
-    )
-    cubes: StrPath | None = quantity(
-        None,
-        metavar="PLACE",
-        in_key=False,
-        doc="Where to put the large cubes: a folder, a URL (s3://bucket/prefix), or RUN. "
-        "[default: the place used before, else RUN]",
-    )
+    overwrite: bool = quantity(False, in_key=False)
+    """Replace the ingested frames of another acquisition."""
+    copy: bool = quantity(False, in_key=False)
+    """Copy all samples into RUN, so that later steps do not need ACQ."""
+    cubes: StrPath | None = quantity(None, metavar="PLACE", in_key=False)
+    """Where to put the large cubes: a folder, a URL (s3://bucket/prefix), or RUN. [default: the
+    place used before, else RUN]"""
 
 
 @dataclass(frozen=True)
@@ -90,36 +76,22 @@ class Reduce:
     frames become cubes in electrons.
     """
 
-    gain: Literal["declared", "measured"] = quantity(
-        "declared", doc="Gain to use: declared in acquisition.yaml or measured from the flats."
-    )
-    clip_sigma: float = python_only_option(
-        4.0, low=4, high=100, doc="Clipping of calibration frames, robust sigmas."
-    )
-    hot_sigma: float = python_only_option(
-        10.0, low=5, high=1e6, doc="Dark signal of ``HOT`` pixels, robust sigmas above the median."
-    )
-    dead_below: float = python_only_option(
-        0.5,
-        low=0,
-        high=1,
-        doc="Response relative to the neighbours below which a pixel is ``DEAD``.",
-    )
-    dead_above: float = _factor(
-        2.0, doc="Response relative to the neighbours above which a pixel is ``DEAD``."
-    )
-    noisy_factor: float = _factor(
-        1.5, doc="Noise relative to the typical noise above which a pixel is ``NOISY``."
-    )
-    nonlinear_share: float = python_only_option(
-        0.03,
-        above=0,
-        high=1e6,
-        doc="Deviation from a straight line above which a pixel is ``NONLINEAR``.",
-    )
-    rounding_share: float = python_only_option(
-        1e-3, above=0, high=1, doc="Largest share of the variance that rounding may add."
-    )
+    gain: Literal["declared", "measured"] = quantity("declared")
+    """Gain to use: declared in acquisition.yaml or measured from the flats."""
+    clip_sigma: float = python_only_option(4.0, low=4, high=100)
+    """Clipping of calibration frames, robust sigmas."""
+    hot_sigma: float = python_only_option(10.0, low=5, high=1e6)
+    """Dark signal of ``HOT`` pixels, robust sigmas above the median."""
+    dead_below: float = python_only_option(0.5, low=0, high=1)
+    """Response relative to the neighbours below which a pixel is ``DEAD``."""
+    dead_above: float = _factor(2.0)
+    """Response relative to the neighbours above which a pixel is ``DEAD``."""
+    noisy_factor: float = _factor(1.5)
+    """Noise relative to the typical noise above which a pixel is ``NOISY``."""
+    nonlinear_share: float = python_only_option(0.03, above=0, high=1e6)
+    """Deviation from a straight line above which a pixel is ``NONLINEAR``."""
+    rounding_share: float = python_only_option(1e-3, above=0, high=1)
+    """Largest share of the variance that rounding may add."""
     cubes: StrPath | None = as_in(Ingest, "cubes")
 
 
@@ -127,28 +99,20 @@ class Reduce:
 class Sweep:
     """Options of the pass over the cube, a part of ``fit``."""
 
-    batch_frames: int | None = python_only_option(
-        None, low=4, unit="frames", doc="Frames of an Allan batch; 500, or fewer in a short run."
-    )
-    chi2_limit: float = python_only_option(
-        1.5, above=1.0, doc="Reduced chi-square above which a pixel is ``BAD_FIT``."
-    )
+    batch_frames: int | None = python_only_option(None, low=4, unit="frames")
+    """Frames of an Allan batch; 500, or fewer in a short run."""
+    chi2_limit: float = python_only_option(1.5, above=1.0)
+    """Reduced chi-square above which a pixel is ``BAD_FIT``."""
 
 
 @dataclass(frozen=True)
 class Fit(Sweep):
     """Fit the fringes and write the maps of pixel offsets."""
 
-    model: str = quantity(
-        "auto",
-        choices=("auto", "hyperbolic", "paraxial"),  # as in pixcal.estimators.fringe_fit.shapes
-        doc="Shape of the fringes: hyperbolic, straight (paraxial), or chosen from the data.",
-    )
-    with_diagnosis: bool = quantity(
-        False,
-        in_key=False,
-        doc="Also write maps corrected for the effects that 'pixcal diagnose' found.",
-    )
+    model: str = quantity("auto", choices=("auto", "hyperbolic", "paraxial"))
+    """Shape of the fringes: hyperbolic, straight (paraxial), or chosen from the data."""
+    with_diagnosis: bool = quantity(False, in_key=False)
+    """Also write maps corrected for the effects that 'pixcal diagnose' found."""
     own: tuple[Path, ...] = _own(
         "Python file of your own effect that the diagnosis found", in_key=False
     )
@@ -162,36 +126,26 @@ class Fit(Sweep):
 class Allan:
     """Measure the Allan deviation: error against number of frames."""
 
-    region: Region | None = python_only_option(
-        None, unit="px", low=0, doc="Limits (y0, y1, x0, x1) of the main curve, ends excluded."
-    )
+    region: Region | None = python_only_option(None, unit="px", low=0)
+    """Limits (y0, y1, x0, x1) of the main curve, ends excluded."""
     regions: tuple[Region, ...] = quantity(
-        (),
-        unit="px",
-        low=0,
-        flag="--region",
-        metavar="y0:y1,x0:x1",
-        doc="Rectangle with its own Allan curve, ends excluded; repeatable.",
+        (), unit="px", low=0, flag="--region", metavar="y0:y1,x0:x1"
     )
+    """Rectangle with its own Allan curve, ends excluded; repeatable."""
 
 
 @dataclass(frozen=True)
 class Crests:
     """Check the fit: locate the fibres from crests and valleys."""
 
-    frames: int = quantity(
-        8, low=1, metavar="N", doc="Number of frames to use, spread over the run."
-    )
-    paths: int | None = quantity(
-        None, low=2, shown="all", doc="Number of outermost crests and valleys to use at each end."
-    )
+    frames: int = quantity(8, low=1, metavar="N")
+    """Number of frames to use, spread over the run."""
+    paths: int | None = quantity(None, low=2, shown="all")
+    """Number of outermost crests and valleys to use at each end."""
     segment: int | None = quantity(
-        None,
-        low=4,
-        unit="px",
-        shown="an eighth of the window, 8 to 128",
-        doc="Length of fringe that gives one point.",
+        None, low=4, unit="px", shown="an eighth of the window, 8 to 128"
     )
+    """Length of fringe that gives one point."""
 
 
 @dataclass(frozen=True)
@@ -215,54 +169,31 @@ class Astrometry:
     """
 
     truth: Path | None = quantity(
-        None,
-        metavar="DIR",
-        shown="the maps plus random errors of size SIGMA",
-        doc="True offsets of a simulated detector (ACQ-truth).",
+        None, metavar="DIR", shown="the maps plus random errors of size SIGMA"
     )
-    diameter_m: float = quantity(7.0, unit="m", above=0, doc="Diameter of the telescope, m.")
-    focal_length_m: float = quantity(
-        130.0, unit="m", above=0, doc="Focal length of the telescope, m."
-    )
-    wavelength_nm: float = quantity(
-        600.0, unit="nm", above=0, doc="Wavelength of the star light, nm."
-    )
-    obscuration: float = quantity(
-        0.0, low=0, high=0.9, metavar="E", doc="Central obscuration as a fraction of the diameter."
-    )
-    electrons: float = quantity(
-        1e8,
-        unit="e-",
-        above=0,
-        metavar="N",
-        shown="1e8",
-        doc="Photo-electrons of a star at each position, over all exposures.",
-    )
-    background_e: float = quantity(
-        0.0, unit="e-", low=0, metavar="N", doc="Background per pixel and position, electrons."
-    )
-    window: int | None = quantity(
-        None,
-        unit="px",
-        low=3,
-        high=255,
-        shown="8 λ/D",
-        doc="Side of the fit window, an odd number.",
-    )
-    stars: int = quantity(
-        1000, low=2, high=100_000, doc="Number of stars, at random places on the detector."
-    )
-    positions: int = quantity(
-        16, low=1, high=1024, doc="Number of positions of each star to average."
-    )
-    dither_px: float = quantity(
-        32.0,
-        unit="px",
-        low=0,
-        high=512,
-        doc="Largest dither from the first position, along x and y.",
-    )
-    seed: int = quantity(0, low=0, doc="Random seed.")
+    """True offsets of a simulated detector (ACQ-truth)."""
+    diameter_m: float = quantity(7.0, unit="m", above=0)
+    """Diameter of the telescope, m."""
+    focal_length_m: float = quantity(130.0, unit="m", above=0)
+    """Focal length of the telescope, m."""
+    wavelength_nm: float = quantity(600.0, unit="nm", above=0)
+    """Wavelength of the star light, nm."""
+    obscuration: float = quantity(0.0, low=0, high=0.9, metavar="E")
+    """Central obscuration as a fraction of the diameter."""
+    electrons: float = quantity(1e8, unit="e-", above=0, metavar="N", shown="1e8")
+    """Photo-electrons of a star at each position, over all exposures."""
+    background_e: float = quantity(0.0, unit="e-", low=0, metavar="N")
+    """Background per pixel and position, electrons."""
+    window: int | None = quantity(None, unit="px", low=3, high=255, shown="8 λ/D")
+    """Side of the fit window, an odd number."""
+    stars: int = quantity(1000, low=2, high=100_000)
+    """Number of stars, at random places on the detector."""
+    positions: int = quantity(16, low=1, high=1024)
+    """Number of positions of each star to average."""
+    dither_px: float = quantity(32.0, unit="px", low=0, high=512)
+    """Largest dither from the first position, along x and y."""
+    seed: int = quantity(0, low=0)
+    """Random seed."""
 
     def __post_init__(self) -> None:
         if self.window is not None and self.window % 2 == 0:
@@ -282,23 +213,20 @@ class Centroids:
     and their errors from the maps.
     """
 
-    out: Path = quantity(metavar="FILE", doc="Table to write: CSV, ECSV, FITS or VOTable.")
-    fwhm_px: float = quantity(
-        unit="px", low=FWHMS[0], high=FWHMS[1], doc="Full width of the stars at half maximum, px."
-    )
-    x: str = quantity("x", metavar="NAME", doc="Column of x, px.")
-    y: str = quantity("y", metavar="NAME", doc="Column of y, px.")
-    origin: Literal["0", "1"] = quantity(
-        "0", doc="Coordinate of the centre of the first pixel (1 for SExtractor and FITS)."
-    )
-    electrons: float | None = quantity(
-        None,
-        above=0,
-        metavar="N",
-        shown="equal weights",
-        doc="Electrons per star, if the centroids were fitted with photon-noise weights.",
-    )
-    overwrite: bool = quantity(False, doc="Replace FILE.")
+    out: Path = quantity(metavar="FILE")
+    """Table to write: CSV, ECSV, FITS or VOTable."""
+    fwhm_px: float = quantity(unit="px", low=FWHMS[0], high=FWHMS[1])
+    """Full width of the stars at half maximum, px."""
+    x: str = quantity("x", metavar="NAME")
+    """Column of x, px."""
+    y: str = quantity("y", metavar="NAME")
+    """Column of y, px."""
+    origin: Literal["0", "1"] = quantity("0")
+    """Coordinate of the centre of the first pixel (1 for SExtractor and FITS)."""
+    electrons: float | None = quantity(None, above=0, metavar="N", shown="equal weights")
+    """Electrons per star, if the centroids were fitted with photon-noise weights."""
+    overwrite: bool = quantity(False)
+    """Replace FILE."""
 
 
 @dataclass(frozen=True)
@@ -345,12 +273,10 @@ class Compare:
     Give two or more fitted runs of the same window, or one run to compare with itself.
     """
 
-    split: Literal["halves", "odd-even"] = quantity(
-        "halves", doc="How to split a single run: first and second half, or alternating batches."
-    )
-    sigma_accuracy: float = quantity(
-        0.02, low=0, high=0.5, metavar="SHARE", doc="Relative error of SIGMA to tolerate."
-    )
+    split: Literal["halves", "odd-even"] = quantity("halves")
+    """How to split a single run: first and second half, or alternating batches."""
+    sigma_accuracy: float = quantity(0.02, low=0, high=0.5, metavar="SHARE")
+    """Relative error of SIGMA to tolerate."""
 
 
 @dataclass(frozen=True)
@@ -362,19 +288,11 @@ class Budget:
     """
 
     precision_px: float | None = quantity(
-        None,
-        unit="px",
-        low=1e-9,
-        high=1,
-        shown="5e-5 without --frames",
-        doc="Wanted 1-sigma error of the offsets on each axis.",
+        None, unit="px", low=1e-9, high=1, shown="5e-5 without --frames"
     )
-    frames: int | None = quantity(
-        None,
-        low=1,
-        high=10**12,
-        doc="Frames of each fringe set; prints the precision that they reach.",
-    )
+    """Wanted 1-sigma error of the offsets on each axis."""
+    frames: int | None = quantity(None, low=1, high=10**12)
+    """Frames of each fringe set; prints the precision that they reach."""
 
 
 @dataclass(frozen=True)
@@ -385,9 +303,8 @@ class Simulate:
     camera of the bench would have written; its truth goes to a separate directory.
     """
 
-    truth: Path | None = quantity(
-        None, metavar="DIR", shown="ACQ-truth", doc="Directory of the truth."
-    )
+    truth: Path | None = quantity(None, metavar="DIR", shown="ACQ-truth")
+    """Directory of the truth."""
     own: tuple[Path, ...] = _own("Python file with your own effect that BENCH.yaml names")
 
 
@@ -400,11 +317,8 @@ class Run:
     gain: Literal["declared", "measured"] = as_in(Reduce, "gain")
     model: str = as_in(Fit, "model")
     cubes: StrPath | None = as_in(Ingest, "cubes")
-    diagnosed: bool = quantity(
-        True,
-        flag="--diagnose/--no-diagnose",
-        doc="Find the effects that make the frames differ from a simulation (the longest step).",
-    )
+    diagnosed: bool = quantity(True, flag="--diagnose/--no-diagnose")
+    """Find the effects that make the frames differ from a simulation (the longest step)."""
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,7 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
     if start is None:
         raise InputError(
             "no fringes found: the phase or the signal is constant, or the fringe period is too "
-            "long for the window of {shape[1]} x {shape[0]} px ; check the frames, and which "
+            f"long for the window of {shape[1]} x {shape[0]} px; check the frames, and which "
             "files the set lists"
         )
     vector = _refined(light, start)
