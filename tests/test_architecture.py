@@ -208,7 +208,6 @@ MANY_PARAMETERS = {
     "pixcal.api.arrays.calibrate": "public: one for every input and option",
     "pixcal.storage.stage.make": "named options that most stages leave out",
     "pixcal.report.drawing.axes_grid": "named margins, most left at their defaults",
-    "pixcal.estimators.test_statistics.statistic": "a decorator: fields of a statistic",
     "pixcal.estimators.detector.pair_noise.flat_pair_sums": "noise and limits of samples",
 }
 """Functions of more than `MOST_PARAMETERS`, and why."""

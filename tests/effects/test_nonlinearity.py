@@ -11,7 +11,7 @@ import pytest
 from all_frames import frames_of
 
 from pixcal.effects.nonlinearity import CurvePoint, Nonlinearity, _straight_on
-from pixcal.estimators.detector.response_of_noise import _bent_by_noise
+from pixcal.estimators.detector.response_of_flats import _bent_by_noise
 from pixcal.estimators.detector.transfer_curve import TransferCurve
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.arrays import F64

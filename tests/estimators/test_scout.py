@@ -163,6 +163,12 @@ def test_fringe_vector_to_a_fiftieth_of_a_turn_across_the_window():
         np.testing.assert_allclose(found, k, atol=2 * np.pi / 50 / 61)
 
 
+def test_a_window_without_fringes_is_named_by_its_size():
+    noise = np.random.default_rng(5).normal(size=(1, 61, 67))
+    with pytest.raises(InputError, match=r"for the window of 67 x 61 px; check"):
+        find_fringe_vector(noise, np.ones(noise.shape[1:], bool), (1.2, 0.1))
+
+
 def test_smooth_phasor_keeps_a_curved_phase():
     y, x = np.mgrid[:61, :67] - np.array([30, 33])[:, None, None]
     psi = 1.2 * x + 0.1 * y + 2e-4 * x * x - 1e-4 * x * y

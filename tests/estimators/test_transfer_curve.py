@@ -15,7 +15,7 @@ from pixcal.estimators.crosstalk.kernel import within
 from pixcal.estimators.crosstalk.links import links
 from pixcal.estimators.crosstalk.sources import sources_of, total
 from pixcal.estimators.detector.flat_noise import shot_share_of_flats
-from pixcal.estimators.detector.ladder_curve import ladder_curve
+from pixcal.estimators.detector.response_of_flats import ladder_curve
 from pixcal.estimators.detector.transfer_curve import shot_share, sums_of_stacks, transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.estimators.test_statistics.noise import read_noise

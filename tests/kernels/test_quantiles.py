@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pixcal.kernels.quantiles import quantiles_of_parts
+from pixcal.kernels.medians import quantiles_of_parts
 
 F32 = NDArray[np.float32]
 LEVELS = (0.0, 0.15865525393145707, 0.3, 0.5, 0.8413447460685429, 1.0)

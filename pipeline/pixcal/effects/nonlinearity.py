@@ -7,9 +7,8 @@ import numpy as np
 
 from pixcal.estimators.crosstalk.boundaries import shared_charge
 from pixcal.estimators.detector.flat_ladder import ladder, ladder_response
-from pixcal.estimators.detector.ladder_curve import ladder_curve
 from pixcal.estimators.detector.response import departure, fit_curve, fit_response
-from pixcal.estimators.detector.response_of_noise import full_scale, response_of_noise
+from pixcal.estimators.detector.response_of_flats import full_scale, ladder_curve, response_of_noise
 from pixcal.estimators.detector.transfer_curve import transfer_curve
 from pixcal.estimators.diagnosis.central_crop import central_crop
 from pixcal.estimators.diagnosis.distortions import Agreement

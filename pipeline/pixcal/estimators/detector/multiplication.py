@@ -35,20 +35,12 @@ class Skew(NamedTuple):
 def skew(
     frames: F32, level: float, variance: float, slope: float, good: Mask, quantum: float = 0.0
 ) -> Skew | None:
-    """Third cumulant of the noise of frames (t, y, x) of one scene; None without enough samples.
+    """Third cumulant of the noise of frames (t, y, x) of one scene, ADU; None with too few samples.
 
-    Parameters
-    ----------
-    frames : (t, y, x) float32
-        ADU.
-    level : float
-        ADU above the bias.
-    variance, slope : float
-        Variance without light (ADU²), and how it rises with the level (ADU).
-    good : (y, x) bool
-        Pixels to use.
-    quantum : float
-        Step of the samples, ADU. Rounding has a third cumulant where the noise is below a step.
+    level : ADU above the bias
+    variance, slope : variance without light (ADU²), and how it rises with the level (ADU)
+    good : (y, x) pixels to use
+    quantum : step of the samples, ADU; rounding has a third cumulant where the noise is below it
     """
     count = len(frames)
     if count < MIN_FRAMES or variance + slope * level < quantum**2 / 2:
@@ -79,11 +71,7 @@ def skew(
 def is_multiplied(points: Iterable[Skew], slope: float) -> bool:
     """Whether electrons were multiplied, from levels with and without light.
 
-    Parameters
-    ----------
-    points : iterable of Skew
-    slope : float
-        Rise of the variance with the level, ADU.
+    ``slope``: rise of the variance with the level, ADU.
     """
     level, cumulant, error = np.array(list(points)).reshape(-1, 3).T
     if len(level) < 2:

@@ -12,7 +12,7 @@ import numpy as np
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.frame_series import stability
 from pixcal.kernels.allan import averaging_lengths, disjoint_differences
-from pixcal.kernels.quantiles import quantiles_of_parts
+from pixcal.kernels.medians import quantiles_of_parts
 from pixcal.model.arrays import F32, F64, I64
 from pixcal.model.options import Region
 from pixcal.stages.tiles import Part, Range, spans

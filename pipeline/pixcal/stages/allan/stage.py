@@ -16,7 +16,7 @@ from pixcal.engine.run import Runtime
 from pixcal.estimators.frame_series import stability
 from pixcal.estimators.frame_series.stability import AllanCurve
 from pixcal.kernels.allan import allan_deviation
-from pixcal.kernels.quantiles import quantiles_of_parts
+from pixcal.kernels.medians import quantiles_of_parts
 from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Allan as Config
