@@ -9,6 +9,7 @@ from pixcal.kernels.significance import (
     sigmas_of_best,
     sigmas_of_chi2,
     sigmas_of_count,
+    sigmas_of_t,
 )
 
 RNG = np.random.default_rng(4)
@@ -58,3 +59,11 @@ def test_error_of_a_root_downwards_may_differ() -> None:
     assert (root, error) == (3.0, 2.0)
     assert root_with_error(9.0, 16.0, 5.0)[1] == pytest.approx(2.0)
     assert root_with_error(-1.0, 4.0) == (0.0, 2.0)
+
+
+@pytest.mark.parametrize("dof", [4, 7, 30])
+def test_student_agrees_with_scipy_within_two_per_cent(dof: int) -> None:
+    for t in (0.5, 3.0, 12.0, 20.0):
+        exact = stats.norm.isf(stats.t.sf(t, dof))
+        assert sigmas_of_t(t, dof) == pytest.approx(exact, rel=0.02)
+        assert sigmas_of_t(-t, dof) == -sigmas_of_t(t, dof)

@@ -36,6 +36,12 @@ def sigmas_of_chi2(value: float, dof: int) -> float:
     return -float(ndtri_exp(min(math.log(chdtrc(dof, max(value, 0.0))), -1e-300)))
 
 
+def sigmas_of_t(t: float, dof: int) -> float:
+    """Normal quantile of a value of Student's distribution, to 2 % (Wallace 1959)."""
+    size = (8 * dof + 1) / (8 * dof + 3) * math.sqrt(dof * math.log1p(t**2 / dof))
+    return math.copysign(size, t)
+
+
 def sigmas_of_count(count: int, expected: float) -> float:
     """Standard deviations of a normal that are as rare as more than ``count`` Poisson events.
 

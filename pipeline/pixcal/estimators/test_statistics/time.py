@@ -6,12 +6,13 @@ from itertools import pairwise
 import numpy as np
 from scipy.fft import dct
 
-from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker, level_before, light_of
+from pixcal.estimators.detector.flat_ladder import level_before, light_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.test_statistics import Curve, family, statistic
 from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData
 from pixcal.kernels.frame_order import follows
 from pixcal.kernels.sample_sums import frame_means
+from pixcal.kernels.significance import sigmas_of_t
 from pixcal.model.arrays import F64
 
 of_time = partial(statistic, "time")
@@ -29,6 +30,7 @@ STACKS = (
     ("flat", "relative intensity, rms", ""),
 )
 MIN_FRAMES = 8
+_LEVELS = 6  # fewest levels of flats whose first frames are compared with the others
 _FOR_TREND = 3  # fewest frames whose level has a trend
 LAGS = (1, 2, 3, -1, -2)
 BATCHES = 8
@@ -129,19 +131,31 @@ def allan_of_batches(data: FringeSetData) -> Curve | None:
     return Curve(np.array([1.0, 2.0, 4.0]), np.array(out))
 
 
-@of_time("first flat of each exposure time relative to the following ones", "relative intensity")
+@of_time(
+    "first flat of each exposure time relative to the following ones", "significance", unit="σ"
+)
 def first_flats(evidence: Evidence) -> Curve | None:
-    """Relative change: mean over the levels, and slope against the rise from the frame before."""
+    """Mean relative change over the levels, and slope against the rise from the frame before."""
     # Lamp flicker changes each level independently. Lag changes the first frame by a share of the
-    # rise, which is large only where the series of exposure times begins.
+    # rise, which is large only where the series of exposure times begins. Both are over their
+    # errors from the scatter of the levels: the flicker of few frames is hardly known.
     stacks = [s for s in evidence.ladder if len(s.adu) > 1]
     every = [light_of(evidence, s) for s in stacks]
-    if flicker(evidence)[1] < FLICKER_KNOWN or min(light.mean() for light in every) <= 0:
+    if len(every) < _LEVELS or min(light.mean() for light in every) <= 0:
         return None
     steps = np.array([float(light[0] / light[1:].mean()) - 1 for light in every])
     before = np.array([level_before(evidence, s) for s in stacks])
     lacking = 1 - before / [light.mean() for light in every]
-    return Curve.numbered([steps.mean(), steps @ lacking / (lacking @ lacking)])
+    return Curve.numbered([_sigmas(steps, shape) for shape in (np.ones_like(steps), lacking)])
+
+
+def _sigmas(values: F64, shape: F64) -> float:
+    """Significance of a shape in values whose scatter is unknown."""
+    freedom, square = len(values) - 1, float(shape @ shape)
+    size = float(values @ shape) / square
+    rest = values - size * shape
+    t = size * np.sqrt(square * freedom / max(float(rest @ rest), 1e-30))
+    return sigmas_of_t(float(t), freedom)
 
 
 @family(
