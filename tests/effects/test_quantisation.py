@@ -12,6 +12,7 @@ from pixcal.estimators.detector.bit_weights import FITS, NEAREST, NEAREST_OF_ALL
 from pixcal.estimators.detector.code_density import CodeWidths, code_widths
 from pixcal.estimators.detector.code_histogram import histogram, step_of
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.kernels.significance import sigmas_of_chi2
 
 TOP = 65535.0
 
@@ -282,6 +283,20 @@ def test_no_bit_is_told_to_be_off_by_more_than_itself(monkeypatch: pytest.Monkey
     factor = -43.8 * 2.0 ** np.arange(12)
     monkeypatch.setattr(CodeWidths, "level", lambda _, bits: bits + factor * (np.ptp(bits) > 0))
     assert "bits" not in _uneven(widths)[0]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_even_codes_of_many_levels_have_no_wrong_bits(seed: int) -> None:
+    """Levels leave codes between them out, so that some weights are hardly constrained."""
+    rng, counts = np.random.default_rng(seed), np.zeros(8192)
+    for n in range(15):
+        samples = np.rint(rng.normal(463 + 449.1 * n, 3.6 + 3.7 * n, 200_000)).astype(int)
+        counts += np.bincount(samples, minlength=len(counts))
+    widths = code_widths(counts, 1.4, 360.0)
+    assert widths is not None
+    fit = widths.wrong_bits(2 * widths.scatter()[0])
+    assert fit.chi2 < np.sum(widths.width**2 / widths.variance)
+    assert sigmas_of_chi2(fit.chi2, len(fit.bits)) < 3
 
 
 def test_bits_that_do_not_turn_over_are_not_told() -> None:

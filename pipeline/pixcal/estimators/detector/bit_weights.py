@@ -27,7 +27,7 @@ class WrongBits:
     bits: F64  # (n,) errors, codes, lowest bit first
     law: Law
     covariance: F64  # (n, n)
-    chi2: float  # of the bits
+    chi2: float  # of the bits: the fall of the misfit
     misfit: float  # chi-square of the widths after correction
 
 

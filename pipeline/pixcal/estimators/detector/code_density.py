@@ -221,8 +221,8 @@ class CodeWidths:
             bits, left, misfit = moved, after, misfit - better
             if better < _SETTLED:
                 break
-        inverse = np.linalg.pinv(covariance, rcond=1e-9, hermitian=True)
-        return WrongBits(bits, law, covariance, float(bits @ inverse @ bits), misfit)
+        explained = float(weight @ self.width**2) - misfit
+        return WrongBits(bits, law, covariance, explained, misfit)
 
     def _far(self, law: Law) -> F64:
         """Errors of bits, highest first, from the step between levels where each bit changes."""
