@@ -10,14 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
-from pixcal.estimators.maps.map_fit import (
-    gauge_terms,
-    half_theta,
-    neighbour_products,
-    polynomial,
-    without,
-    without_harmonics,
-)
+from pixcal.estimators.maps import map_fit
 from pixcal.estimators.maps.ring_power import Ring, ring_power
 from pixcal.kernels.beams import LightMaps
 from pixcal.kernels.medians import robust_sigma
@@ -135,7 +128,7 @@ class FlatError(Effect):
         n = len(sets)
         pairs = [(iotas[i], alphas[j]) for i in range(n) for j in range(n) if i != j or n == 1]
         weight = int(np.count_nonzero(good))
-        near = np.mean([neighbour_products(a, b, good) for a, b in pairs], axis=0)
+        near = np.mean([map_fit.neighbour_products(a, b, good) for a, b in pairs], axis=0)
         # Mean cross power (y, x); its sum is the mean product of the good pixels.
         products = [(np.fft.fft2(a) * np.conj(np.fft.fft2(b))).real for a, b in pairs]
         ring = ring_power(np.asarray(np.mean(products, axis=0) / (weight * pairs[0][0].size)))
@@ -207,18 +200,19 @@ def _structure(
     fringes: FringeEvidence, flat: F64, flats: tuple[F64, F64], good: Mask
 ) -> tuple[F64, F64]:
     """Logarithms of iota and alpha over the flats minus smooth terms, each from half the frames."""
-    free = np.concatenate([polynomial(good.shape, 2), gauge_terms(fringes)])[:, good].T
+    free = np.concatenate([map_fit.polynomial(good.shape, 2), map_fit.gauge_terms(fringes)])
+    free = free[:, good].T
     maps = []
     for n in (0, 1):
-        theta = half_theta(fringes, n, good)
+        theta = map_fit.half_theta(fringes, n, good)
         size = theta[0] if n == 0 else np.hypot(theta[1], theta[2])
         ratio = np.log(np.maximum(size * flat[good] / flats[n][good], 1e-12))
-        rest = without(ratio[:, None], free)[:, 0]
+        rest = map_fit.without(ratio[:, None], free)[:, 0]
         limit = _CLIP * robust_sigma(rest - np.median(rest))
         out = np.zeros(good.shape)
         out[good] = np.where(np.abs(rest) < limit, rest, 0.0)
         maps.append(out)
-    return without_harmonics(maps[0], maps[1], fringes, good)
+    return map_fit.without_harmonics(maps[0], maps[1], fringes, good)
 
 
 def _smooth(neighbours: F64, ring: Ring) -> tuple[float, float, float]:

@@ -2,13 +2,7 @@
 
 import numpy as np
 
-from pixcal.estimators.detector.flat_ladder import (
-    FLICKER_KNOWN,
-    flicker,
-    level_before,
-    light_of,
-    warming,
-)
+from pixcal.estimators.detector import flat_ladder
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 
 _SERIES = 8  # fewest frames of a series that measures its own flicker
@@ -29,9 +23,9 @@ def lag_of_flats(evidence: Evidence) -> tuple[float, float, float] | None:
     level, step, error = np.array([f for _, f in firsts]).T
     if np.ptp(level) < 10 * error.min():
         return None
-    before = np.array([level_before(evidence, s) for s, _ in firsts])
+    before = np.array([flat_ladder.level_before(evidence, s) for s, _ in firsts])
     flat = np.array([s.kind == "flat" for s, _ in firsts])
-    rise, of_rise = warming(evidence)
+    rise, of_rise = flat_ladder.warming(evidence)
     # Change of the steps per unit rise of the light: from the first frame to the middle of the
     # others.
     later = np.array([len(s.adu) / 2 * (s.kind == "flat") for s, _ in firsts]) * level
@@ -59,10 +53,10 @@ def lag_of_flats(evidence: Evidence) -> tuple[float, float, float] | None:
 def _first_frame(stack: Stack, evidence: Evidence) -> tuple[float, float, float] | None:
     """Level of a stack, how much its first frame differs from the others, and the error; e-."""
     count = len(stack.adu)
-    lamp, known = flicker(evidence)
-    if count < (2 if stack.kind == "flat" and known > FLICKER_KNOWN else _SERIES):
+    lamp, known = flat_ladder.flicker(evidence)
+    if count < (2 if stack.kind == "flat" and known > flat_ladder.FLICKER_KNOWN else _SERIES):
         return None
-    light = light_of(evidence, stack)
+    light = flat_ladder.light_of(evidence, stack)
     level, rest = float(light[1:].mean()), light[1:]
     # Long series measure the lamp's flicker themselves.
     scatter = level * max(lamp, _STEADIEST) if count < _SERIES else float(rest.std(ddof=2))

@@ -6,14 +6,7 @@ from itertools import combinations
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
-from pixcal.estimators.maps.map_fit import (
-    gauge_terms,
-    half_theta,
-    white_products,
-    without,
-    without_harmonics,
-    without_lines,
-)
+from pixcal.estimators.maps import map_fit
 from pixcal.estimators.maps.structure import without_outliers
 from pixcal.model.arrays import F64, Mask
 
@@ -31,7 +24,7 @@ def visibility_products(evidence: Evidence, sets: Sequence[FringeEvidence]) -> P
     for at, (m, n) in enumerate(pairs):
         first, second = maps[m][:2] if m == n else (both[m], both[n])
         kept = maps[m][2] & maps[n][2]
-        white = white_products(first, second, kept)
+        white = map_fit.white_products(first, second, kept)
         errors[at] = white.std() / np.sqrt(len(white))
         # Variance of the subtracted bias, e-², which is common to all frames.
         counts = [len(s.adu) for s in evidence.of_kind("bias")]
@@ -52,17 +45,17 @@ def _two_halves(fringes: FringeEvidence) -> tuple[F64, F64, Mask]:
     """Visibility of the pixels in two halves of the frames; where both are known."""
     one, other = (_visibility(fringes, half) for half in (0, 1))
     kept = np.isfinite(one) & np.isfinite(other)
-    one, other = (without_lines(half[kept], kept) for half in (one, other))
-    return *without_harmonics(one, other, fringes, kept), kept
+    one, other = (map_fit.without_lines(half[kept], kept) for half in (one, other))
+    return *map_fit.without_harmonics(one, other, fringes, kept), kept
 
 
 def _visibility(fringes: FringeEvidence, half: int) -> F64:
     """Logarithm of the visibility (y, x) of half the frames, without fringes; outliers are NaN."""
     good = fringes.good
-    theta = half_theta(fringes, half, good)
+    theta = map_fit.half_theta(fringes, half, good)
     rest = np.full(good.shape, np.nan)
     rest[good] = np.log(np.maximum(np.hypot(theta[1], theta[2]), 1e-9) / np.maximum(theta[0], 1e-9))
     rest = without_outliers(rest)
     used = np.isfinite(rest)
-    rest[used] = without(rest[used][:, None], gauge_terms(fringes)[:, used].T)[:, 0]
+    rest[used] = map_fit.without(rest[used][:, None], map_fit.gauge_terms(fringes)[:, used].T)[:, 0]
     return rest

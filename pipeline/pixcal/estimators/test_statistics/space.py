@@ -7,16 +7,8 @@ from itertools import combinations
 import numpy as np
 
 from pixcal.estimators.fringe_fit.combine import SAME_AXIS
+from pixcal.estimators.maps import structure
 from pixcal.estimators.maps.stitching import FieldFit
-from pixcal.estimators.maps.structure import (
-    PERIODS,
-    fit_terms,
-    flattened,
-    legendre,
-    profile,
-    redness,
-    repeats,
-)
 from pixcal.estimators.test_statistics import Curve, family, statistic
 from pixcal.estimators.test_statistics.fringe_set_data import FringeSetData, by_cell
 from pixcal.model.arrays import F64, Mask
@@ -49,8 +41,8 @@ def apart(sets: Sequence[FringeSetData]) -> Curve:
         a, b = np.array(one.fringes.k), np.array(other.fringes.k)
         cosine = float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
         if abs(cosine) > SAME_AXIS:
-            other_map = np.sign(cosine) * other.maps["offset"]
-            values.append(float(np.nanmean(flattened(one.maps["offset"] - other_map) ** 2)))
+            rest = one.maps["offset"] - np.sign(cosine) * other.maps["offset"]
+            values.append(float(np.nanmean(structure.flattened(rest) ** 2)))
     return Curve.numbered(values)
 
 
@@ -78,8 +70,8 @@ MAP_LINES = tuple((f"{m[0]}_{lines}", *m, lines) for m in MAPS for lines in AXES
 def repeats_of_lines(of: str, data: FringeSetData) -> Curve:
     """Size of patterns that repeat over rows or columns."""
     name, lines = of.split("_")
-    size = np.abs(repeats(data.maps_without_fringes[name], AXES[lines]))
-    return Curve(np.array(PERIODS, float), size)
+    size = np.abs(structure.repeats(data.maps_without_fringes[name], AXES[lines]))
+    return Curve(np.array(structure.PERIODS, float), size)
 
 
 @family(
@@ -89,7 +81,7 @@ def repeats_of_lines(of: str, data: FringeSetData) -> Curve:
 def profiles_of_lines(of: str, data: FringeSetData) -> Curve:
     """Power of the means of rows or columns."""
     name, lines = of.split("_")
-    along = profile(data.maps_without_fringes[name], AXES[lines])
+    along = structure.profile(data.maps_without_fringes[name], AXES[lines])
     power = np.abs(np.fft.rfft(along)[1:]) ** 2 * 2 / len(along) ** 2
     return _binned(np.arange(1, len(power) + 1) / len(along), power)
 
@@ -100,7 +92,7 @@ def profiles_of_lines(of: str, data: FringeSetData) -> Curve:
 )  # fmt: skip
 def residual_fringes(name: str, data: FringeSetData) -> Curve:
     """Amplitudes of the fringes left in a map."""
-    sizes = fit_terms(data.flat_maps[name], data.fringe_terms)
+    sizes = structure.fit_terms(data.flat_maps[name], data.fringe_terms)
     return Curve(np.array([1.0, 1.25, 2.0, 2.25]), sizes)
 
 
@@ -112,10 +104,10 @@ def residual_fringes(name: str, data: FringeSetData) -> Curve:
 def low_orders(name: str, data: FringeSetData) -> Curve:
     """Legendre terms, over their size by chance in an equally red map."""
     values = data.maps[name]
-    terms = legendre(values.shape, 4 if name == "contrast" else 3)
+    terms = structure.legendre(values.shape, 4 if name == "contrast" else 3)
     field = data.stitched if name == "offset" else np.zeros(values.shape, np.intp)
     fit = FieldFit.of(values, terms[1:], field)
-    error = np.sqrt(fit.variance * redness(fit.rest) * np.diag(fit.covariance))
+    error = np.sqrt(fit.variance * structure.redness(fit.rest) * np.diag(fit.covariance))
     # Two Gaussian beams cause curvature of the contrast in any direction, but no higher terms.
     first = 3 if name != "contrast" else 6
     pulls = fit.values / np.maximum(error, 1e-300)
