@@ -44,7 +44,7 @@ def quantity(
     low, high : inclusive limits of a number (of each number of a tuple)
     above : exclusive lower limit
     choices : the allowed words
-    doc : one line on the meaning; if long, write it as a string below the field, see `meanings`
+    doc : one line on the meaning; in pixcal's own modules it may be a string below the field
     **more : further metadata of options, see `pixcal.model.options`
     """
     meta = dict(more, unit=unit, low=low, high=high, above=above, choices=choices, doc=doc)
