@@ -216,7 +216,8 @@ def test_the_linearity_plot_leaves_out_unused_steps() -> None:
     levels = [
         {"level_e": 1e4 * n, "deviation_percent": 0.1 * n if n < 3 else None} for n in (1, 2, 3)
     ]
-    axes = detector_figures.linearity(levels).axes[0]
+    axes = detector_figures.linearity(levels, 0.05).axes[0]
+    assert len(axes.containers) == 1
     assert [len(np.asarray(line.get_xdata())) for line in axes.lines][1] == 2
 
 

@@ -95,17 +95,19 @@ def _spectra(axes: Axes, curves: Curves) -> None:
     axes.legend(fontsize=9, frameon=False, ncols=2, loc="upper right")
 
 
-def linearity(levels: Sequence[Mapping[str, Any]]) -> Figure:
+def linearity(levels: Sequence[Mapping[str, Any]], error_percent: float | None) -> Figure:
     """Deviation from a straight line over the exposure-time steps of the flats.
 
     ``levels``: with ``level_e`` (e-) and ``deviation_percent`` (None where the step was not used).
+    ``error_percent``: of each deviation, if known.
     """
     used = [v for v in levels if v.get("deviation_percent") is not None]
     left_out = [v for v in levels if v.get("deviation_percent") is None]
     figure, ((axes,),) = axes_grid((WIDE, 3.2), left=1.0)
     axes.axhline(0, color=INK, lw=1, ls="--")
     at = [v["level_e"] / 1e3 for v in used]
-    axes.plot(at, [v["deviation_percent"] for v in used], "o-", color=BLUE, lw=1.2, ms=6)
+    deviation = [v["deviation_percent"] for v in used]
+    axes.errorbar(at, deviation, error_percent, fmt="o-", color=BLUE, lw=1.2, ms=3.5, capsize=3)
     for level in left_out:
         axes.axvline(level["level_e"] / 1e3, color=INK, ls=":", lw=1)
     axes.margins(y=0.25)
