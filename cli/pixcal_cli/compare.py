@@ -1,6 +1,6 @@
 """``pixcal compare``."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,16 +67,12 @@ def _show(result: Mapping[str, Any]) -> None:
     show_notes(result["warnings"])
 
 
-def _sentences(components: Mapping[str, Any]) -> list[str]:
-    sentences = []
+def _sentences(components: Mapping[str, Any]) -> Iterator[str]:
     for name, facts in components.items():
         evidence = "; ".join(facts["evidence"])
-        sentences.append(
-            f"{name}: {f'beyond noise: {evidence}' if evidence else 'consistent with noise'}"
-        )
+        yield f"{name}: {f'beyond noise: {evidence}' if evidence else 'consistent with noise'}"
         if facts["suspicion"] is not None:
-            sentences.append(f"{name}: {facts['suspicion']}")
-    return sentences
+            yield f"{name}: {facts['suspicion']}"
 
 
 def _amount(estimate: Mapping[str, float]) -> str:

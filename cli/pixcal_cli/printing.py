@@ -1,7 +1,7 @@
 """Numbers, tables and notes on stdout."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import click
@@ -37,7 +37,7 @@ def show_records(first: str, records: Mapping[str, Any], columns: Columns) -> No
     show_table((first, *columns), rows)
 
 
-def show_notes(sentences: Sequence[str]) -> None:
+def show_notes(sentences: Iterable[str]) -> None:
     """Print notes, a line each."""
     for sentence in sentences:
         click.echo(f"  note: {sentence}")

@@ -4,7 +4,7 @@ docs/reference/products-other.md describes ``astrometry.json``; ``astrometry.zar
 of errors.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -131,7 +131,7 @@ def _measure(
         },
         "axes": _axes(detector, observed, errors, maps, telescope),
     }
-    result["warnings"] = _warnings(result)
+    result["warnings"] = [*_warnings(result)]
     write_json(made.folder / "astrometry.json", result)
     photons = _photon_noise(observed, config.background_e / config.electrons, acquisition)
     view = _view(result, detector, observed, maps, np.stack([CURVE, photons]))
@@ -194,35 +194,33 @@ def _axes(
     return facts
 
 
-def _warnings(result: Mapping[str, Any]) -> list[str]:
-    sentences = []
+def _warnings(result: Mapping[str, Any]) -> Iterator[str]:
     stars = result["stars"]
     lost = stars["number"] * stars["positions"] - stars["positions_used"]
     if lost:
-        sentences.append(f"{lost} positions are too close to masked pixels and were left out")
+        yield f"{lost} positions are too close to masked pixels and were left out"
     for name, axis in result["axes"].items():
         gain = axis["floor"]["gain"]["value"]
         if axis["floor"]["perfect"]["px"] is None:
-            sentences.append(
+            yield (
                 f"{name}: the offsets of the pixels are below the errors of the maps, so these "
                 "maps do not improve centroids; take more frames"
             )
         elif gain is not None and gain < 1:
-            sentences.append(
+            yield (
                 f"{name}: the errors of the maps exceed the offsets, so these maps make centroids "
                 "worse"
             )
     if "fringe" in result["axes"]:
-        sentences.append(
+        yield (
             "offsets are known along one axis only; those along the other axis also move stars, "
             "but are assumed to be zero here"
         )
     if result["detector"]["modes_removed_px"] is None:
-        sentences.append(
+        yield (
             "without --truth, the maps are assumed to have random errors of SIGMA and "
             "no systematic errors"
         )
-    return sentences
 
 
 def _view(

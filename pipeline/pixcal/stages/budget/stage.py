@@ -3,7 +3,7 @@
 docs/reference/products-other.md describes ``budget.json``.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -121,8 +121,8 @@ def _budget(
             asdict(lever) | _time(lever.variance, lever.period_s, precision)
             for lever in levers(bench, bound)
         ],
-        "left_out": _left_out(bench),
-        "warnings": _warnings(bench, bound),
+        "left_out": [*_left_out(bench)],
+        "warnings": [*_warnings(bench, bound)],
     }
 
 
@@ -151,50 +151,44 @@ def _reached(reach: Reach, frames: Shares) -> dict[str, Any]:
     return {"frames": round(sum(frames)), "median_px": median**0.5, "worst_px": worst**0.5}
 
 
-def _left_out(bench: Bench) -> list[str]:
+def _left_out(bench: Bench) -> Iterator[str]:
     """Effects that the bound does not include."""
-    d, sentences = bench.detector, []
-    sentences.append(
-        "systematic errors (crosstalk, drifts, ghosts, nonlinearity), which do not average out"
-    )
+    d = bench.detector
+    yield "systematic errors (crosstalk, drifts, ghosts, nonlinearity), which do not average out"
     if bench.effects:
-        sentences.append(
+        yield (
             "effects of the bench file, except variations of light and contrast of whole frames: "
             + ", ".join(sorted(bench.effects))
         )
     if d.prnu_rms > 0:
-        sentences.append(
+        yield (
             f"PRNU of {100 * d.prnu_rms:.2g} % rms, which changes the errors of single pixels by "
             f"{50 * d.prnu_rms:.2g} % rms"
         )
     if not bench.shot_noise:
-        sentences.append(
-            "shot_noise: false in the bench file: the budget includes shot noise anyway"
-        )
-    return sentences
+        yield "shot_noise: false in the bench file: the budget includes shot noise anyway"
 
 
-def _warnings(bench: Bench, bound: expected.JoinedBound) -> list[str]:
-    sentences, limit = [], expected.brightest_allowed(bench)
+def _warnings(bench: Bench, bound: expected.JoinedBound) -> Iterator[str]:
+    limit = expected.brightest_allowed(bench)
     ny, nx = bench.detector.shape
     for number, (scan, s) in enumerate(zip(bench.frames.fringes, bound.sets, strict=True)):
         noise = s.variance + scan.peak_e + (expected.frame_rms(bench, number)[0] * scan.peak_e) ** 2
         top = scan.peak_e + MARGIN * noise**0.5
         if limit is not None and top > limit:
-            sentences.append(
+            yield (
                 f"{scan.name}: the brightest fringe, {scan.peak_e / 1e3:.4g} ke-, reaches "
                 f"{top / 1e3:.4g} ke- at {MARGIN:.0f} sigma; the range ends at "
                 f"{limit / 1e3:.4g} ke-, so that some samples are lost"
             )
         if s.interfringe < 2:
-            sentences.append(
+            yield (
                 f"{scan.name}: fringe period {s.interfringe:.3g} px is below two pixels: the "
                 "fringes are aliased"
             )
         across = float(np.hypot(np.median(s.kx) * nx, np.median(s.ky) * ny) / (2 * np.pi))
         if across < MIN_FRINGES_FOR_MAPS:
-            sentences.append(
+            yield (
                 f"{scan.name}: {across:.2g} fringes across the window; with fewer "
                 f"than {MIN_FRINGES_FOR_MAPS:g}, offsets and fringes cannot be separated"
             )
-    return sentences

@@ -3,7 +3,7 @@
 docs/reference/products-other.md describes ``compare.json``.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -134,7 +134,7 @@ def _compare_all(
         "sigma_accuracy": config.sigma_accuracy,
         "pairs": pairs,
         "summary": _summary(pairs, components) if len(sides) > 2 else None,
-        "warnings": _warnings(sides, components),
+        "warnings": [*_warnings(sides, components)],
     }
     return result, views
 
@@ -170,15 +170,13 @@ def _summary(pairs: list[dict[str, Any]], components: Iterable[str]) -> dict[str
     return summary
 
 
-def _warnings(sides: Sequence[Side], components: dict[str, Vector]) -> list[str]:
-    sentences = []
+def _warnings(sides: Sequence[Side], components: dict[str, Vector]) -> Iterator[str]:
     direction = components.get("delta_fringe")
     for side in sides:
         turned = 0.0 if side.both or direction is None else _angle(side.axes[0], direction)
         if turned > NOTED_DEG:
-            sentences.append(
+            yield (
                 f"{side.label}: fringes rotated by {turned:.1f} degrees: "
                 f"{100 * np.sin(np.radians(turned)):.1g} % of the offsets along the fringes count "
                 "as a difference"
             )
-    return sentences

@@ -1,6 +1,6 @@
 """Fibre positions from crests and valleys (paper, section 6, equation 7, and figure 17)."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -47,18 +47,16 @@ class CrestFit:
         """Parameters (6,) that the prior constrains more than the points do."""
         return np.asarray(self.sigma > np.sqrt(0.5) * self.prior)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> Iterator[str]:
         """Sentences on the scatter of the points and on outliers."""
-        sentences = []
         if self.chi2_reduced > NOTABLE_CHI2:
-            sentences.append(
+            yield (
                 f"points scatter {np.sqrt(self.chi2_reduced):.1f} times more than their noise. The "
                 "errors include this, but are too small if whole blocks of pixels are offset"
             )
         lost = int((~self.used).sum())
         if lost > 0.05 * len(self.used):
-            sentences.append(f"{lost} of {len(self.used)} points are outliers and were left out")
-        return sentences
+            yield f"{lost} of {len(self.used)} points are outliers and were left out"
 
     def geometry_facts(self) -> dict[str, float]:
         """Each parameter with its error, its nominal value and the error of the prior, mm."""

@@ -90,7 +90,7 @@ def _facts(paths: CrestPaths, fit: CrestFit, maps: Mapping[str, NDArray[Any]]) -
         "chi2_reduced": fit.chi2_reduced,
         "evaluations": fit.evaluations,
         "unique_minimum": all(crest_fit.falls_then_rises(cost) for cost in costs),
-        "warnings": fit.warnings(),
+        "warnings": [*fit.warnings()],
     }
 
 

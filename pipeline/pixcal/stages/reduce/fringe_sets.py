@@ -1,6 +1,7 @@
 """Write the datasets of the fringe sets: range, precision, conversion and warnings."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -140,25 +141,23 @@ def share_at_mean(facts: dict[str, Any], bounds: Bounds) -> float | None:
 
 def set_warnings(
     name: str, facts: dict[str, Any], declared: float | None, share: float
-) -> list[str]:
+) -> Iterator[str]:
     """Warnings on a fringe set, given the result of `write_set`.
 
     ``declared``: saturation level, ADU; ``share``: as in `write_set`.
     """
-    warnings = []
     cost = facts["quantisation"]["share_of_variance_dark"]
     if cost > share:
-        warnings.append(
+        yield (
             f"{name}: steps of {facts['quantisation']['step_e']:.3g} e-, which the range of the "
             f"signal needs, add {100 * cost:.2g} % to the variance of a sample without light"
         )
     largest = facts["largest_adu"]
     level = math.inf if declared is None else declared
     if largest < level and any(largest == 2**bits - 1 for bits in _CONVERTERS):
-        warnings.append(
+        yield (
             f"{name}: the largest sample is {largest}, the largest code of a converter; if it "
             f"saturates there, declare detector.saturation_adu: {largest}"
         )
     if facts["mean_e"] is None:
-        warnings.append(f"{name}: no usable samples: all are saturated or missing")
-    return warnings
+        yield f"{name}: no usable samples: all are saturated or missing"

@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -120,7 +121,7 @@ def _flats(source: Ingested, levels: Mask) -> list[int]:
     return sorted(frame for group, wanted in chosen if wanted for frame in group.frames)
 
 
-def _dark_lines(mask: ArrayReader, shape: tuple[int, int]) -> list[str]:
+def _dark_lines(mask: ArrayReader, shape: tuple[int, int]) -> Iterator[str]:
     """Warnings on neighbouring rows or columns without any light."""
     dark = {"rows": np.ones(shape[0], np.bool_), "columns": np.ones(shape[1], np.bool_)}
     for strip in strips(indices(shape), STRIP):
@@ -128,16 +129,14 @@ def _dark_lines(mask: ArrayReader, shape: tuple[int, int]) -> list[str]:
         dead = mask.read((y0, y1), (x0, x1)) & PixelFlag.DEAD > 0
         dark["rows"][y0:y1] &= dead.all(axis=1)
         dark["columns"][x0:x1] &= dead.all(axis=0)
-    said = []
     for name, lines in dark.items():
         ends = np.flatnonzero(np.diff(lines, prepend=False, append=False)).reshape(-1, 2)
         spans = [f"{a} to {b - 1}" for a, b in ends if b - a >= _LINES]
         if spans and not lines.all():
-            said.append(
+            yield (
                 f"{name} {', '.join(spans)} see no light and are masked as dead: an overscan, or a "
                 "border of the detector"
             )
-    return said
 
 
 def _count_flags(mask: Place, shape: tuple[int, int]) -> dict[str, int]:
