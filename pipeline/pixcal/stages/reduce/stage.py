@@ -5,6 +5,7 @@ and verifies their checksums.
 """
 
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +13,14 @@ import numpy as np
 
 from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
+from pixcal.estimators.detector.multiplication import (
+    EXCESS,
+    EXCESS_ERROR,
+    MIN_FRAMES,
+    Skew,
+    is_multiplied,
+    skew,
+)
 from pixcal.model.config import result_options
 from pixcal.model.errors import InputError
 from pixcal.model.options import Reduce
@@ -19,15 +28,16 @@ from pixcal.stages.reduce.calibration import FLAT_FLOOR, Finishing, calibration_
 from pixcal.stages.reduce.columns import run_noted, strip_width
 from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, summarise
 from pixcal.stages.reduce.electrons import convert_bytes
+from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.flat_survey import rough_gain
 from pixcal.stages.reduce.frame_statistics import measure
 from pixcal.stages.reduce.fringe_sets import Bounds, write_set
+from pixcal.stages.reduce.halves import frames_of
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduce.measuring import Measuring, measure_bytes, statistics_writers
-from pixcal.stages.reduce.multiplied import with_excess_noise
 from pixcal.stages.reduce.reduction import Reduction, write_reduction
 from pixcal.stages.reduce.subtracted import subtracted_rate
-from pixcal.stages.tiles import STRIP, indices, strips
+from pixcal.stages.tiles import STRIP, centred, indices, strips
 from pixcal.storage.artefact import Build, Workspace
 from pixcal.storage.cube import create_group
 from pixcal.storage.cube_place import base_of, chosen_base
@@ -38,6 +48,8 @@ from pixcal.storage.place import Place
 from pixcal.storage.stage import make, working
 
 _SHARED_BYTES = 64 << 20
+SKEW_SIDE = 512  # longest side of the middle of the detector whose frames are read
+SKEW_FRAMES = 16  # most frames of a level that are read
 
 
 Config = Reduce
@@ -91,7 +103,7 @@ def reduce_frames(made: Workspace, source: Ingested, config: Config, runtime: Ru
     for writer in job.writers.values():
         writer.finish()
     summary = summarise(job, made.scratch / "statistics", source)
-    summary = with_excess_noise(summary, source, job)
+    summary = _with_excess_noise(summary, source, job)
     gain = summary.gain_to_use(config.gain, bool(exposures.dark))
     bounds = _calibrate(made, source, summary, job, gain, runtime)
     sets = {}
@@ -170,3 +182,30 @@ def _calibrate(
     if not math.isfinite(least):
         return Bounds((1.0, 1.0), 0.0, 0.0, read_noise)
     return Bounds((least, float(largest[0])), float(largest[1]), float(largest[2]), read_noise)
+
+
+def _with_excess_noise(summary: Summary, source: Ingested, job: Measuring) -> Summary:
+    """The summary with the gain of electrons, where a register multiplied them."""
+    # The slope of photon transfer is then F² times that of the light. F² is that of a large
+    # multiplication, as only the third moment of the noise is known.
+    gain, dark = summary.gain, job.read_series
+    if gain is None or dark is None or len(dark.frames) < MIN_FRAMES:
+        return summary
+    slope, variance = 1 / gain.gain, max(gain.read_variance[0], job.quantum**2 / 12)
+
+    def of(group: Group, level: float) -> Skew | None:
+        used, window = group.frames[:SKEW_FRAMES], centred(job.shape, SKEW_SIDE)
+        frames = np.stack([*frames_of(source, group.array, used, window)])
+        good = np.ones(frames.shape[1:], np.bool_)
+        return skew(frames.astype(np.float32), level, variance, slope, good, job.quantum)
+
+    groups = [(dark, 0.0)]
+    groups += [
+        (group, float(level))
+        for group, level, used in zip(job.flat, summary.levels, summary.usable, strict=True)
+        if used and len(group.frames) >= MIN_FRAMES
+    ]
+    points = [of(*one) for one in groups]
+    if points[0] is None or not is_multiplied((p for p in points if p is not None), slope):
+        return summary
+    return replace(summary, gain=replace(gain, excess=(EXCESS, EXCESS * EXCESS_ERROR)))

@@ -5,8 +5,9 @@ computes from the bench and its effects only.
 """
 
 import shutil
-from collections.abc import Callable
-from dataclasses import fields
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from datetime import datetime, timedelta
 from functools import partial
 from itertools import product
@@ -28,12 +29,11 @@ from pixcal.model.yaml_file import to_yaml
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import Recording, recordings
-from pixcal.stages.simulate.target import Target
 from pixcal.stages.simulate.truth import row_blocks, write_truth
 from pixcal.storage.artefact import artefact_key
-from pixcal.storage.formats import STAGES
+from pixcal.storage.formats import STAGES, ArtefactKind
 from pixcal.storage.lock import lock
-from pixcal.storage.manifest import Manifest, file_digest
+from pixcal.storage.manifest import MANIFEST, Manifest, file_digest, read_manifest, write_manifest
 from pixcal.storage.products import COMPRESSED, FrameWriter, ascii_text
 
 STAGE, TRUTH = STAGES["simulate"], STAGES["simulate-truth"]
@@ -206,3 +206,82 @@ def _write_description(bench: Bench, folder: Path) -> None:
         ),
     )
     (folder / "acquisition.yaml").write_text(to_yaml(contents), encoding="utf-8")
+
+
+# Output directories, built at a temporary place and then moved
+
+
+@dataclass(frozen=True)
+class Target:
+    """A directory to write, the option that names it, and the kind of its contents."""
+
+    final: Path
+    option: str
+    stage: ArtefactKind
+
+    @classmethod
+    def of(cls, folder: Path, option: str, stage: ArtefactKind) -> "Target":
+        """Target at a given directory, which may not exist yet."""
+        try:
+            folder = folder.resolve()
+            folder.parent.mkdir(parents=True, exist_ok=True)
+        except (OSError, RuntimeError) as error:  # the latter for circular links
+            raise InputError(
+                f"{option} {folder}: cannot be created ({error}); choose another"
+            ) from error
+        return cls(folder, option, stage)
+
+    @property
+    def aside(self) -> Path:
+        """Temporary place where the directory is built."""
+        return self.final.with_name(f".{self.final.name}.partial")
+
+    def up_to_date(self, key: str) -> Manifest | None:
+        """Manifest of the present directory, if it has this key and is complete."""
+        folder, place = self.final, f"{self.option} {self.final}"
+        if not folder.exists():
+            return None
+        if not folder.is_dir():
+            raise InputError(f"{place}: is a file; choose another directory")
+        there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if not p.is_dir()}
+        if not there:
+            return None
+        manifest = read_manifest(folder)
+        if manifest is None or manifest.stage != self.stage.name:
+            raise InputError(
+                f"{place}: not empty, and not made by 'pixcal simulate'; choose another"
+            )
+        foreign = sorted(there - set(manifest.summary.get("files", {})) - {MANIFEST})
+        if foreign:
+            raise InputError(f"{folder / foreign[0]}: not made by 'pixcal simulate'; move it away")
+        whole = manifest.key == key and _sizes(folder) == manifest.summary.get("files")
+        return manifest if whole else None
+
+    @contextmanager
+    def building(self) -> Iterator[Path]:
+        """An empty temporary directory for the contents, removed at the end."""
+        made = self.aside / "made"
+        try:
+            shutil.rmtree(made, ignore_errors=True)
+            made.mkdir(parents=True)
+            yield made
+        finally:
+            shutil.rmtree(self.aside, ignore_errors=True)
+
+    def put_in_place(self, key: str, config: dict[str, Any]) -> Manifest:
+        """Write the manifest and replace the present directory by the new one."""
+        made, stage = self.aside / "made", self.stage
+        summary = {"files": _sizes(made)}
+        manifest = Manifest(stage.name, stage.format, key, config, {}, summary=summary)
+        write_manifest(made, manifest)
+        if self.final.exists():
+            old = self.aside / "replaced"
+            shutil.rmtree(old, ignore_errors=True)
+            self.final.rename(old)
+        made.rename(self.final)
+        return manifest
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    files = (p for p in sorted(folder.rglob("*")) if p.is_file() and p != folder / MANIFEST)
+    return {p.relative_to(folder).as_posix(): p.stat().st_size for p in files}
