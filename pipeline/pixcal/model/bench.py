@@ -266,11 +266,6 @@ class SimulatedFrames:
         if seconds > MAX_DURATION_S or not 1858 < moment.year < 2200:
             raise InputError(f"start: {self.start!r:.80} and {seconds:g} s later: not a date")
 
-    @property
-    def start_time(self) -> datetime:
-        """Time of the first frame (UTC, without a zone)."""
-        return datetime.fromisoformat(self.start).replace(tzinfo=None)
-
 
 # Computed once, because a diagnosis uses them thousands of times.
 _OPTICS_OF_SETS = {f.name for f in fields(SimulatedOptics)} & {f.name for f in fields(SimulatedSet)}

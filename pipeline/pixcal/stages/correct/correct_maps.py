@@ -222,7 +222,9 @@ def sides_of(sets: Sequence[Swept]) -> Sides:
     """Sides at which the detector extends beyond the window, from the maps of all sets."""
     misfits = np.zeros((4, 2))
     for swept in sets:
-        if swept.passes_borders and min(swept.source.shape) >= 2 * DEPTH:
+        # Pixels beyond the window matter if a correction moves charge.
+        moves = any(effect.undo_halo for effect in (*swept.effects, *swept.samples))
+        if moves and min(swept.source.shape) >= 2 * DEPTH:
             for side in range(4):
                 misfits[side] += [_misfit(swept, side, is_open) for is_open in (False, True)]
     return open_sides(misfits)

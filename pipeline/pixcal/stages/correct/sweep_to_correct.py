@@ -91,11 +91,6 @@ class Swept:
         """Pixels around a tile that are read with it."""
         return FILL_REACH + sum(effect.undo_halo for effect in (*self.effects, *self.samples))
 
-    @property
-    def passes_borders(self) -> bool:
-        """Whether a correction moves charge, so that pixels beyond the window matter."""
-        return any(effect.undo_halo for effect in (*self.effects, *self.samples))
-
     def around(self, y: tuple[int, int], x: tuple[int, int]) -> Part:
         """A tile with its halo, which extends beyond the window at open sides only."""
         ny, nx = self.source.shape

@@ -155,7 +155,7 @@ def _create_files(bench: Bench, recording: Recording, folder: Path) -> list[Fram
 def _cards(bench: Bench, recording: Recording, frame: int) -> dict[str, Any]:
     """Header of a file whose first frame has this number."""
     seconds = recording.start_s + frame * recording.period_s
-    start = bench.frames.start_time
+    start = datetime.fromisoformat(bench.frames.start).replace(tzinfo=None)
     mjd = (start - _MJD_EPOCH) / timedelta(days=1) + seconds / 86400
     moment = start + timedelta(seconds=seconds)
     return {
