@@ -168,7 +168,6 @@ def test_no_module_imports_itself_in_a_circle() -> None:
 MOST_MODULE_LINES = 300
 LONG_MODULES = {
     "pixcal.model.options": "every option of every command, defined once",
-    "pixcal.model.bench": "every key of a bench file",
     "pixcal.kernels.bilinear": "one file, so that Numba's cache notices changes",
     "pixcal.stages.diagnose.search": "one search, whose steps share what it has tried",
     "pixcal.estimators.fringe_fit.scout": "one class: the steps to the frames of a set",

@@ -24,14 +24,12 @@ class Detector:
 
     pitch_um: float = quantity(unit="um", low=0.01, high=1000, doc="pixel pitch")
     read_noise_e: float = quantity(unit="e-", low=0, high=1e6, doc="read noise, rms")
-    gain_e_per_adu: float | None = quantity(
-        None, unit="e-/ADU", low=1e-6, high=1e6, doc="conversion gain; default: that of the flats"
-    )
+    gain_e_per_adu: float | None = quantity(None, unit="e-/ADU", low=1e-6, high=1e6)
+    """conversion gain; default: that of the flats"""
     name: str = quantity("", doc="free text")
     full_well_e: float | None = quantity(None, unit="e-", low=1, high=1e12, doc="full well")
-    saturation_adu: float | None = quantity(
-        None, unit="ADU", above=0, high=1e12, doc="samples at or above this level are saturated"
-    )
+    saturation_adu: float | None = quantity(None, unit="ADU", above=0, high=1e12)
+    """samples at or above this level are saturated"""
 
     def __post_init__(self) -> None:
         check_printable(self.name)
@@ -43,9 +41,8 @@ class Optics:
 
     wavelength_nm: float = quantity(unit="nm", low=1, high=1e6, doc="laser wavelength")
     distance_mm: float = quantity(unit="mm", low=0.1, high=1e7, doc="fibres to detector, nominal")
-    frame_period_s: float | None = quantity(
-        None, unit="s", low=1e-9, high=1e9, doc="used where the headers hold no time stamps"
-    )
+    frame_period_s: float | None = quantity(None, unit="s", low=1e-9, high=1e9)
+    """used where the headers hold no time stamps"""
 
 
 def check_printable(name: str) -> None:
@@ -88,9 +85,8 @@ class FringeScan:
 
     name: str = quantity(doc="letters, digits, '-' and '_'")
     files: tuple[str, ...] = quantity(doc="globs relative to acquisition.yaml")
-    baseline_mm: tuple[float, float] = quantity(
-        unit="mm", low=-1e4, high=1e4, doc="fibre B minus fibre A along x and y"
-    )
+    baseline_mm: tuple[float, float] = quantity(unit="mm", low=-1e4, high=1e4)
+    """fibre B minus fibre A along x and y"""
 
     def __post_init__(self) -> None:
         check_set(self.name, self.baseline_mm)

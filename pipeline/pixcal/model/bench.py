@@ -44,34 +44,28 @@ class SimulatedDetector:
     name: str = as_in(acquisition.Detector, "name")
     seed: int = _seed(doc="random seed of the detector: its fixed patterns")
     chip: tuple[int, int] | None = _px(None, doc="whole chip: [rows, columns]; default: the window")
-    origin_px: tuple[int, int] | None = _px(
-        None, low=0, doc="first pixel of the window; default: window in the centre"
-    )
+    origin_px: tuple[int, int] | None = _px(None, low=0)
+    """first pixel of the window; default: window in the centre"""
     bits: int = quantity(16, low=1, high=16, doc="of the analogue-to-digital converter")
-    step_adu: int = quantity(
-        1, unit="ADU", low=1, high=4096, doc="step of the samples (16: 12 bits written as 16)"
-    )
-    saturation_adu: float | None = quantity(
-        None, unit="ADU", above=0, doc="samples are clipped here; default: highest code"
-    )
+    step_adu: int = quantity(1, unit="ADU", low=1, high=4096)
+    """step of the samples (16: 12 bits written as 16)"""
+    saturation_adu: float | None = quantity(None, unit="ADU", above=0)
+    """samples are clipped here; default: highest code"""
     lowest_adu: int = _adu(0, doc="lowest code: lower samples are read as this")
-    full_well_e: float | None = quantity(
-        None, unit="e-", low=1, high=1e7, doc="charge is clipped here; default: never"
-    )
+    full_well_e: float | None = quantity(None, unit="e-", low=1, high=1e7)
+    """charge is clipped here; default: never"""
     bias_adu: float = _adu(500.0, doc="mean bias")
     bias_pixel_rms_adu: float = _adu(0.0, doc="rms of the bias pattern from pixel to pixel")
     bias_column_rms_adu: float = _adu(0.0, doc="rms of the bias pattern from column to column")
     dark_e_s: float = _rate(0.0, doc="dark current")
     hot_fraction: float = _share(doc="share of the pixels that are hot")
-    hot_rate_e_s: float = _rate(
-        0.0, doc="mean dark current of hot pixels; each has at least half of it"
-    )
+    hot_rate_e_s: float = _rate(0.0)
+    """mean dark current of hot pixels; each has at least half of it"""
     dead_fraction: float = _share(doc="share of the pixels without response")
     prnu_rms: float = _share(doc="relative rms of the response from pixel to pixel")
     delta_rms_px: float = _share(unit="px", doc="rms offset from pixel to pixel, each axis")
-    stitch_rms_px: float = _share(
-        unit="px", doc="rms offset from stitching block to block, each axis"
-    )
+    stitch_rms_px: float = _share(unit="px")
+    """rms offset from stitching block to block, each axis"""
     stitch_px: tuple[int, int] = _px((64, 64), doc="stitching block: [rows, columns]")
     temperature_c: float = quantity(35.0, unit="C", low=-273.15, high=200, doc="for the headers")
 
@@ -132,19 +126,16 @@ class SimulatedOptics:
 
     wavelength_nm: float = as_in(acquisition.Optics, "wavelength_nm")
     distance_mm: float = _length(doc="fibres to detector, true")
-    beam_radius_mm: float = quantity(
-        unit="mm", low=1e-3, high=1e7, doc="1/e² radius of each fibre's light on the detector"
-    )
-    nominal_distance_mm: float | None = _length(
-        None, doc="declared distance; default: the true one"
-    )
+    beam_radius_mm: float = quantity(unit="mm", low=1e-3, high=1e7)
+    """1/e² radius of each fibre's light on the detector"""
+    nominal_distance_mm: float | None = _length(None)
+    """declared distance; default: the true one"""
     offset_mm: tuple[float, float] = _place(doc="projected centre of the fibres: [x, y]")
     pointing_a_mm: tuple[float, float] = _place(doc="peak of A's light from the projection of A")
     pointing_b_mm: tuple[float, float] = _place(doc="peak of B's light from the projection of B")
     power_ratio: float = quantity(1.0, low=1e-3, high=1e3, doc="power of B over that of A")
-    visibility: float = quantity(
-        1.0, above=0, high=1, doc="contrast where both fibres give the same intensity"
-    )
+    visibility: float = quantity(1.0, above=0, high=1)
+    """contrast where both fibres give the same intensity"""
 
     moved: ClassVar = {
         "laser_noise_rms": "effects.intensity_noise.rms",
@@ -164,19 +155,10 @@ class SimulatedSet:
     name: str = as_in(acquisition.FringeScan, "name")
     baseline_mm: tuple[float, float] = as_in(acquisition.FringeScan, "baseline_mm")
     count: int = _count(low=1)
-    peak_e: float = quantity(
-        unit="e-",
-        low=1e-3,
-        high=1e7,
-        doc="signal of the brightest fringe in the window, for unit response and mean power",
-    )
-    baseline_z_mm: float = quantity(
-        0.0,
-        unit="mm",
-        low=-1e4,
-        high=1e4,
-        doc="fibre B minus fibre A along the optical axis (tilt)",
-    )
+    peak_e: float = quantity(unit="e-", low=1e-3, high=1e7)
+    """signal of the brightest fringe in the window, for unit response and mean power"""
+    baseline_z_mm: float = quantity(0.0, unit="mm", low=-1e4, high=1e4)
+    """fibre B minus fibre A along the optical axis (tilt)"""
     offset_mm: tuple[float, float] | None = _of_pair("offset_mm", "centre of this pair")
     distance_mm: float | None = _of_pair("distance_mm", "of this pair, true")
     beam_radius_mm: float | None = _of_pair("beam_radius_mm", "of this pair's light")
@@ -184,9 +166,8 @@ class SimulatedSet:
     pointing_b_mm: tuple[float, float] | None = _of_pair("pointing_b_mm", "of this pair's fibre B")
     power_ratio: float | None = _of_pair("power_ratio", "of this pair, B over A")
     visibility: float | None = _of_pair("visibility", "of this pair")
-    phase_law: str = quantity(
-        "random", choices=("random", "ramp"), doc="random: uniform over 2π; ramp: equal steps"
-    )
+    phase_law: str = quantity("random", choices=("random", "ramp"))
+    """random: uniform over 2π; ramp: equal steps"""
     phase_step_rad: float = quantity(0.0, unit="rad", low=-1e3, high=1e3, doc="step of a ramp")
 
     moved: ClassVar = {
@@ -225,15 +206,12 @@ class SimulatedFrames:
     compress: tuple[str, ...] = quantity((), doc="bias, dark, flat or sets to tile-compress (RICE)")
     bias: int = _count(0, low=0, doc="number of bias frames")
     bias_exptime_s: float = _time(0.0, doc="of the bias frames")
-    darks: tuple[ExposureStep, ...] = quantity(
-        (), doc="dark frames, one entry for each exposure time"
-    )
-    flats: tuple[ExposureStep, ...] = quantity(
-        (), doc="flats under a steady lamp, one entry for each exposure time"
-    )
-    flat_rate_e_s: float | None = quantity(
-        None, unit="e-/s", low=1e-3, high=1e12, doc="signal rate under the lamp, for unit response"
-    )
+    darks: tuple[ExposureStep, ...] = quantity(())
+    """dark frames, one entry for each exposure time"""
+    flats: tuple[ExposureStep, ...] = quantity(())
+    """flats under a steady lamp, one entry for each exposure time"""
+    flat_rate_e_s: float | None = quantity(None, unit="e-/s", low=1e-3, high=1e12)
+    """signal rate under the lamp, for unit response"""
     fringes: tuple[SimulatedSet, ...] = quantity((), doc="the fringe sets")
 
     def __post_init__(self) -> None:

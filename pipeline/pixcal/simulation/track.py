@@ -22,9 +22,8 @@ class Track(Scalable):
     strengths = ("value",)
 
     set: str = quantity(doc="name of the fringe set")
-    time_s: tuple[float, ...] = quantity(
-        unit="s", doc="seconds after the first frame of the set, ascending"
-    )
+    time_s: tuple[float, ...] = quantity(unit="s")
+    """seconds after the first frame of the set, ascending"""
     value: tuple[float, ...] = quantity(low=-1e6, high=1e6, doc="values at these times")
 
     @classmethod
