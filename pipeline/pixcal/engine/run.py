@@ -27,6 +27,7 @@ from rich.progress import (
 from threadpoolctl import ThreadpoolController
 
 from pixcal.engine.bounds import other_memory
+from pixcal.engine.malloc import keep_freed_memory
 from pixcal.engine.remote_task import Job, RemoteTask, pack
 from pixcal.model.errors import ClusterError, InputError
 from pixcal.model.options import Running
@@ -115,6 +116,7 @@ def run_tasks(
 
     ``done`` is called here with the number and result of each item as its task ends.
     """
+    keep_freed_memory()
     results: dict[int, R] = {}
     times = (TimeElapsedColumn(), "left", TimeRemainingColumn())
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), *times)
