@@ -7,12 +7,7 @@ import numpy as np
 
 from pixcal.effects._level_change import LevelChange
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.light import (
-    ambient_shares,
-    gain_share,
-    light_changes,
-    separate_powers,
-)
+from pixcal.estimators.frame_series import light
 from pixcal.kernels.scene import FrameStates
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.config import quantity
@@ -61,7 +56,7 @@ class IntensityNoise(LevelChange):
         return replace(states, level=states.level * level, amplitude=states.amplitude * fringe)
 
     def replayed(self, evidence: Evidence) -> Self | None:
-        courses = light_changes(evidence)
+        courses = light.light_changes(evidence)
         share = {name: self._ambient(n) for n, name in enumerate(evidence.fringes)}
         tracks = tuple(
             Track.of(name, time, level / (1 - share[name])) for name, time, level, _ in courses
@@ -85,16 +80,16 @@ class IntensityNoise(LevelChange):
         estimate = super().estimate(evidence)
         if estimate is None:
             return None
-        of_gain, of_gain_error = gain_share(evidence)
+        of_gain, of_gain_error = light.gain_share(evidence)
         if of_gain > max(0.5, SIGNIFICANT * of_gain_error):
             return replace(estimate, refused="its noise rises as that of a gain that varies")
         assert isinstance(estimate.effect, cls)
         effect = estimate.effect
-        shares = ambient_shares(evidence)
+        shares = light.ambient_shares(evidence)
         if any(SIGNIFICANT * error < share < MAX_AMBIENT for share, error in shares):
             ambient = tuple(float(np.clip(share, 0, MAX_AMBIENT)) for share, _ in shares)
             effect = replace(effect, ambient=ambient)
         elif estimate.significance > SIGNIFICANT:
-            effect = replace(effect, separate=separate_powers(evidence))
+            effect = replace(effect, separate=light.separate_powers(evidence))
         law = "the powers of the two fibres vary separately" if effect.separate else estimate.law
         return replace(estimate, effect=effect, law=law)

@@ -13,13 +13,7 @@ from pixcal.estimators.detector.noiseless_charge import missing_noise
 from pixcal.estimators.detector.persistence import LONGEST, persistence
 from pixcal.estimators.diagnosis.central_crop import central_crop
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
-from pixcal.kernels.charge_release import (
-    BANDS,
-    fill_traps,
-    in_bands,
-    left_behind,
-    released_by_frame,
-)
+from pixcal.kernels import charge_release
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best
 from pixcal.model.arrays import F32, F64
@@ -192,8 +186,8 @@ class Lag(Effect):
         """
         taken = self._left(charge, np.float32(self.share))
         if self._by_frame:
-            return released_by_frame(taken, self.releases)
-        return fill_traps(taken, self._keep, self.capacity_e or np.inf)
+            return charge_release.released_by_frame(taken, self.releases)
+        return charge_release.fill_traps(taken, self._keep, self.capacity_e or np.inf)
 
     def _left_behind(self, charge: F32, shot: Shot, noisy: float = 1.0) -> F32:
         """Electrons of a frame that stay, each independently, so that noise stays white."""
@@ -201,13 +195,13 @@ class Lag(Effect):
         noise = np.zeros_like(charge)
         if shot.bench.shot_noise and noisy > 0:
             noise = shot.normals(self.name) * np.float32(np.sqrt(noisy))
-        return left_behind(charge, self._left(charge, share), share, noise)
+        return charge_release.left_behind(charge, self._left(charge, share), share, noise)
 
     def _left(self, charge: F32, share: F32 | np.float32) -> F32:
         """Mean charge left behind, e-; ``share``: of the pixels, or of all."""
         if not self.bands:
             return np.asarray(share * charge)
-        parts = in_bands(charge, self.level_e, len(self.bands))
+        parts = charge_release.in_bands(charge, self.level_e, len(self.bands))
         every = (np.float32(w) * part for w, part in zip(self.bands, parts, strict=True))
         return np.asarray(share * sum(every))
 
@@ -256,7 +250,7 @@ class Lag(Effect):
         """With a share that depends on the level, or that traps limit; the parameters of either."""
 
         def lag(values: F64) -> Lag:
-            alone = len(values) == len(BANDS)
+            alone = len(values) == len(charge_release.BANDS)
             *shares, decay, capacity = (*values, 0.0, 0.0) if alone else values
             share = self.share if alone else min(float(shares[0]), 0.5)
             bands = np.clip(np.array(shares) / share, 0, _LARGEST) if len(shares) > 1 else ()

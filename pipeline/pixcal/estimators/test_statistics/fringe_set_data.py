@@ -19,14 +19,7 @@ from pixcal.estimators.maps.structure import (
     stitched_fields,
     without_outliers,
 )
-from pixcal.kernels.sample_sums import (
-    clipped_residuals,
-    count_remainders,
-    level_sums,
-    neighbour_products,
-    pixel_moments,
-    products_by_level,
-)
+from pixcal.kernels import sample_sums
 from pixcal.model.arrays import C128, F32, F64, Indices, Mask
 
 OUTLIER_SIGMA = 8.0  # standard deviations beyond which a residual counts only as an outlier
@@ -51,7 +44,7 @@ class FringeSetData:
         fringes, maps = self.fringes, (self.fringes.shot_factor, self.fringes.read_variance)
         shot, read = (noise.astype(np.float32) for noise in maps)
         limits = np.array(OUTLIERS)
-        return clipped_residuals(
+        return sample_sums.clipped_residuals(
             fringes.electrons, fringes.model, shot, read, self.good, OUTLIER_SIGMA, limits
         )
 
@@ -111,14 +104,14 @@ class FringeSetData:
         low, high = (float(level) for level in np.quantile(some, (0.005, 0.995)))
         sums = np.zeros((LEVELS, 3))
         step = max(high - low, 1e-9) / LEVELS
-        level_sums(model, self.good, low, step, self._calm[1], self.residual, sums)
+        sample_sums.level_sums(model, self.good, low, step, self._calm[1], self.residual, sums)
         count, total, squares = sums.T
         return total / np.maximum(count, 1), squares / np.maximum(count, 1)
 
     @cached_property
     def moments(self) -> tuple[F64, F64]:
         """Mean square and mean fourth power (y, x) of the residuals over their noise."""
-        second, fourth = pixel_moments(self.residual)
+        second, fourth = sample_sums.pixel_moments(self.residual)
         return second, fourth
 
     @property
@@ -138,7 +131,7 @@ class FringeSetData:
         if codes.dtype.kind not in "iu":
             return None
         every = max(1, len(codes) // 100)
-        count: Indices = count_remainders(codes[::every], self.good, CODES)
+        count: Indices = sample_sums.count_remainders(codes[::every], self.good, CODES)
         return count
 
     @cached_property
@@ -224,7 +217,7 @@ def neighbour_sums(
 ) -> tuple[F64, F64]:
     """Sums (step, y) of products of samples (t, y, x) with good neighbours, and how many."""
     pairs, count = _pairs(good, steps)
-    sums = neighbour_products(values, pairs, np.array(steps), every)
+    sums = sample_sums.neighbour_products(values, pairs, np.array(steps), every)
     return sums, count * len(range(0, len(values), every))
 
 
@@ -234,7 +227,9 @@ def neighbour_sums_by_level(
     """The same, (2, step, y), of products of samples above the median level, and of those below."""
     pairs, count = _pairs(good, steps)
     middle = float(np.median(level[:: 4 * every, good][:, ::SPARSE]))
-    sums = products_by_level(values, level, np.float32(middle), pairs, np.array(steps), every)
+    sums = sample_sums.products_by_level(
+        values, level, np.float32(middle), pairs, np.array(steps), every
+    )
     return sums, count * len(range(0, len(values), every))
 
 
