@@ -20,7 +20,6 @@ LIMITS = {
     "phases": "too few phases",
 }
 
-
 out_option = click.option(
     "--out", type=PATH, metavar="DIR", help="Write budget.json and the picture budget.png there."
 )

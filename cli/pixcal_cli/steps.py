@@ -191,7 +191,6 @@ def electrons(run: Path, files: tuple[Path, ...], config: options.Electrons) -> 
 
 report = step(options.Report, "pixcal report demo")
 
-
 acquisition_option = click.option(
     "--out",
     "acquisition",

@@ -28,11 +28,9 @@ from pixcal.model.errors import ClusterError, InputError
 from pixcal.model.options import Running
 
 AHEAD = 4  # tasks submitted per thread, because the end of a task is reported with a delay
-# least number of submitted tasks, so that an adaptive cluster grows by demand
-MIN_AHEAD = 32
+MIN_AHEAD = 32  # least number of submitted tasks, so that an adaptive cluster grows by demand
 CHECK_INTERVAL_S = 5.0  # interval between checks of the number of threads
-# files that mark a run directory in use (`pixcal.storage.lock`)
-HELD = (".lock", ".partial")
+HELD = (".lock", ".partial")  # files that mark a run directory in use (`pixcal.storage.lock`)
 
 Ended = Callable[[int, Any], None]
 

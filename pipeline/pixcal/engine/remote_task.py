@@ -70,8 +70,7 @@ class Job:
     function: bytes = field(compare=False)  # pickled; called with the item of a task
     # files and folders that must exist on the worker
     paths: tuple[Path, ...] = field(compare=False)
-    # most concurrent tasks per process; 0: no limit
-    at_once: int = field(default=0, compare=False)
+    at_once: int = field(default=0, compare=False)  # most concurrent tasks per process; 0: no limit
     # versions required on the worker (see `versions`)
     versions: dict[str, str] = field(default_factory=dict, compare=False)
     name: str = field(default_factory=lambda: uuid4().hex)

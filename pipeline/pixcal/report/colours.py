@@ -16,8 +16,7 @@ BLUE = "#2667b0"
 RED = "#c1431f"
 GREEN = "#1b8a5a"
 GREY = "#7d8896"
-# one for each map or set in the same axes
-LINES = (BLUE, RED, GREEN, INK)
+LINES = (BLUE, RED, GREEN, INK)  # one for each map or set in the same axes
 # bars of histograms
 BAR = "#b9cbe4"
 # range expected by chance

@@ -19,7 +19,6 @@ from pixcal.report.drawing import WIDE, draw_blocks, finish, new_figure, note
 LONG_TITLE = 10  # points, so that long numbers stay within their panel
 CREST, VALLEY = RED, BLUE
 
-
 # a part of a frame: electrons (y, x), NaN where bad, and (y, x) of its first pixel
 Extract = tuple[NDArray[Any], tuple[int, int]]
 
@@ -36,8 +35,7 @@ class CrestView:
     # sigma_px, residual_px: (point,) errors, and fit minus path, across the fringes, px
     sigma_px: F64
     residual_px: F64
-    # (x, y) of fibres A and B projected on the detector, px
-    fibres: tuple[F64, F64]
+    fibres: tuple[F64, F64]  # (x, y) of fibres A and B projected on the detector, px
     extracts: tuple[Extract, ...]  # about the first and the last path
     best: tuple[float, float]  # distance and baseline of the minimum, mm
     distance_sigma: float  # mm

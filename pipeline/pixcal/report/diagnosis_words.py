@@ -7,8 +7,7 @@ from typing import Any
 from pixcal.report.contents import DiagnosisContents
 from pixcal.report.text import number
 
-# name of the set in `curves.json` for a curve that is not of a single set
-DETECTOR = "detector"
+DETECTOR = "detector"  # name of the set in `curves.json` for a curve that is not of a single set
 _STEPS = ("x+1", "y+1", "x+1 y+1", "x−1 y+1", "x+2", "y+2", "x+3", "y+3", "x+4", "y+4")
 
 

@@ -81,8 +81,7 @@ def _grouped(text: str) -> str:
     return text.replace(",", "\u202f").replace("-", "−")
 
 
-# share of a value below which an error is not that of a measurement
-SMALLEST = 1e-9
+SMALLEST = 1e-9  # share of a value below which an error is not that of a measurement
 
 
 def with_error(value: float | None, error: float | None) -> str:

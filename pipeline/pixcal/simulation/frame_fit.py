@@ -39,8 +39,7 @@ class FrameFit:
     errors: dict[str, float]
     significance: float
     why: str
-    # significance (sigma) of different steady strengths in each set
-    sets_differ: float = -np.inf
+    sets_differ: float = -np.inf  # significance (sigma) of different steady strengths in each set
 
 
 def fit_frames(

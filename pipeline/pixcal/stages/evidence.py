@@ -23,8 +23,7 @@ from pixcal.storage.manifest import read_json
 from pixcal.storage.place import Local
 from pixcal.storage.stage import read_acquisition, require
 
-# first row and column in, and shape of, a window
-Window = tuple[tuple[int, int], tuple[int, int]]
+Window = tuple[tuple[int, int], tuple[int, int]]  # first row and column in, and shape of, a window
 
 MAX_SAMPLES = 1 << 26  # samples of a set that are read into memory (about ten bytes each)
 

@@ -28,8 +28,7 @@ class Treatment:
     effect: Effect
     origin: str  # `diagnosis`, or `nominal`: known to be there before the diagnosis
     errors: Mapping[str, float]  # of its parameters, 1-sigma, by name
-    # one of `CORRECTED`, `in the fit`, `absorbed by the fit` or `not corrected`
-    how: str
+    how: str  # one of `CORRECTED`, `in the fit`, `absorbed by the fit` or `not corrected`
     why: str
     covariance: F64 | None = None  # (n, n) of the parameters, where they were measured together
 

@@ -25,8 +25,7 @@ from pixcal.storage.place import Place, UrlPath, explained
 File = tuple[str, int]  # name and size (bytes)
 
 AHEAD = 4  # files in transit while one is decoded
-# most waiting files per thread; those of an abandoned column are never used
-_KEPT = 2 * AHEAD
+_KEPT = 2 * AHEAD  # most waiting files per thread; those of an abandoned column are never used
 
 
 class ReadAhead:

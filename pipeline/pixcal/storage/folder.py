@@ -16,10 +16,8 @@ from pixcal.storage.place import Place, UrlPath, explained
 # file that an array has beside its metadata: sizes and checksums of its chunks
 INDEX = "chunks.npy"
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)  # system errors that are not due to the file
-# bytes that one task sends to a URL at once; exceeds what it reads ahead
-BATCH_BYTES = 16 << 20
+BATCH_BYTES = 16 << 20  # bytes that one task sends to a URL at once; exceeds what it reads ahead
 MANY_FILES = 250  # number of files above which they are not flushed one by one
-
 
 # name of a file below a folder, such as `c/0/1/2`, and its content in parts
 File = tuple[str, Sequence[bytes]]

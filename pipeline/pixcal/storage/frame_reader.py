@@ -147,5 +147,4 @@ class ChosenFrames:
         return np.concatenate(blocks, out=out)
 
 
-# reader of frames (time, y, x) in any storage
-Reader = ArrayReader | FrameReader | ChosenFrames
+Reader = ArrayReader | FrameReader | ChosenFrames  # reader of frames (time, y, x) in any storage

@@ -17,7 +17,6 @@ FIRST_MJD, LAST_MJD = -678_575, 2_973_482  # days of the years 1 to 9999
 _MJD_EPOCH = datetime(1858, 11, 17, tzinfo=UTC)
 DAY_S = 86400.0
 
-
 _CARD = 80  # characters
 _SMALL = {"m": 1e-3, "milli": 1e-3, "u": 1e-6, "micro": 1e-6}  # of a second
 _UNIT = re.compile(r"\b(m|milli|u|micro)?s(?:ecs?|econds?)?\b")

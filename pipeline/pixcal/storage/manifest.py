@@ -22,8 +22,7 @@ from pixcal.storage.place import Local
 MANIFEST = "manifest.json"
 JOURNAL = "journal.jsonl"
 SCRATCH = "scratch"
-# names of the files of an artefact that were found damaged when read
-DAMAGE = "damage.json"
+DAMAGE = "damage.json"  # names of the files of an artefact that were found damaged when read
 # in an artefact that is complete but not yet flushed to disk: the boot during which it was made
 UNFLUSHED = "unflushed"
 

@@ -18,8 +18,7 @@ from pixcal.model.options import Region
 from pixcal.stages.tiles import Part, Range, spans
 from pixcal.storage.cube_reader import ArrayReader
 
-# chunks of the fit per task, stacked vertically: one file for each length
-TILES_HIGH = 4
+TILES_HIGH = 4  # chunks of the fit per task, stacked vertically: one file for each length
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,7 @@ DETAIL = 128  # side of the part of the error maps that is shown in full resolut
 FIGURE_BYTES = 160 << 20  # Matplotlib and one figure
 _BYTES_PER_PIXEL = 180  # peak of a task per pixel (measured)
 _BYTES_PER_PIXEL_AND_MODE = 13  # additional per mode if there is a truth (measured)
-# peak of a task of the modes' fit, per pixel and mode (measured)
-_BYTES_PER_FITTED_MODE = 28
+_BYTES_PER_FITTED_MODE = 28  # peak of a task of the modes' fit, per pixel and mode (measured)
 # peak of a task of the stars, per pixel of a star's windows (measured)
 _BYTES_PER_WINDOW_PIXEL = 200
 

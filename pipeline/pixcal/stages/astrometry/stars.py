@@ -24,15 +24,13 @@ FULL_WELL_E = 50_000.0  # if the acquisition declares none (paper, table 1)
 WINDOW = 4.0  # half of the default window, in lambda / D: three dark rings
 SAMPLINGS = (0.4, 40.0)  # range of pixels per lambda / D of the table of the pattern
 BATCH = 16  # stars of a task
-# largest share of the position information in masked pixels at a usable place
-MAX_LOST = 0.1
+MAX_LOST = 0.1  # largest share of the position information in masked pixels at a usable place
 # errors of a star at a place: with pixels on a perfect grid or at mapped positions; without and
 # with photon noise; and the first two as predicted by `star_centroids.Star.weights`
 KINDS = ("perfect", "measured", "perfect_photons", "measured_photons", "linear", "linear_measured")
 TILE = 512  # approximate side of a task's part of the map, px
 SHOWN = 96  # most blocks along the longer side of the whole detector's pictures
-# least side of such a block, px: its rms needs a few independent places
-MIN_BLOCK = 8
+MIN_BLOCK = 8  # least side of such a block, px: its rms needs a few independent places
 GRIDS = ("perfect", "measured")
 
 

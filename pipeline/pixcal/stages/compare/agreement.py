@@ -22,8 +22,7 @@ from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64
 
 SEEN = 5.0  # sigma above which a covariance is a signal to which a line can be fitted
-# relative error of the maps' errors to tolerate before a difference counts
-SIGMA_ACCURACY = 0.02
+SIGMA_ACCURACY = 0.02  # relative error of the maps' errors to tolerate before a difference counts
 
 
 def halve(sums: F64) -> F64:
@@ -62,8 +61,7 @@ class Projection:
     """The modes removed from both maps, by unweighted least squares on all good pixels."""
 
     change: F64  # (2, 2 + mode) the maps without their modes, from maps and modes
-    # (mode, mode) inverse of the modes' normal matrix; equal modes count once
-    inverse: F64
+    inverse: F64  # (mode, mode) inverse of the modes' normal matrix; equal modes count once
 
     @classmethod
     def of(cls, pixels: Grouping) -> "Projection":

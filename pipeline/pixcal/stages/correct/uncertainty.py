@@ -17,8 +17,7 @@ from pixcal.simulation.forward import numbers, with_numbers
 from pixcal.stages.correct.sweep_to_correct import Swept, corrected, maps_of
 from pixcal.stages.fit.scouting import scout_tiles
 
-# peak memory of a tile's task per pixel, surroundings included (measured),
-PIXEL_BYTES = 500
+PIXEL_BYTES = 500  # peak memory of a tile's task per pixel, surroundings included (measured),
 EFFECT_BYTES = 40  # per effect,
 SLOPE_BYTES = 24  # and per parameter with a slope
 

@@ -34,8 +34,7 @@ from pixcal.stages.diagnose.thresholds import LAW_ERROR, MAX_RESIDUAL_GAP, MIN_L
 from pixcal.stages.diagnose.trial import Curves, Effects
 
 DRAWS = 200
-# standard deviations by which a cause must change a statistic that tests it
-CHANGED = 3.0
+CHANGED = 3.0  # standard deviations by which a cause must change a statistic that tests it
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,7 @@ from pixcal.storage.stage import read_acquisition, require
 
 # evidence in memory and its run, for each sample of all fringe sets (measured, like the next two)
 EVIDENCE_BYTES = 34
-# a sample of bias, dark or flat: as read, in its run, and as a real number
-CALIBRATION_BYTES = 12
+CALIBRATION_BYTES = 12  # a sample of bias, dark or flat: as read, in its run, and as a real number
 LOOK_BYTES = 50  # additional, for the statistics of one set: for each sample of the largest set
 ESTIMATE_BYTES = 130  # additional, for the largest estimate, which is that of crosstalk
 FEWEST_FRAMES = 24  # fringe frames in each half

@@ -32,8 +32,7 @@ MOST_FRAMES = 1500
 # preceding one; with short ones, both halves have the same drifts
 BLOCKS = ((16, 384), (8, 192), (4, 32), (2, FEWEST))
 TURN = (False, True, True, False)  # which blocks are held out: a steady drift is the same in both
-# first frame, last frame and count, by array
-Frames = dict[str, tuple[int, int, int]]
+Frames = dict[str, tuple[int, int, int]]  # first frame, last frame and count, by array
 LADDER = 3  # exposure times of flats for a linearity curve
 # with equal phase steps, light of neighbouring frames cannot be detected
 RANDOM = "fringes with random phases"

@@ -66,8 +66,7 @@ class Trials:
     """Simulations of the test frames of all windows; none is made twice."""
 
     windows: tuple[Window, ...]
-    # folder for intermediate files; a resumed run finds its simulations there
-    scratch: Path
+    scratch: Path  # folder for intermediate files; a resumed run finds its simulations there
     runtime: Runtime
     signatures: tuple[Signature, ...] = ()  # effects whose estimates are also statistics
     # estimates by name of the effect: from the seed ``exact`` on, parameters are drawn within their

@@ -70,10 +70,8 @@ class Black(NamedTuple):
     """
 
     cut_off: Mapping[str, CutOff]  # arrays whose noise is cut off at their lowest code
-    # `GainFit.without_dark`; None: measured again in each part
-    without_dark: bool | None = None
-    # dark signal (ADU/s) that the camera subtracts: see `subtracted_dark`
-    subtracted: float = 0.0
+    without_dark: bool | None = None  # `GainFit.without_dark`; None: measured again in each part
+    subtracted: float = 0.0  # dark signal (ADU/s) that the camera subtracts: see `subtracted_dark`
     excess_noise_factor: float = 1.0  # `Evidence.excess_noise_factor`, which needs three flats
 
 

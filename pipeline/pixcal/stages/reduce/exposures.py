@@ -9,8 +9,7 @@ import numpy as np
 from pixcal.estimators.detector.calibration import MIN_STEPS
 from pixcal.model.arrays import F32
 
-# relative tolerance of equal exposure times: cameras may write measured times
-_SAME = 1e-3
+_SAME = 1e-3  # relative tolerance of equal exposure times: cameras may write measured times
 
 
 @dataclass(frozen=True)

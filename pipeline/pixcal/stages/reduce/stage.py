@@ -51,7 +51,6 @@ _SHARED_BYTES = 64 << 20
 SKEW_SIDE = 512  # longest side of the middle of the detector whose frames are read
 SKEW_FRAMES = 16  # most frames of a level that are read
 
-
 Config = Reduce
 
 
