@@ -109,9 +109,8 @@ class FrameReader:
         first = rows[0] // BAND
         if (checksums != self._checksums[t, first : first + len(checksums)]).any():
             raise InputError(
-                f"{file.source.path}: its contents differ from those ingested (checksum), "
-                "although size and time agree; restore it, or touch it and run 'pixcal ingest' "
-                "again"
+                f"{file.source.path}: its contents differ from those ingested (checksum), although "
+                "size and time agree; restore it, or touch it and run 'pixcal ingest' again"
             )
 
 

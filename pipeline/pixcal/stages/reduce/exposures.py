@@ -97,9 +97,8 @@ def _group_darks(exposures: Exposures, times: Mapping[str, list[float | None]]) 
         exposures.warnings.append(f"no EXPTIME in {unknown} of {len(dark)} dark frames: not used")
     if not exposures.dark:
         exposures.warnings.append(
-            "no bias and no dark frames: bias and dark signal are assumed to be zero, "
-            "the gain is not "
-            "measured, and signals include the bias"
+            "no bias and no dark frames: bias and dark signal are assumed to be zero, the gain is "
+            "not measured, and signals include the bias"
         )
     elif not bias and not exposures.has_rate:
         exposures.warnings.append(
