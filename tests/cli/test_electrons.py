@@ -146,6 +146,34 @@ def test_what_cannot_be_used_is_named_and_nothing_is_written(
     assert "add --overwrite" in capsys.readouterr().err
 
 
+def test_raw_frames_are_not_replaced(
+    run: Path, bench: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    raw = tmp_path / "sky.fits"
+    fits.PrimaryHDU(np.full(SHAPE, 900, np.uint16)).writeto(raw)
+    before = raw.read_bytes()
+    assert frames(run, raw, "--out", tmp_path, "--overwrite", "--exptime", 1) == 2
+    assert "is a raw frame" in capsys.readouterr().err
+    assert raw.read_bytes() == before
+    assert frames(run, tmp_path, "--out", tmp_path / "out") == 2
+
+
+@pytest.mark.parametrize(
+    "card", ["DATE-OBS= 2026-01-01T00:00:00", "observer= 'x'", "GAIN    = 1.2.3", "COMMENT \x01"]
+)
+def test_cards_that_fits_does_not_allow_are_mended_or_left_out(
+    run: Path, card: str, tmp_path: Path
+) -> None:
+    raw, image = tmp_path / "sky.fits", fits.PrimaryHDU(np.full(SHAPE, 900, np.uint16))
+    image.header["TOSPOIL"] = 1
+    image.writeto(raw)
+    text = raw.read_bytes()
+    at = text.index(b"TOSPOIL")
+    raw.write_bytes(text[:at] + card.ljust(80).encode() + text[at + 80 :])
+    assert frames(run, raw, "--out", tmp_path / "out") == 0
+    assert len(stack(tmp_path / "out")) == 1
+
+
 def test_a_picture_needs_an_exposure_time_if_there_is_dark_signal(
     run: Path, tmp_path: Path, reseal: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:

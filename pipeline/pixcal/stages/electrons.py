@@ -124,6 +124,8 @@ def run(run_dir: Path, files: Sequence[Path], config: Electrons) -> Converted:
         for out in outs:
             if out in taken:
                 raise InputError(f"{path}: {out} is that of another file, too; rename one of them")
+            if out.exists() and any(out.samefile(file) for file in files if file.exists()):
+                raise InputError(f"{out}: is a raw frame; choose another --out")
             if out.exists() and not config.overwrite:
                 raise InputError(f"{out}: exists; choose another --out, or add --overwrite")
         taken.update(outs)

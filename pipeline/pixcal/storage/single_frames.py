@@ -1,7 +1,9 @@
 """Frames of one file, one after the other, with its header."""
 
 import tempfile
+import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,10 +47,17 @@ class FramesOfFile:
 
     def header(self) -> fits.Header:
         """What the file says besides its samples; empty for TIFF and PNG."""
+        kept = fits.Header()
         if self.file.container == "picture":
-            return fits.Header()
-        header = fits.getheader(self.file.source.path, self.file.hdu)
-        header.strip()
-        for key in _OF_SAMPLES:
-            header.remove(key, ignore_missing=True)
-        return header
+            return kept
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            header = fits.getheader(self.file.source.path, self.file.hdu)
+            header.strip()
+            for card in header.cards:
+                # Cameras write cards that FITS does not allow; some cannot be mended.
+                with suppress(fits.VerifyError, ValueError):
+                    card.verify("silentfix")
+                    if card.keyword not in _OF_SAMPLES:
+                        kept.append(fits.Card(card.keyword, card.value, card.comment))
+        return kept
