@@ -49,3 +49,16 @@ def test_noise_of_rows_stays(acquired: Callable[..., Evidence]) -> None:
         differences(one, one.of_kind("flat")[-1]).mean(axis=2).std() for one in (evidence, noisy)
     )
     assert found > 1.3 * plain
+
+
+def test_frames_that_do_not_differ_have_no_statistics_of_noise(
+    acquired: Callable[..., Evidence],
+) -> None:
+    """Copies of one frame, or frames that an effect drives below the converter's zero."""
+    evidence = replace(acquired(), fringes={})
+    stacks = evidence.stacks
+    same = tuple(replace(s, adu=s.adu * (s.kind != "bias")) for s in stacks)
+    usual, without = (measure(replace(evidence, stacks=s)) for s in (stacks, same))
+    lost = {name for name, _ in usual.keys() - without.keys()}
+    assert {"bias_smooth_patterns", "bias_tone", "bias_line_repeats"} <= lost
+    assert all(name.startswith("bias") for name in lost)

@@ -42,7 +42,8 @@ def differences(evidence: Evidence, stack: Stack) -> F32:
         steps = np.asarray((flat - flat @ basis @ basis.T).reshape(steps.shape))
     steps -= frame_means(steps, good)[:, None, None].astype(np.float32)
     # Root mean squares, as medians of integers are quantised.
-    rest = steps / np.sqrt((steps[:, good] ** 2).mean())
+    noise = np.sqrt((steps[:, good] ** 2).mean())
+    rest = steps / noise if noise > 0 else steps
     rest[np.abs(rest) > OUTLIER_SIGMA] = 0
     return np.asarray(rest * good, np.float32)
 
@@ -61,11 +62,12 @@ def _gradient(evidence: Evidence) -> F32:
 
 
 def repeated(evidence: Evidence, kind: str) -> tuple[Stack, ...]:
-    """Stacks of a kind with several frames, whose noise is not hidden by rounding."""
+    """Stacks of a kind whose frames differ, by noise that is not hidden by rounding."""
     if kind != "flat" and not evidence.dithered:
         return ()
     stacks = evidence.ladder if kind == "flat" else evidence.of_kind(kind)
-    return tuple(s for s in stacks if len(s.adu) >= 2)
+    # Copies of one frame, and frames that are clipped everywhere, do not differ.
+    return tuple(s for s in stacks if len(s.adu) >= 2 and differences(evidence, s).any())
 
 
 def _correlation(evidence: Evidence, stacks: Sequence[Stack]) -> F64:
