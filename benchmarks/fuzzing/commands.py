@@ -194,7 +194,7 @@ def choices() -> list[tuple[Words, click.Command, click.Parameter, str]]:
 def _line(words: Words, command: click.Command, bad: click.Parameter, value: str) -> list[str]:
     """A command line that is good but for one value."""
     good = {"acquisition": "acq", "run": "run", "runs": "run", "bench": "bench.yaml"}
-    good |= {"out": "new.fits", "fwhm_px": "2.5", "table": "stars.csv"}
+    good |= {"out": "new.fits", "fwhm_px": "2.5", "table": "stars.csv", "files": "sky.fits"}
     if words[0] in ("run", "ingest"):
         good["run"] = "out"
     if words[0] == "simulate":
@@ -223,6 +223,7 @@ def _option(case: Case) -> None:
     (here / "file").write_text("kept")
     (here / "rubbish.json").write_text("{")
     (here / "stars.csv").write_text("x,y\n10.5,12.25\n")
+    shutil.copy(next((here / "acq").rglob("*.fits")), here / "sky.fits")
     (here / "loop").symlink_to("loop")
     (here / "full").mkdir()
     (here / "full" / "mine.txt").write_text("kept")

@@ -145,7 +145,9 @@ def centroids(run: Path, table: Path, config: options.Centroids) -> None:
 
     corrected = stage.correct_table(run, table, config)
     good = np.isfinite(corrected.place[:, 0])
-    click.echo(f"{config.out}: {int(good.sum())} of {len(good)} centroids corrected")
+    click.echo(
+        f"{click.format_filename(config.out)}: {int(good.sum())} of {len(good)} centroids corrected"
+    )
     if good.any():
         added = np.sqrt((corrected.error[good] ** 2).mean(axis=0))
         click.echo(f"  map errors add {added[0]:.2g} px rms in x, {added[1]:.2g} px in y")
@@ -164,7 +166,7 @@ def wcs(run: Path, config: options.Wcs) -> None:
     from pixcal.stages import centroids as stage  # here: for a fast `pixcal --help`
 
     stage.write_wcs(run, config)
-    click.echo(f"{config.out}: written")
+    click.echo(f"{click.format_filename(config.out)}: written")
 
 
 @command(
@@ -182,7 +184,9 @@ def electrons(run: Path, files: tuple[Path, ...], config: options.Electrons) -> 
 
     written = stage.run(run, files, config)
     count = len(written.files)
-    click.echo(f"{config.out}: {count} frame{'s' * (count > 1)} in electrons")
+    click.echo(
+        f"{click.format_filename(config.out)}: {count} frame{'s' * (count > 1)} in electrons"
+    )
     if written.removed:
         click.echo(f"  removed: {', '.join(written.removed)}")
     if written.left:

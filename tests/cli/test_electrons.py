@@ -156,6 +156,8 @@ def test_raw_frames_are_not_replaced(
     assert "is a raw frame" in capsys.readouterr().err
     assert raw.read_bytes() == before
     assert frames(run, tmp_path, "--out", tmp_path / "out") == 2
+    assert frames(run, raw, "--out", raw) == 2
+    assert "is a file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

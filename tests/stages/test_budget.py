@@ -143,6 +143,9 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
         budget.run(changed(tmp_path, **places), Config())
     with pytest.raises(InputError, match="'vertical': no light falls on the window"):
         budget.run(changed(tmp_path, optics__beam_radius_mm=0.01), Config())
+    with pytest.raises(InputError, match="no contrast"):
+        aside = changed(tmp_path, optics__pointing_b_mm=[1e3, 0.0])
+        budget.run(aside, Config(precision_px=1e-3))
     with pytest.raises(InputError, match="not found"):
         budget.run(tmp_path / "none.yaml", Config())
     (tmp_path / "file").write_text("")

@@ -68,7 +68,7 @@ class Pickup(Effect):
     def __post_init__(self) -> None:
         if not len(self.rms) == len(self.columns) == len(self.rows):
             raise InputError(
-                "rms, columns and rows: give the same number of values for each, one per tone"
+                "rms, columns and rows: of different lengths; give one value of each per tone"
             )
 
     def read_variance(self, detector: SimulatedDetector) -> float:

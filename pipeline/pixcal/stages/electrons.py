@@ -133,7 +133,10 @@ def run(run_dir: Path, files: Sequence[Path], config: Electrons) -> Converted:
         if seconds is None and dark:
             raise InputError(f"{path}: no exposure time; add EXPTIME (s) to it, or give --exptime")
         planned.append((of_file, outs, seconds or 0.0))
-    config.out.mkdir(parents=True, exist_ok=True)
+    try:
+        config.out.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise InputError(f"--out {config.out}: is a file; choose another directory") from error
     removed = tuple(effect.name for effect in calibration.effects)
     for of_file, outs, seconds in planned:
         header = of_file.header()

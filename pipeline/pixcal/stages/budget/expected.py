@@ -235,7 +235,15 @@ def planned_split(bench: Bench) -> F64:
 
 
 def frames_needed(variance: float, precision: float) -> int:
-    """Frames that reduce a variance (px²) of one frame to the squared precision (px)."""
+    """Frames that reduce a variance (px²) of one frame to the squared precision (px).
+
+    InputError if no number of frames is enough.
+    """
+    if not variance < np.inf:
+        raise InputError(
+            "optics: the fringes have no contrast, so no number of frames is enough; raise "
+            "visibility, or point both beams at the detector (pointing_a_mm, pointing_b_mm)"
+        )
     return max(1, ceil(variance / precision**2))
 
 
