@@ -11,8 +11,9 @@ from PIL import Image
 
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import InputError
-from pixcal.stages import budget, fit, ingest, reduce, simulate
+from pixcal.stages import budget
 from pixcal.stages.budget import Config
+from pixcal.stages.budget.expected import fit, frames_needed, ingest, reduce, simulate
 
 ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "configs/demo.yaml"
@@ -143,9 +144,9 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
         budget.run(changed(tmp_path, **places), Config())
     with pytest.raises(InputError, match="'vertical': no light falls on the window"):
         budget.run(changed(tmp_path, optics__beam_radius_mm=0.01), Config())
-    with pytest.raises(InputError, match="no contrast"):
-        aside = changed(tmp_path, optics__pointing_b_mm=[1e3, 0.0])
-        budget.run(aside, Config(precision_px=1e-3))
+    for variance in (np.inf, np.nan):
+        with pytest.raises(InputError, match="no contrast"):
+            frames_needed(variance, 1e-3)
     with pytest.raises(InputError, match="not found"):
         budget.run(tmp_path / "none.yaml", Config())
     (tmp_path / "file").write_text("")
