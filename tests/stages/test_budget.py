@@ -11,9 +11,9 @@ from PIL import Image
 
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import InputError
-from pixcal.stages import budget
+from pixcal.stages import budget, fit, ingest, reduce, simulate
 from pixcal.stages.budget import Config
-from pixcal.stages.budget.expected import fit, frames_needed, ingest, reduce, simulate
+from pixcal.stages.budget.expected import frames_needed
 
 ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "configs/demo.yaml"
