@@ -167,7 +167,7 @@ def test_pairs_of_flats_tell_of_charge_that_stays_behind(
     assert found.errors["share"] < (0.002 if carried else 0.001)
     assert (found.significance > 5) == (share > 0)
     first = measure(replace(evidence, stacks=tuple(stacks)))["first_flats", DETECTOR]
-    # Flicker of two frames is 0.14 % a level; the scatter of twelve is that of their errors.
+    # In units of the error that the scatter of the twelve levels gives.
     assert first.value[int(carried)] < -4 if share else (abs(first.value) < 3).all()
 
 

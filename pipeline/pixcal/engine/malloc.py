@@ -15,9 +15,9 @@ NANNY_THRESHOLD = "65536"  # MALLOC_TRIM_THRESHOLD_ that Dask's nanny sets for i
 @cache
 def keep_freed_memory() -> None:
     """Let glibc's malloc reuse buffers, unless the user chose its settings."""
-    # Otherwise it returns what a chunk took as soon as the chunk is written, and fresh pages for
-    # the next take 3 % of a run. Where Dask's nanny set the variable, malloc does not even adapt,
-    # and a sweep takes 3 to 4 times as long. These limits are the largest to which it adapts.
+    # Otherwise it returns what a chunk took as soon as the chunk is written, and fetches fresh
+    # pages for the next. Where Dask's nanny set the variable, malloc does not even adapt, and a
+    # sweep takes 3 to 4 times as long. These limits are the largest to which it adapts.
     if os.environ.get("MALLOC_TRIM_THRESHOLD_", NANNY_THRESHOLD) == NANNY_THRESHOLD:
         _mallopt({_MMAP_THRESHOLD: 32 << 20, _TRIM_THRESHOLD: 64 << 20})
 
